@@ -36,7 +36,9 @@ _NETWORKS = (
 
 
 def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
-    """A class or function and the kinds of its arguments in a file, see `registry.make`.
+    """Return a class or function with the kinds of its arguments in a file.
+
+    See `registry.build_from_config`.
 
     Args:
         module: Its full name.

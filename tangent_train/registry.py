@@ -3,8 +3,8 @@
 ``_target_`` of a config section names the object to build. Config folders and the command line are
 the user's own and may name any class or function. Files are untrusted plain data: they may name
 registered classes and give their arguments, as far as the argument types allow, and are never
-interpreted: no interpolations, no positional arguments, no paths, no URLs. `make` is the only code
-that builds objects from settings.
+interpreted: no interpolations, no positional arguments, no paths, no URLs. `build_from_config` is
+the only code that builds objects from settings.
 
 This module imports nothing heavy: networks and data sets import it.
 """
@@ -91,7 +91,9 @@ class SettingsFile:
         return DataError(self.path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
 
-def make(settings: Any, place: str, file: SettingsFile | None = None, **given: Any) -> Any:
+def build_from_config(
+    settings: Any, place: str, file: SettingsFile | None = None, **given: Any
+) -> Any:
     """Build the object that a section of a config describes.
 
     Args:
@@ -158,8 +160,8 @@ def _check_taken(
     )
 
 
-def maker_of(settings: Any, place: str, file: SettingsFile | None = None) -> Any:
-    """The class or function that a section names; see `make`."""
+def resolve_target(settings: Any, place: str, file: SettingsFile | None = None) -> Any:
+    """The class or function that a section names; see `build_from_config`."""
     return _maker(settings, place, file)[0]
 
 
@@ -286,7 +288,7 @@ def _argument(
     elif isinstance(value, str) and _is_whole(kind):
         raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
     if isinstance(value, Mapping) and "_target_" in value:
-        return make(value, place, file)
+        return build_from_config(value, place, file)
     if isinstance(value, Mapping):
         return {name: _argument(v, f"{place}.{name}", file, Any) for name, v in value.items()}
     if isinstance(value, list):
@@ -303,7 +305,7 @@ def _check_argument(
     if kind is None:
         raise file.refused(place, value, f"one of its settings ({', '.join(kinds)})")
     if kind is _Object and isinstance(value, Mapping) and "_target_" in value:
-        return  # `make` looks at it
+        return  # `build_from_config` looks at it
     if value is not None and kind is not Any and not _fits(value, kind):
         raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
 

@@ -23,7 +23,7 @@ from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.predictor import Predictor, view_scores, views_per_forward
 from tangent_train.inference.views import InputImage, PanoramaViews
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
 
@@ -53,7 +53,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
     """An untrained network for the tangent images of a level, in a checkpoint."""
     settings |= {"num_classes": NUM_CLASSES}
     names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
-    network, normalization = make(settings, "network"), Normalization.of("imagenet", 3)
+    network, normalization = build_from_config(settings, "network"), Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (side, side))
     return import_network(photo, path, level=level, base_level=1)
 

@@ -21,9 +21,9 @@ from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
-from tangent_train.say import say
 from tangent_train.threads import in_threads
 
 Kind = Literal["segmentation", "classification"]
@@ -485,4 +485,4 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
 @rank_zero_only
 def tell(text: str) -> None:
     """Print text as it is, in the first process."""
-    say(text)
+    print_text(text)

@@ -16,9 +16,9 @@ from lightning.fabric.plugins import TorchCheckpointIO
 from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
-from tangent_train.say import say
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -165,7 +165,7 @@ class LastCheckpoint(Checkpoint):
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
             command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
             text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
-            say(text, error=True)
+            print_text(text, error=True)
 
     def _any_told_to_end(self, trainer: Trainer) -> bool:
         """Whether some process got SIGTERM: all end after the same step."""

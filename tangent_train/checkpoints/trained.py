@@ -28,7 +28,7 @@ from tangent_train.checkpoints.content import (
 from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
-from tangent_train.registry import SettingsFile, Text, check_fields, check_plain, make
+from tangent_train.registry import SettingsFile, Text, build_from_config, check_fields, check_plain
 
 METADATA_KEY = "tangent_train"
 """Names the JSON text: in an ONNX file's ``metadata_props``, in safetensors' ``__metadata__``."""
@@ -302,7 +302,7 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
         for name, tensor in content["state_dict"].items()
         if str(name).startswith(_PREFIX)
     }
-    size = make(config["representation"], "representation", source).image_size
+    size = build_from_config(config["representation"], "representation", source).image_size
     network = _network(described, tensors, source)
     kind = described["score_kind"]
     scores = Scores(network, len(described["class_names"]) - 1, described["groups"], kind=kind)
@@ -323,7 +323,7 @@ def _network(
     channels, classes = len(channel_names(described["inputs"])), len(described["class_names"]) - 1
     settings = completed_settings(described["settings"], channels, classes, restored=True)
     described["settings"] = settings
-    network: nn.Module = make(settings, "network", source)
+    network: nn.Module = build_from_config(settings, "network", source)
     try:
         network.load_state_dict(dict(tensors))
     except (RuntimeError, TypeError, AttributeError) as error:
@@ -339,7 +339,9 @@ def _network(
 def _trained(
     described: Mapping[str, Any], network: nn.Module, source: SettingsFile
 ) -> TrainedNetwork:
-    make(described["representation"], "representation", source)  # refused now, not when it is used
+    build_from_config(
+        described["representation"], "representation", source
+    )  # refused now, not when it is used
     normalization, fixed = described["normalization"], described["fixed_size"]
     rows, columns = described["image_size"]
     names, groups = tuple(described["class_names"]), described["groups"]

@@ -14,11 +14,11 @@ from torch import nn
 
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import parse_settings
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.views import check_size
-from tangent_train.registry import SettingsFile, make, maker_of
+from tangent_train.registry import SettingsFile, build_from_config, resolve_target
 
 _RGB = 3
 
@@ -37,7 +37,7 @@ def build(
 
     Args:
         settings: Of the run.
-        source: The file they come from, see `registry.make`.
+        source: The file they come from, see `registry.build_from_config`.
         trains: False if the task is only evaluated: its optimizer and scheduler are not made.
 
     Returns:
@@ -51,7 +51,7 @@ def build(
     section = completed_settings(
         settings["network"], data.in_channels, data.num_classes, restored=restored
     )
-    network = make(section, "network", source)
+    network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
     _try_network(task, data.in_channels)
     if not trains:
@@ -66,14 +66,14 @@ def build(
 
 def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
     """The data module of a run, of the kind that its task takes; see `build`."""
-    representation = make(settings["representation"], "representation", source)
-    data_set = maker_of(settings["data"], "data", source)
+    representation = build_from_config(settings["representation"], "representation", source)
+    data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
         expected = "labelled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
-    data = make(settings["data"], "data", source, representation=representation)
+    data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()
-    kind = getattr(maker_of(settings["task"], "task", source), "kind", data.kind)
+    kind = getattr(resolve_target(settings["task"], "task", source), "kind", data.kind)
     if kind != data.kind:
         raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
     return data
@@ -87,7 +87,7 @@ def build_trained(
     Args:
         settings: Of the evaluation, perhaps with ``class_map`` and ``unmapped``.
         trained: The network.
-        source: The file they come from, see `registry.make`.
+        source: The file they come from, see `registry.build_from_config`.
 
     Returns:
         Data module, task, and what the class map was understood to say.
@@ -98,7 +98,7 @@ def build_trained(
     data = build_data(settings, source)
     notes = []
     if settings.get("class_map") is not None:
-        given = typed(_Mapping, settings)
+        given = parse_settings(_Mapping, settings)
         class_map = load_class_map(given.class_map)
         mapped = map_classes(trained, class_map, given.unmapped, data.class_names[1:])
         trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
@@ -153,10 +153,10 @@ def _build_task(
     if trains:
         optimizer = dict(settings["optimizer"])
         parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = make(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = make(settings["scheduler"], "scheduler", source)
-    return make(
+        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+    return build_from_config(
         settings["task"],
         "task",
         source,

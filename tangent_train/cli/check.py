@@ -8,10 +8,10 @@ from contextlib import redirect_stdout
 from typing import TYPE_CHECKING, Any
 
 from datamodules.core.class_weights import label_doubts
+from tangent_train.console import print_text
 from tangent_train.errors import counted
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tangent_train.results.tables import Table, percent
-from tangent_train.say import say
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,8 +27,8 @@ def check(settings: Mapping[str, Any]) -> None:
     Args:
         settings: The composed ``check.yaml``.
     """
-    representation = make(settings["representation"], "representation")
-    data = make(settings["data"], "data", representation=representation)
+    representation = build_from_config(settings["representation"], "representation")
+    data = build_from_config(settings["data"], "data", representation=representation)
     terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # progress is none of the problems that are listed
         problems, count = data.check()
@@ -50,11 +50,11 @@ def check(settings: Mapping[str, Any]) -> None:
         if labelled:
             _share_table(labelled, data.class_names).print()
         for warning in warnings:
-            say(f"Warning: {warning}", error=not terminal)
+            print_text(f"Warning: {warning}", error=not terminal)
     found = counted(len(listed), "problems") if listed else "Nothing is wrong"
     if warnings:
         found = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
-    say(f"{found}; {read}.", error=bool(listed or warnings) and not terminal)
+    print_text(f"{found}; {read}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import datamodules
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.cli.settings import names_of, typed
+from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.errors import DataError
 
 
@@ -31,7 +31,7 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
         SettingError: A setting is of another type.
     """
     kind = SETTINGS[command]
-    settings = typed(kind, config)
+    settings = parse_settings(kind, config)
     for one in fields(kind):
         value = getattr(settings, one.name)
         if value is not None and "check" in one.metadata:

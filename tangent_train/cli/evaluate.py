@@ -26,12 +26,13 @@ from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.command_settings import EvaluateSettings
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS, run_settings
+from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
@@ -42,7 +43,6 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
-from tangent_train.say import say
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -58,13 +58,13 @@ def evaluate(
     Args:
         settings: Of the run, and ``checkpoint``, ``class_map`` and ``unmapped``; all there are for
             a stage of a transfer.
-        source: The file they come from, see `registry.make`.
+        source: The file they come from, see `registry.build_from_config`.
         trained: The network of a file that has no settings of a run, if it was loaded for these.
 
     Raises:
         SettingError: No checkpoint is given, or it does not fit the data.
     """
-    checkpoint = typed(EvaluateSettings, settings).checkpoint
+    checkpoint = parse_settings(EvaluateSettings, settings).checkpoint
     mapped = settings.get("class_map") is not None
     if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}
@@ -141,7 +141,7 @@ class Run:
         every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
         if epochs not in (None, -1):
             at_least("trainer.max_epochs", epochs, 1)
-        return make(
+        return build_from_config(
             section,
             "trainer",
             self.source,
@@ -222,9 +222,9 @@ class Run:
             notes=[headline(record), *notes],
         )
         for line in (*self.notes, headline(record)):
-            say(line)
+            print_text(line)
         result_tables(record)[0].print()
-        say(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
+        print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
 def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:

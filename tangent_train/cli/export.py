@@ -10,11 +10,11 @@ from rich.text import Text
 
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.command_settings import ExportSettings as Settings
-from tangent_train.cli.settings import check_new, typed
+from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
 from tangent_train.inference.export import export_network
 from tangent_train.inference.predictor import sees_rays
-from tangent_train.say import say
 
 
 def export(config: Mapping[str, Any]) -> None:
@@ -28,7 +28,7 @@ def export(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or impossible, the file exists, or the network cannot be
             exported.
     """
-    settings = typed(Settings, config)
+    settings = parse_settings(Settings, config)
     output = settings.output
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
@@ -38,11 +38,11 @@ def export(config: Mapping[str, Any]) -> None:
     fixed, multiple = written.trained.fixed_size, trained.size_multiple
     sides = width_height(fixed) if fixed else "any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
-    say(
+    print_text(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
         f"images: {trained.in_channels} channels, {sides}; scores: {trained.network.num_scores} "
         f"classes\nlargest difference to PyTorch: {written.difference:.1e} of the range of the "
         "scores"
     )
     if output.suffix.lower() == ".onnx" and sees_rays(trained.network):
-        say(f"{output.name} has no cross-image attention; .safetensors keeps it.")
+        print_text(f"{output.name} has no cross-image attention; .safetensors keeps it.")

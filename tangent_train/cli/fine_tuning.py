@@ -15,10 +15,10 @@ from models import initialize
 from tangent_train.checkpoints.trained import Start, completed_settings, start_in
 from tangent_train.cli.build import Settings
 from tangent_train.cli.evaluate import Run
-from tangent_train.cli.settings import Trust, typed
+from tangent_train.cli.settings import Trust, parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, printable
-from tangent_train.registry import SettingsFile, make
-from tangent_train.say import say
+from tangent_train.registry import SettingsFile, build_from_config
 
 _TYPED = re.compile(r"[+~]*network[.@=]")
 _RGB = 3
@@ -67,7 +67,9 @@ def begin_from(path: Path, settings: Settings) -> tuple[Settings, SettingsFile |
                 remedy="Take the last step out of the network, and import it again.",
             )
         changed["network"] = start.settings
-        source = SettingsFile(path, typed(Trust, settings).trust, settings.keys() - {"network"})
+        source = SettingsFile(
+            path, parse_settings(Trust, settings).trust, settings.keys() - {"network"}
+        )
         told.append(f"Network of {path}: {target} (another: network=…)")
     normalization = _normalization(start, changed["data"])
     if normalization is not None:
@@ -106,7 +108,7 @@ def load_start(path: Path, run: Run) -> None:
 
 @rank_zero_only
 def _print(text: str) -> None:
-    say(printable(text))
+    print_text(printable(text))
 
 
 def _wraps(section: Mapping[str, Any], target: Any) -> bool:
@@ -133,6 +135,6 @@ def _heads(run: Run) -> set[str]:
     more = completed_settings(
         run.settings["network"], run.data.in_channels, run.data.num_classes + 1, restored=True
     )
-    larger = make(more, "network", run.source).state_dict()
+    larger = build_from_config(more, "network", run.source).state_dict()
     own = run.task.network.state_dict()
     return {name for name, tensor in own.items() if tensor.shape != larger[name].shape}

@@ -15,10 +15,10 @@ from rich.text import Text
 
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.cli.command_settings import ImportSettings as Settings
-from tangent_train.cli.settings import check_new, typed
+from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.imports import elsewhere
-from tangent_train.say import say
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
@@ -48,7 +48,7 @@ def import_network(config: Mapping[str, Any]) -> None:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    settings = typed(Settings, config)
+    settings = parse_settings(Settings, config)
     with elsewhere():
         from tangent_train.inference import photo_networks
 
@@ -70,9 +70,9 @@ def import_network(config: Mapping[str, Any]) -> None:
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
         )
-    say(_understood(output, trained, settings))
+    print_text(_understood(output, trained, settings))
     for remark in network.remarks:
-        say(remark)
+        print_text(remark)
 
 
 def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:

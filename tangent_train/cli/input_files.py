@@ -9,10 +9,10 @@ from pathlib import Path
 from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_names
 from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
 from tangent_train.cli.command_settings import InputSettings
-from tangent_train.cli.each import Job, Shard
+from tangent_train.cli.jobs import Job, Shard
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, at_least
 from tangent_train.results.predictions import frame_name
-from tangent_train.say import say
 
 
 def is_video(path: Path) -> bool:
@@ -55,7 +55,7 @@ class Inputs:
         """
         every = at_least("every", settings.every, 1)
         suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
-        paths = image_paths(settings.input or "", suffixes, is_result, say)
+        paths = image_paths(settings.input or "", suffixes, is_result, print_text)
 
         def size(job: Job) -> tuple[int, int, int]:
             frames, rows, columns = read_video_size(job.path)

@@ -15,15 +15,15 @@ from rich.progress import track
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.command_settings import KeypointsSettings as Settings
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import read_json, write_bytes
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
-from tangent_train.registry import check_fields, make, maker_of
+from tangent_train.registry import build_from_config, check_fields, resolve_target
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
-from tangent_train.say import say
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
 
@@ -38,7 +38,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or invalid.
         DataError: There are no pairs.
     """
-    given, comparer = typed(Settings, config), Comparer(typed(Ways, config))
+    given, comparer = parse_settings(Settings, config), Comparer(parse_settings(Ways, config))
     output = given.output
     colmap()  # pycolmap is missed now rather than after minutes
     data, pairs = _pairs(config)
@@ -53,7 +53,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         return KeypointReport(rows, comparer.ways.representations, settings, pairs.published)
 
     missing = [(k, name) for k, name in enumerate(names) if name not in done]
-    say(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
+    print_text(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
     for index, name in track(missing, "Comparing pairs", disable=not missing):
         try:
             pair = pairs.read(index)
@@ -61,7 +61,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
             if given.export:
                 _export(output / "export", pairs.files, pair, comparison)
         except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
-            say(f"Pair {name}: {error or 'too little memory'}")
+            print_text(f"Pair {name}: {error or 'too little memory'}")
             continue
         if index < given.pictures:
             for condition in comparison.images:
@@ -71,9 +71,9 @@ def keypoints(config: Mapping[str, Any]) -> None:
         report().write(output)
     for table in report().means():
         table.print()
-    say(f"Results are in {output}." if done else "There are no results.")
+    print_text(f"Results are in {output}." if done else "There are no results.")
     if given.export:
-        say(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
+        print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     failed = len(set(names) - set(done))
     if failed:
         sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
@@ -84,13 +84,13 @@ def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
     images = {name: config[name] for name in _OF_IMAGES}
     if any(images[name] is not None for name in ("left", "right", "input")):
         return images, ImagePairs(**images)
-    if not issubclass(maker_of(config["data"], "data"), PanoramaPairs):
+    if not issubclass(resolve_target(config["data"], "data"), PanoramaPairs):
         raise SettingError(
             "data",
             found=config["data"]["_target_"],
             expected="pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
         )
-    return config["data"], make(config["data"], "data")
+    return config["data"], build_from_config(config["data"], "data")
 
 
 def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:

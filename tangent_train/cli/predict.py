@@ -20,10 +20,11 @@ from datamodules.images.pixel_files import read_pixels
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings as Settings
-from tangent_train.cli.each import Job, Shard, each
 from tangent_train.cli.input_files import Inputs, is_video
+from tangent_train.cli.jobs import Job, Shard, run_jobs
 from tangent_train.cli.predict_shards import PredictionShard
-from tangent_train.cli.settings import typed
+from tangent_train.cli.settings import parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
@@ -38,7 +39,6 @@ from tangent_train.results.predictions import (
     class_shares,
     is_result_in,
 )
-from tangent_train.say import say
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
@@ -61,7 +61,7 @@ def predict(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or invalid.
         DataError: The checkpoint cannot be read, or there are no images.
     """
-    settings = typed(Settings, config)
+    settings = parse_settings(Settings, config)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.of(settings.shard)
     original, trained = _networks(settings)
@@ -78,7 +78,7 @@ def predict(config: Mapping[str, Any]) -> None:
         done = _label(settings, decisive, inputs.part(shard), label, folder, part)
         part.save(done, done=True)
         count, entries = part.together()
-        say(f"Shard {shard} is done: {count} of {shard.count} in all.")
+        print_text(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
             _finish(settings, inputs, label, folder, entries)
@@ -112,14 +112,14 @@ def _label(
             folder.write_summary(decisive, entries)
 
     count = len(names)
-    say(f"{counted(count, 'images')}, {len(entries)} done already.")
+    print_text(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write
     labelled = set()
     saved = -math.inf
     save()
     try:
-        with closing(each("Predicting", inputs.missing(earlier), missing, *steps)) as done:
+        with closing(run_jobs("Predicting", inputs.missing(earlier), missing, *steps)) as done:
             for job in done:
                 entry = {"error": job.error} if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
@@ -128,7 +128,7 @@ def _label(
                     save()
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        say(f"{len(entries)} of {count} images are done. resume=true continues.")
+        print_text(f"{len(entries)} of {count} images are done. resume=true continues.")
         raise
     finally:
         save()
@@ -155,7 +155,7 @@ def _finish(
     if pictures:
         folder.write_page(entries, pictures)
     folder.mean_shares(entries).print()
-    say(f"Results are in {settings.output}.")
+    print_text(f"Results are in {settings.output}.")
 
 
 class _Labelled(NamedTuple):
@@ -265,7 +265,7 @@ def _make_videos(
         again = job.path in labelled
         folder.write_videos(job.item, job.path, job.value, inputs.every, again=again)
 
-    done = each("Making videos", videos, len(videos), write)
+    done = run_jobs("Making videos", videos, len(videos), write)
     return [{"file": str(j.path), "name": j.item, "error": j.error} for j in done if j.error]
 
 
@@ -276,7 +276,7 @@ def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
     class_map = load_class_map(settings.class_map)
     trained = load_trained(settings.checkpoint, settings.trust)
     mapped = map_classes(trained, class_map, settings.unmapped)
-    say(f"Class map {class_map.name}: {mapped}.")
+    print_text(f"Class map {class_map.name}: {mapped}.")
     return trained, mapped.trained
 
 

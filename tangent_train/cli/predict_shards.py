@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tangent_train.cli.each import Shard
+from tangent_train.cli.jobs import Shard
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json, write_text
 from tangent_train.results.predictions import Entry

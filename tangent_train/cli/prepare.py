@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from tangent_train.cli.build import Settings
-from tangent_train.cli.each import Shard
-from tangent_train.registry import make
-from tangent_train.say import say
+from tangent_train.cli.jobs import Shard
+from tangent_train.console import print_text
+from tangent_train.registry import build_from_config
 
 
 def prepare(settings: Settings) -> None:
@@ -15,13 +15,13 @@ def prepare(settings: Settings) -> None:
         settings: The composed ``prepare.yaml``.
     """
     shard = Shard.of(settings["shard"])
-    representation = make(settings["representation"], "representation")
-    data = make(settings["data"], "data", representation=representation)
+    representation = build_from_config(settings["representation"], "representation")
+    data = build_from_config(settings["data"], "data", representation=representation)
     if shard is not None:
         count = data.prepare_part(shard.part)
-        say(f"Shard {shard}: {count} {data.noun} are in {data.store}.")
+        print_text(f"Shard {shard}: {count} {data.noun} are in {data.store}.")
     else:
         data.prepare_data()
         data.setup()
         counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
-        say(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")
+        print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

@@ -30,9 +30,10 @@ from datamodules.images.tangent_folders import (
 )
 from datamodules.images.tangent_results import TangentResults, result_files
 from tangent_train.cli.command_settings import RenderSettings as Settings
-from tangent_train.cli.each import Job, each
 from tangent_train.cli.input_files import Inputs, is_video
-from tangent_train.cli.settings import check_new, typed
+from tangent_train.cli.jobs import Job, run_jobs
+from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import TangentGrid, nearest_level, rotation_about
 from tangent_train.keypoints.colmap import panorama_poses
@@ -45,7 +46,6 @@ from tangent_train.rendering.camera_files import (
     write_poses,
 )
 from tangent_train.rendering.figure import tangent_figure
-from tangent_train.say import say
 
 _Work = Callable[[Job, Callable[[float], object]], Path]
 
@@ -60,7 +60,7 @@ def render(config: Mapping[str, Any]) -> None:
         DataError: There is nothing to render.
         SettingError: A setting is invalid, or a file would be overwritten.
     """
-    settings = typed(Settings, config)
+    settings = parse_settings(Settings, config)
     modes = [name for name in ("input", "back", "poses") if getattr(settings, name) is not None]
     if len(modes) != 1:
         raise SettingError(
@@ -86,14 +86,16 @@ def render(config: Mapping[str, Any]) -> None:
 
 def _each(jobs: Iterable[Job], count: int, work: _Work) -> list[Path]:
     """Results of the panoramas that could be rendered."""
-    return [job.value for job in each("Rendering", jobs, count, work) if not job.error]
+    return [job.value for job in run_jobs("Rendering", jobs, count, work) if not job.error]
 
 
 def _end(done: Sequence[Path], count: int) -> None:
     """Say what was written, and exit with 1 if not all panoramas were."""
     if done:
         written = list(dict.fromkeys(done))
-        say(f"Written: {written[0]}" + (f" and {len(written) - 1} more" if written[1:] else ""))
+        print_text(
+            f"Written: {written[0]}" + (f" and {len(written) - 1} more" if written[1:] else "")
+        )
     if len(done) < count:
         failed = f"{count - len(done)} of {count} panoramas"
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
@@ -212,7 +214,9 @@ def _poses(settings: Settings, model: Path) -> None:
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = panorama_poses(model, rig)
     write_poses(output, poses)
-    say(f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}")
+    print_text(
+        f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"
+    )
 
 
 def _rotation(settings: Settings) -> NDArray[np.float64] | None:

@@ -6,9 +6,9 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tangent_train.console import print_text
 from tangent_train.errors import DataError
 from tangent_train.imports import elsewhere
-from tangent_train.say import say
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -35,8 +35,8 @@ def report(arguments: Sequence[str]) -> None:
     found.write(options.output, "report")
     found.tables()[0].print()
     for note in found.all_notes():
-        say(f"- {note}")
-    say(f"Files: {options.output}/report.*")
+        print_text(f"- {note}")
+    print_text(f"Files: {options.output}/report.*")
 
 
 def _parser() -> argparse.ArgumentParser:

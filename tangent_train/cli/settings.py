@@ -31,7 +31,7 @@ class Trust:
     trust: tuple[str, ...]
 
 
-def typed(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
+def parse_settings(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """Build a dataclass of settings; values are checked where they are used.
 
     Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples

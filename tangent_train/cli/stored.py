@@ -16,7 +16,7 @@ from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkp
 from tangent_train.cli.command_settings import RunSettings
 from tangent_train.cli.compose import config_folder, path_text, quoted, values_of_sweep
 from tangent_train.cli.remembered import remembered_paths
-from tangent_train.cli.settings import Trust, names_of, typed
+from tangent_train.cli.settings import Trust, names_of, parse_settings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
@@ -42,22 +42,22 @@ class StoredRun:
     Attributes:
         path: The checkpoint.
         config: Its settings, plain values.
-        typed: Overrides of the user, without the checkpoint.
+        user_overrides: Overrides of the user, without the checkpoint.
         added: The options of the run among the user's own, its level and seed.
         place: Overrides for the checkpoint and the run folder.
     """
 
     path: Path
     config: Mapping[str, Any]
-    typed: Sequence[str]
+    user_overrides: Sequence[str]
     added: Sequence[str]
     place: Sequence[str]
 
     @property
     def arguments(self) -> list[str]:
         """The command line for Hydra: options, then overrides, of which the last one counts."""
-        options = [a for a in self.typed if "=" not in a or a[0] == "-"]
-        overrides = [a for a in self.typed if a not in options]
+        options = [a for a in self.user_overrides if "=" not in a or a[0] == "-"]
+        overrides = [a for a in self.user_overrides if a not in options]
         return [*options, *self.added, *overrides, *self.place]
 
     def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
@@ -73,7 +73,7 @@ class StoredRun:
             DataError: The file lacks settings.
             SettingError: A setting of this machine has to be typed.
         """
-        own = names_of(self.typed)
+        own = names_of(self.user_overrides)
         own |= {"representation.level"} if "level" in own else set()
         own |= {"data.seed"} if "seed" in own else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
@@ -90,7 +90,7 @@ class StoredRun:
             _lay(settings, said, name.split("."))
         if "data" in own:
             settings["data"] |= self._of_the_network(settings["data"], own)
-        trust = typed(Trust, said).trust
+        trust = parse_settings(Trust, said).trust
         return settings, SettingsFile(self.path, trust, own | local)
 
     def _section(
@@ -128,18 +128,18 @@ class StoredNetwork:
 
     Attributes:
         path: The file.
-        typed: Overrides of the user, without the file.
+        user_overrides: Overrides of the user, without the file.
         added: None, see `StoredRun`.
     """
 
     path: Path
-    typed: Sequence[str]
+    user_overrides: Sequence[str]
     added: Sequence[str] = ()
 
     @property
     def arguments(self) -> list[str]:
         """The command line for Hydra."""
-        return [*self.typed, f"checkpoint={self.path}"]
+        return [*self.user_overrides, f"checkpoint={self.path}"]
 
     def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile, Any]:
         """All settings of the evaluation.
@@ -157,8 +157,8 @@ class StoredNetwork:
         from tangent_train.inference.predictor import views_per_forward
         from tangent_train.inference.views import panorama_settings
 
-        own = names_of(self.typed)
-        trust = typed(Trust, said).trust
+        own = names_of(self.user_overrides)
+        trust = parse_settings(Trust, said).trust
         trained = load_trained(self.path, trust)
         settings = dict(said)
         level = said["level"] if "level" in own else None

@@ -26,7 +26,7 @@ from tangent_train.cli.command_settings import TrainSettings
 from tangent_train.cli.evaluate import Run, machine_faults
 from tangent_train.cli.fine_tuning import begin_from, load_start
 from tangent_train.cli.remembered import remember_paths, remembered_paths
-from tangent_train.cli.settings import names_of, typed
+from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
 from tangent_train.errors import DataError, SettingError
@@ -40,12 +40,12 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
 
     Args:
         settings: Of the run: the composed ``train.yaml``, or of a run that is resumed.
-        source: The file they come from, see `registry.make`.
+        source: The file they come from, see `registry.build_from_config`.
 
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed, files = None, typed(TrainSettings, settings)
+    resumed, files = None, parse_settings(TrainSettings, settings)
     start = None if files.resume else files.init_from
     if files.resume is not None:
         resumed = files.resume / "checkpoints" / "last.ckpt"
@@ -168,8 +168,8 @@ def _remember(run: Run) -> Collection[str]:
 
 def _typed_local(remembered: Collection[str]) -> list[str]:
     """Typed machine-specific settings that a resumed run needs again: no file holds them."""
-    typed = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    named = [(said, *said.partition("=")[::2]) for said in typed]
+    overrides = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
+    named = [(said, *said.partition("=")[::2]) for said in overrides]
     return [
         said
         for said, name, value in named

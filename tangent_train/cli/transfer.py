@@ -19,10 +19,10 @@ from tangent_train.cli.compose import without_interpolation
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
 from tangent_train.cli.transfer_views import views_of
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.imports import elsewhere
 from tangent_train.registry import check_fields
-from tangent_train.say import say
 
 _OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 
@@ -54,7 +54,7 @@ def transfer(config: DictConfig) -> None:
         for number, stage in enumerate(stages, start=1):
             _run(stage, f"Stage {number} of {len(stages)}, {stage.name} in {stage.folder}")
     except (KeyboardInterrupt, SystemExit):
-        say("Finished stages are kept; the same command continues.", error=True)
+        print_text("Finished stages are kept; the same command continues.", error=True)
         raise
     _report(config, folder, stages, trained)
 
@@ -138,14 +138,14 @@ def _named(stage: Stage) -> Iterator[None]:
 def _run(stage: Stage, what: str) -> None:
     state = stage_state(stage)
     if state == "finished":
-        say(f"{what}: finished before.")
+        print_text(f"{what}: finished before.")
         return
     _, _, _, command, *arguments = stage_command(stage)
-    say(f"{what}: tangent-{command} {shlex.join(arguments)}")
+    print_text(f"{what}: tangent-{command} {shlex.join(arguments)}")
     status = run_stage(stage, state)
     if status:
         name = f"stage {stage.name} in {stage.folder}"
-        say(f"tangent-transfer: {name} ended with status {status}.", error=True)
+        print_text(f"tangent-transfer: {name} ended with status {status}.", error=True)
         sys.exit(status)
 
 
@@ -172,5 +172,5 @@ def _report(
     report.write(folder, name)
     report.tables()[0].print()
     for note in report.all_notes():
-        say(f"- {note}")
-    say(f"Tables and a chart: {folder / name}.md, .csv, .png")
+        print_text(f"- {note}")
+    print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")

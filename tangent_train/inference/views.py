@@ -12,7 +12,7 @@ import numpy as np
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from datamodules.core.samples import world_rays
 from tangent_train.errors import SettingError, width_height
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tangent_train.rendering.representations.equirect import EquirectViews, as_crop, column_shifts
 from tangent_train.rendering.representations.perspective import PhotoCrops
@@ -245,7 +245,7 @@ def panorama_representation(
         SettingError: The network cannot take its images.
     """
     settings = panorama_settings(trained, level, base_level)
-    made: Any = make(settings, "representation", trained.source)
+    made: Any = build_from_config(settings, "representation", trained.source)
     check_size(trained, made.image_size)
     return made
 

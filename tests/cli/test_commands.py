@@ -26,9 +26,9 @@ from tangent_train.cli import main
 from tangent_train.cli.build import _fault
 from tangent_train.cli.compose import path_text
 from tangent_train.cli.stored import stored_run
+from tangent_train.console import print_text
 from tangent_train.results.record import load_record
 from tangent_train.results.tables import Table
-from tangent_train.say import say
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import run_python
@@ -174,7 +174,7 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
     assert found == path_text(rooms.partition("=")[2])
     moved = stored_run("evaluate", [f"checkpoint={best}", "data.root=moved"])
     assert moved is not None
-    assert moved.typed == ["data.root=moved"]
+    assert moved.user_overrides == ["data.root=moved"]
 
     shutil.copytree(run_folder, tmp_path / "theirs")
     for name, home in (("theirs", None), (str(run_folder), str(tmp_path / "other machine"))):
@@ -423,7 +423,7 @@ def test_output_of_any_encoding(
         monkeypatch.setattr(sys, "stdout", stream)
         with pytest.raises(SystemExit, match=r"Küche.*no such folder"):
             main.report()
-        say("→ ×\udcff")
+        print_text("→ ×\udcff")
         Table("°", ("Küche", "緑"), [["…", "⅓"]]).print()
         stream.flush()
         assert stream.buffer.getvalue()
@@ -475,7 +475,7 @@ def test_an_error_of_a_thread_that_is_raised_again_is_not_printed_twice(
 
 def test_names_are_printed_without_escapes_and_markup(capsys: pytest.CaptureFixture[str]) -> None:
     name = "[red]sofa\x1b[2J\x9b\x07"
-    say(name)
+    print_text(name)
     Table(name, (name,), [[name]], note=name).print()
     printed = capsys.readouterr().out
     assert printed.count(r"[red]sofa\x1b[2J\x9b\x07") == 5

@@ -18,7 +18,7 @@ from tangent_train.cli.fine_tuning import begin_from
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import composed, composed_settings
 from tests.tasks.small_networks import with_statistics
@@ -33,7 +33,7 @@ def _write_imported(path: Path, classes: int, **stated: Any) -> Path:
     """Write a network with random numbers as `tangent-import` does."""
     torch.manual_seed(3)
     settings = UNET | {"num_classes": classes}
-    network: Any = with_statistics(make(settings, "network"))
+    network: Any = with_statistics(build_from_config(settings, "network"))
     if stated:
         network.head.weight.data.fill_(0)
         network.head.bias.data.fill_(1 / classes)

@@ -15,7 +15,7 @@ from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import SettingError
 from tangent_train.inference.views import check_size
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tests.inference.trained import trained_network
 from tests.running import composed
 
@@ -123,7 +123,7 @@ def test_the_plan_for_networks_of_photos() -> None:
     stages = _stages(config, trained, representation=own | size)
     assert len(stages) == (1 + len(config.compare)) * len(config.conditions)
     for stage in stages.values():
-        made = make(stage.config["representation"], "representation")
+        made = build_from_config(stage.config["representation"], "representation")
         assert made.erp_height == 1024
         check_size(trained, made.image_size)
 

@@ -24,7 +24,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
 from tangent_train.inference.predictor import Predictor
 from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tangent_train.rendering import rotate_equirect
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.inference.trained import (
@@ -111,7 +111,7 @@ def test_labels_are_those_of_an_evaluation(
     stanford_root: Path, representation: dict[str, Any], blend: str, channels: int, rotations: int
 ) -> None:
     trained = trained_network(representation, channels)
-    made = make(representation, "representation")
+    made = build_from_config(representation, "representation")
     data = Stanford2D3DS(root=stanford_root, representation=made, inputs=trained.inputs, fold=1)
     task = SegmentationTask(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
@@ -130,7 +130,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     torch.manual_seed(0)
     network = small_context().eval()
     awake(network)
-    image, made = InputImage(sphere(32)), make(TANGENT, "representation")
+    image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
     trained = trained_network(TANGENT, network=Scores(network, 3))
     labels = _labels(trained, image, per_forward, blend="nearest")
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()

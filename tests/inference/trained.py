@@ -15,7 +15,7 @@ from tangent_train.checkpoints.scores import Scores
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.build import shown
 from tangent_train.geometry import equirect_directions
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 
 CLASS_NAMES = ("unknown", "dark", "green", "bright")
 
@@ -58,7 +58,7 @@ def trained_network(
         "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,
         "level": representation["level"],
         "representation": representation,
-        "image_size": make(representation, "representation").image_size,
+        "image_size": build_from_config(representation, "representation").image_size,
     }
     return TrainedNetwork(**(settings | changes))
 

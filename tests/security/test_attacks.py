@@ -21,7 +21,7 @@ from tangent_train.cli.build import build
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tangent_train.rendering.camera_files import read_cameras
 from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
@@ -84,7 +84,7 @@ def _evaluation(content: dict[str, Any], path: Path, *typed: str) -> Callable[[P
         assert isinstance(stored, StoredRun)
         settings, source = stored.settings(said)
         build(settings, source)
-        make(settings["trainer"], "trainer", source, logger=False)
+        build_from_config(settings["trainer"], "trainer", source, logger=False)
 
     evaluated(path)
     return evaluated

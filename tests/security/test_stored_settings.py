@@ -20,7 +20,7 @@ from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 from tests.cli.tiny_runs import results, run_command
 from tests.security.honest import SETTINGS, settled, with_config
 from tests.security.watch import CANARY, watched
@@ -148,7 +148,7 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
     with pytest.raises(DataError, match=r"settings\.name="):
         read_settings(tmp_path / "config.yaml")
-    network = make(_UNET, "network")
+    network = build_from_config(_UNET, "network")
     torch.save({"[/nope][link=x]" + evil: torch.zeros(1), **network.state_dict()}, path)
     console = Console(record=True, width=200, force_terminal=True)
     console.print(str(initialize(network, path)), markup=False)
@@ -256,5 +256,5 @@ def test_networks_of_libraries_need_no_trust_and_fetch_nothing(
 ) -> None:
     settings = completed_settings(network, 3, 14, restored=True)
     with watched(tmp_path / "forbidden") as happened, torch.device("meta"):
-        make(settings, "network", SettingsFile(tmp_path))
+        build_from_config(settings, "network", SettingsFile(tmp_path))
     assert not happened

@@ -13,7 +13,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.scores import Scores, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.build import build, shown
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
@@ -37,7 +37,7 @@ def small_trained(
 ) -> TrainedNetwork:
     """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
-    scores = Scores(with_statistics(make(settings, "network")), len(NAMES) - 1).eval()
+    scores = Scores(with_statistics(build_from_config(settings, "network")), len(NAMES) - 1).eval()
     multiple = size_multiple_of(scores, 4)
     return trained_network(
         TANGENT | {"level": 5},

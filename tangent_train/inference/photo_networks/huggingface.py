@@ -22,7 +22,7 @@ from tangent_train.inference.photo_networks.network import (
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.inference.quiet import quiet
 from tangent_train.offline import offline
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is semantic"
@@ -73,7 +73,7 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
     }
     if config.get("model_type") == "oneformer":
         settings["task"] = _task(folder, config)
-    network = make(settings, "network", SettingsFile(path))
+    network = build_from_config(settings, "network", SettingsFile(path))
     if len(names) == 1 and network.is_universal:
         expected = "two classes at least: masks say which class a pixel has, not if it has one"
         raise DataError(path, found="masks of one class", expected=expected)

@@ -11,7 +11,7 @@ from models.pretrained import load_tensors, tensors_for
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 
 
 def load(
@@ -36,6 +36,6 @@ def load(
         raise SettingError("weights", found="none", expected="a file with the network's tensors")
     names = class_names_in(classes)
     whole = completed_settings(settings, 3, len(names), restored=True)
-    network = make(whole, "network")
+    network = build_from_config(whole, "network")
     load_tensors(network, tensors_for(network, Path(weights)), weights)
     return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3))

@@ -11,7 +11,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
 from tangent_train.offline import offline
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 
 _CLASS = "_model_class"
 _LEFT_OUT = {"activation", "aux_params"}
@@ -48,7 +48,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
             found=f"in_channels: {config['in_channels']}",
             expected="3: the commands give a photo network RGB images only",
         )
-    network = make(settings, "network", SettingsFile(path))
+    network = build_from_config(settings, "network", SettingsFile(path))
     given = None if normalization is None else Normalization.of(normalization, 3)
     tensors, remarks = tensors_in(folder)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_HEAD_OF_IMAGES)}

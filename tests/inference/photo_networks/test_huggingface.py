@@ -17,7 +17,7 @@ from transformers import quantizers
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import huggingface, import_network
-from tangent_train.registry import SettingsFile, make
+from tangent_train.registry import SettingsFile, build_from_config
 from tests.inference.photo_networks import huggingface_networks as networks
 from tests.security.attacks import undeclared_settings
 from tests.security.watch import CANARY, watched
@@ -320,7 +320,7 @@ def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path
     network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 2}
     uses: tuple[Callable[[], Any], ...] = (
         lambda: networks.imported(folder),
-        lambda: make(network, "network", SettingsFile(path)),
+        lambda: build_from_config(network, "network", SettingsFile(path)),
     )
     for use in uses:
         refused = pytest.raises((DataError, SettingError), match="network")
@@ -339,8 +339,8 @@ def test_the_hub_is_offline_for_files_alone(tmp_path: Path) -> None:
     file = SettingsFile(tmp_path / "x.ckpt", trust=[f"{__name__}.fetching"])
     with watched(tmp_path / "forbidden") as happened:
         with pytest.raises(DataError, match=r"x\.ckpt: found .*fetching cannot be made"):
-            make(section, "network", file)
+            build_from_config(section, "network", file)
         assert happened == []
         with pytest.raises(OSError):  # noqa: PT011 - any error of the connection
-            make(section, "network")
+            build_from_config(section, "network")
         assert happened

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.build import build
 from tangent_train.cli.transfer_stages import plan
-from tangent_train.registry import make
+from tangent_train.registry import build_from_config
 from tests.cli.test_compose import EXPERIMENTS
 from tests.running import composed
 
@@ -26,7 +26,9 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
     with torch.device("meta"):  # shapes only: build runs the network on an image of full size
         data, task = build(settings)
     assert task.class_names == data.class_names
-    trainer = make(settings["trainer"], "trainer", logger=False, enable_checkpointing=False)
+    trainer = build_from_config(
+        settings["trainer"], "trainer", logger=False, enable_checkpointing=False
+    )
     assert trainer.max_epochs == settings["trainer"]["max_epochs"]
     assert task.optimization(lambda: 1000)
     return set(task.state_dict())

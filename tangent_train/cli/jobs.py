@@ -45,7 +45,7 @@ class Job:
             return replace(self, value=None, error=message)
 
 
-def each(
+def run_jobs(
     description: str,
     jobs: Iterable[Job],
     count: int,

@@ -7,7 +7,7 @@ from rich.console import Console
 from tangent_train.errors import printable
 
 
-def say(text: str, *, error: bool = False) -> None:
+def print_text(text: str, *, error: bool = False) -> None:
     """Print text without markup, highlights, and breaks at the width of the terminal.
 
     Control characters are escaped: names of files and classes are untrusted.
