@@ -102,7 +102,6 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def find(self, problems: Problems) -> Found[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
-        self._rgb = reader.rgb
         name, read = self.reading(reader)
         store = Store.of(self.store, name, reader.settings, read.layout)
         found = Found(self.noun, splits, read, store)
@@ -148,13 +147,11 @@ class PanoramaDataModule(ImageDataModule):
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
-            the image, see `judge`.
+            the image.
         max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
 
     Attributes:
         erp_height: Rows of the panoramas read.
-        judge: Of `auto`, for the test split: helps to estimate, see `estimate_up`. To be set before
-            that split is read.
 
     Raises:
         DataError: The mask cannot be used.
@@ -177,7 +174,7 @@ class PanoramaDataModule(ImageDataModule):
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
         )
         self.erp_height: int = self.representation.erp_height
-        self.judge: PanoramaJudge | None = None
+        self._judge: PanoramaJudge | None = None
         rotation = self.test_rotation
         tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
         fine = tilt or rotation in (None, "so3")
@@ -214,14 +211,28 @@ class PanoramaDataModule(ImageDataModule):
             rotated = RotatedPanoramas(self.test_rotation, self.seed, known=known)
             transforms.append(rotated)
         if self.upright == "auto":
-            judge = self.judge if split == "test" else None
-            transforms.append(EstimatedUp(self.max_tilt_deg, self._rgb, rotated, judge))
+            judge = self._judge if split == "test" else None
+            reading: Any = found.read
+            transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
         return SplitItems(found, split, Panorama, transforms)
 
+    def estimate_up(self, judge: PanoramaJudge) -> None:
+        """Let a network help to estimate the up directions of the test panoramas.
+
+        They are estimated when the loader of the test split is made: the network is on its device
+        then. Without ``upright=auto`` nothing changes.
+
+        Args:
+            judge: Log-likelihoods of up directions, see `gravity.estimate_up`.
+        """
+        if self.upright == "auto":
+            self._judge = judge
+            self._sources.pop("test", None)
+
     def test_dataloader(self) -> DataLoader[Any]:
-        """Batches for the test; what is to be judged is estimated first, in this process."""
+        """Batches for the test; a network estimates up directions first, in this process."""
         source = self.source("test")
-        if self.judge is not None:
+        if self._judge is not None:
             read = (source.read(index) for index in range(len(source)))
             show_progress(read, "Estimating up", self.noun, len(source))
         return super().test_dataloader()

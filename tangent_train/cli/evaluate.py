@@ -166,7 +166,7 @@ class Run:
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
         if getattr(self.data, "upright", None) == "auto":
-            self.data.judge = NetworkJudge(self._as_trained(), trainer.strategy.root_device)
+            self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         task, noun = self.task, self.data.noun
         if task.kind == "classification":

@@ -105,6 +105,26 @@ def test_up_is_estimated_from_the_file_of_a_small_panorama(
     np.testing.assert_array_equal(seen, [rotated, rotated])
 
 
+def test_a_network_estimates_up_of_test_panoramas_that_were_read_before(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
+        return None if judge is None else np.eye(3)[judge(np.eye(3)).argmax()]
+
+    def judge(panorama: Any, ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        return ups[:, 1]
+
+    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    auto, upright = make_module(upright="auto"), make_module()
+    assert auto.source("test").read(0).up is None
+    for module in (auto, upright):
+        module.estimate_up(judge)
+        module.test_dataloader()
+    assert auto.source("test").read(0).up.tolist() == [0, 1, 0]
+    assert auto.source("val").read(0).up is None
+    assert upright.source("test").read(0).up is None
+
+
 def test_processes_share_the_panoramas(
     make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
