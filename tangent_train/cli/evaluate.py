@@ -22,7 +22,7 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.scores import Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.build import Settings, build, build_trained, check_fits, shown
 from tangent_train.cli.command_settings import EvaluateSettings
@@ -183,7 +183,10 @@ class Run:
         """The network of the run, with what it was trained on."""
         if self.trained is not None:
             return self.trained
-        data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
+        data, network = (
+            self.data,
+            ClassScoreNetwork(self.task.network, self.data.num_classes).eval(),
+        )
         return TrainedNetwork(
             network=network,
             class_names=data.class_names,
