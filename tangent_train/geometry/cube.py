@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,8 +79,13 @@ class CubeGrid(PinholeGrid):
         return _NEIGHBORS
 
     @property
+    def owned_dim(self) -> int:
+        """Pixels that span 90°."""
+        return math.ceil(2 / self.pitch - 1e-9)
+
+    @property
     def overlapping(self) -> bool:
-        """Whether there is a margin; else neighbours meet at their outer edges."""
+        """True if there is a margin; else neighbors meet at their outer edges."""
         return self.dim * self.pitch > 2
 
     def _resting_axes(self) -> NDArray[np.float64]:

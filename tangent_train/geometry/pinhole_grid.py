@@ -46,8 +46,13 @@ class PinholeGrid(ABC):
 
     @property
     @abstractmethod
+    def owned_dim(self) -> int:
+        """Side in pixels of the part of an image that contains every direction it owns."""
+
+    @property
+    @abstractmethod
     def overlapping(self) -> bool:
-        """Whether every direction is inside an image, not only on its outer edge."""
+        """True if every direction is inside an image, not only on its outer edge."""
 
     @abstractmethod
     def _resting_axes(self) -> NDArray[np.float64]:
