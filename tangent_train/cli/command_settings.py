@@ -173,8 +173,8 @@ class ImportSettings:
     weights: str | Path | None
     file: Path | None = field(metadata=_EXISTS)
     classes: Path | None = field(metadata=_EXISTS)
-    nothing: tuple[str, ...]
-    nothing_wins: bool
+    unknown_classes: tuple[str, ...]
+    unknown_wins: bool
     scores: ScoreKind | None
     image_size: tuple[int, ...] | None
     fov: float

@@ -23,5 +23,5 @@ def prepare(settings: Settings) -> None:
     else:
         data.prepare_data()
         data.setup()
-        counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
+        counts = ", ".join(f"{len(data.index().splits[s])} {s}" for s in ("train", "val", "test"))
         print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

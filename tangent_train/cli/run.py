@@ -24,7 +24,7 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.scores import Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.command_settings import ClassMapSettings
 from tangent_train.cli.settings import parse_settings
@@ -145,7 +145,7 @@ class Run:
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
         if getattr(self.data, "upright", None) == "auto":
-            self.data.judge = NetworkJudge(self._as_trained(), trainer.strategy.root_device)
+            self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         task, noun = self.task, self.data.noun
         if task.kind == "classification":
@@ -162,7 +162,8 @@ class Run:
         """The network of the run, with what it was trained on."""
         if self.trained is not None:
             return self.trained
-        data, network = self.data, Scores(self.task.network, self.data.num_classes).eval()
+        data = self.data
+        network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
         return TrainedNetwork(
             network=network,
             class_names=data.class_names,

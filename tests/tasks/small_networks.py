@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.scores import Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.run import build, inputs_and_classes
 from tangent_train.registry import SettingsFile, build_from_config
@@ -37,7 +37,9 @@ def small_trained(
 ) -> TrainedNetwork:
     """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
-    scores = Scores(with_statistics(build_from_config(settings, "network")), len(NAMES) - 1).eval()
+    scores = ClassScoreNetwork(
+        with_statistics(build_from_config(settings, "network")), len(NAMES) - 1
+    ).eval()
     multiple = size_multiple_of(scores, 4)
     return trained_network(
         TANGENT | {"level": 5},
