@@ -101,7 +101,7 @@ class TrainedNetwork:
 
 
 @dataclass(frozen=True)
-class Start:
+class NetworkDescription:
     """The description of the network that training starts from.
 
     Attributes:
@@ -199,7 +199,7 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
-def start_in(path: Path) -> Start | None:
+def describe_network(path: Path) -> NetworkDescription | None:
     """The description of the network in a file of this package; None for other files.
 
     Raises:
@@ -220,7 +220,7 @@ def start_in(path: Path) -> Start | None:
         content["settings"] = content["config"].get("network")
     if not isinstance(content["settings"], Mapping):
         return None
-    return Start(
+    return NetworkDescription(
         class_names=tuple(content["class_names"]),
         inputs=tuple(content["inputs"] or ()) or None,
         normalization=content["normalization"],
