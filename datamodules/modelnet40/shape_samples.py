@@ -102,8 +102,8 @@ class ShapeViews(Dataset[ShapeSample]):
 
     def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
         epoch, index = key
-        views = self._views(epoch, index)
-        images = views.render(self.source.read(index).spheres, "bilinear")
+        spheres = self.source.read(index).spheres
+        images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(epoch, index)])
         # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
@@ -111,13 +111,13 @@ class ShapeViews(Dataset[ShapeSample]):
             torch.tensor(index),
         )
 
-    def _views(self, epoch: int, index: int) -> Any:
+    def _views(self, epoch: int, index: int) -> list[Any]:
         if self.random:
-            return self.representation.sample(sample_rng(self.seed, epoch, index))
+            return [self.representation.sample(sample_rng(self.seed, epoch, index))]
         if self.rotation is None:
-            return self.representation.whole()
+            return self.representation.view_sets()
         # Rotated back, it sees what a rotated shape shows.
-        return self.representation.turned(self.shape_rotation(index).T).whole()
+        return self.representation.with_rotation(self.shape_rotation(index).T).view_sets()
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
         """The rotation of one shape, ``(3, 3)``: its point x is now at R x."""

@@ -19,21 +19,27 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from datamodules.core.inputs import normalize
+from datamodules.core.inputs import MAX_DEPTH_M, normalize
+from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
 from tangent_train.errors import SettingError
+from tangent_train.inference.representations import PanoramaViews
 from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.sampling import sphere_rays
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
     from torch import Tensor, nn
 
+    from datamodules.core.inputs import Input
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.inference.representations import InputImage, PanoramaViews, PhotoViews
-    from tangent_train.rendering import Representation
+    from tangent_train.inference.images import InputImage
+    from tangent_train.inference.representations import PhotoViews
+    from tangent_train.rendering import Interpolation, Representation
     from tangent_train.rendering.representations.views import Views
 
     ViewImages = Callable[[slice], Tensor]
@@ -105,7 +111,7 @@ def fill(
     return mosaic
 
 
-def world_rays(
+def upright_rays(
     representation: Representation, device: torch.device | str
 ) -> Iterator[Tensor | None]:
     """Viewing rays of each set of views, in a frame whose zenith is z.
@@ -118,6 +124,35 @@ def world_rays(
     for views in representation.view_sets():
         rays = views.rays()
         yield torch.from_numpy(rays).to(device) if len(rays) else None
+
+
+def input_planes(
+    image: InputImage, shape: tuple[int, int], inputs: Sequence[Input], device: torch.device | str
+) -> tuple[Tensor, list[tuple[Tensor, Interpolation]]]:
+    """The inputs of a network as images of whole panoramas or photos, on a device.
+
+    Args:
+        image: The image.
+        shape: Rows and columns to which it is resized.
+        inputs: Inputs of the network.
+        device: A torch device.
+
+    Returns:
+        RGB ``(3, H, W)`` float32 of 0 to 255; and the others, ``(1, H, W)``, with their
+        interpolation: depth as in `render_inputs`, and elevation.
+    """
+    rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(device).movedim(-1, 0).float()
+    others: list[tuple[Tensor, Interpolation]] = []
+    if "depth" in inputs and image.depth is not None:
+        steps = np.minimum(resize_depth(image.depth, shape), int(MAX_DEPTH_M * STEPS_PER_M))
+        others.append((torch.from_numpy(steps.view(np.int16))[None].to(device), "nearest"))
+    if "elevation" in inputs:
+        up = np.array((0.0, 0.0, 1.0)) if image.up is None else image.up
+        columns, rows = sphere_rays(shape)
+        level, lines = (torch.from_numpy(a).to(device) for a in (up[:2] @ columns, rows))
+        elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
+        others.append((elevation[None].float(), "bilinear"))
+    return resize(rgb, shape, "bilinear"), others
 
 
 class RenderedViews:
@@ -146,11 +181,9 @@ class RenderedViews:
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
         self._trained = trained
-        self._planes = None
-        if torch.device(device).type == "cpu":
-            self._image = image.resized(shape)
-        else:
-            self._planes = input_planes(image, shape, trained.inputs, device)
+        on_cpu = torch.device(device).type == "cpu"
+        self._image = image.resized(shape) if on_cpu else image
+        self._planes = None if on_cpu else input_planes(image, shape, trained.inputs, device)
 
     def __call__(self, views: Views) -> Tensor:
         """Views ``(n, C, h, w)``, normalized."""
@@ -158,7 +191,7 @@ class RenderedViews:
         if self._planes is None:
             rendered = render_inputs(self._image, views, inputs)
         else:
-            rgb, *others = self._planes
+            rgb, others = self._planes
             colors = views.render(rgb, "bilinear").round().movedim(1, -1)
             rendered = colors, *(views.render(plane, how)[:, 0] for plane, how in others)
         images = normalize(rendered, self._trained.normalization, inputs)
@@ -230,19 +263,20 @@ class Predictor:
             The scores; score k is that of label k + 1, the last one perhaps of nothing, see
             `TrainedNetwork.groups`.
         """
-        seen = self._view_sets(image)
+        sources = self._view_sets(image)
         network: Any = self._trained.network
-        rays: Iterable[Tensor | None] = [None] * len(seen)
+        device = self.device
+        sets: list[tuple[Views, ViewImages, Tensor | None]] = []
+        for shown, shape, views in sources:
+            rendered = RenderedViews(self._trained, shown, shape, device)
+            sets += [(part, rendered.of(part), None) for part in views]
         if sees_rays(network):
             network = partial(network, images_per_chunk=self._per_forward)
-            rays = self._view_sets.rays(self.device)
-        sets = [
-            (views, RenderedViews(self._trained, shown, self.device).of(views), of_set)
-            for (shown, views), of_set in zip(seen, rays, strict=True)
-        ]
-        count = sum(len(views) for _, views in seen)
-        averaged = probabilities or len(seen) > 1
-        mosaic = self._mosaic(image.shape, averaged=averaged)
+            if isinstance(self._view_sets, PanoramaViews):
+                rays = upright_rays(self._view_sets.representation, device)
+                sets = [(*part[:2], of_set) for part, of_set in zip(sets, rays, strict=True)]
+        count = sum(len(views) for views, _, _ in sets)
+        mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
         return fill(mosaic, network, sets, self._per_forward, lambda done: progress(done / count))
 
     def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:

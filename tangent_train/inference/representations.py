@@ -23,8 +23,6 @@ from tangent_train.rendering.representations.pinhole import PinholeRepresentatio
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
@@ -241,9 +239,7 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         )
 
 
-def _covered(
-    image: InputImage, wanted: PerspectiveRepresentation, overlap: float
-) -> SourceViews:
+def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:
     """Crops that cover a photo, mirrored at its borders as far as a crop is larger.
 
     Args:

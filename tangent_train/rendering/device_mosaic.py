@@ -99,7 +99,9 @@ class DeviceSums:
                     continue
                 is_owner = owner[rows, columns] == number
                 if self._averaged:
-                    self.sums[:, rows, columns].addcmul_(_softmax(sampled[None])[0], is_owner.float())
+                    self.sums[:, rows, columns].addcmul_(
+                        _softmax(sampled[None])[0], is_owner.float()
+                    )
                 else:
                     best = _without_nan(sampled).argmax(dim=0).int()
                     labels = self._labels[rows, columns]
@@ -142,23 +144,27 @@ class _Rays:
         # To offsets from the center in half image sides.
         scaled = np.diag([2 / width, 2 / height, 1]) @ matrices
         scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * matrices[:, 2:]
-        m, c, r = (torch.from_numpy(a).to(device, dtype) for a in (scaled, columns, rows))
-        self._of_columns = m[:, :, :2] @ c  # (n, 3, W)
+        m, c, r = (
+            torch.from_numpy(a).to(device, dtype, non_blocking=True)
+            for a in (scaled, columns, rows)
+        )
+        with torch.autocast(device.type, enabled=False):
+            self._of_columns = m[:, :, :2] @ c  # (n, 3, W)
         self._of_rows = m[:, :, 2:] * r[:, 1]  # (n, 3, H)
         self._factor = r[:, :1]
 
     def offsets(self, m: int, rows: slice, columns: slice) -> Tensor:
         """``(2, rows, columns)`` offsets in image m; 2 where it looks away."""
         x, y, z = torch.addcmul(
-            self._of_rows[m, :, rows, None], self._factor[rows], self._of_columns[m, :, None, columns]
+            self._of_rows[m, :, rows, None],
+            self._factor[rows],
+            self._of_columns[m, :, None, columns],
         )
         offsets = torch.stack([x, y]) / z
         return offsets.masked_fill_(z <= 0, 2)
 
 
-def _boxes(
-    spans: NDArray[np.int32], width: int, num_classes: int
-) -> Iterator[tuple[slice, slice]]:
+def _boxes(spans: NDArray[np.int32], width: int, num_classes: int) -> Iterator[tuple[slice, slice]]:
     """Rows and columns of rectangles that contain spans of an image.
 
     Args:

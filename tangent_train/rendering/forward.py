@@ -137,7 +137,8 @@ def rotate_equirect(
         shape = image.shape[-2], image.shape[-1]
         dtype = map_dtype(image.dtype == torch.float64, interpolation)
         places = _rotation_map(rotated, shape, dtype).in_panorama()
-        u, v = (torch.from_numpy(line).to(image.device).split(_CHUNK) for line in places)
+        on_device = (torch.from_numpy(line).to(image.device) for line in places)
+        u, v = (torch.split(line, _CHUNK) for line in on_device)
         source = image.reshape(-1, shape[0] * shape[1])
         parts = [_sampled(source, *at, shape, interpolation) for at in zip(u, v, strict=True)]
         return torch.cat(parts, dim=1).reshape(image.shape)

@@ -210,7 +210,12 @@ def _seen_runs(tile: Tile, m: int, geometry: CanvasGeometry, runs: Array) -> int
 
 @njit_fast
 def _list_pixels(
-    m: int, side: tuple[int, int], geometry: CanvasGeometry, found: int, step: tuple[int, int], buffers: _TileBuffers
+    m: int,
+    side: tuple[int, int],
+    geometry: CanvasGeometry,
+    found: int,
+    step: tuple[int, int],
+    buffers: _TileBuffers,
 ) -> int:
     """List the pixels of runs that image m contributes to; returns how many.
 
@@ -496,7 +501,13 @@ def _add_to_tile(
 
 @njit_fast
 def add_images(
-    start: int, stop: int, scores: Array, geometry: CanvasGeometry, softmax: bool, total: Array, labels: Array
+    start: int,
+    stop: int,
+    scores: Array,
+    geometry: CanvasGeometry,
+    softmax: bool,
+    total: Array,
+    labels: Array,
 ) -> None:
     """Add weighted scores of images to rows ``start:stop`` of a canvas, or write best classes.
 
@@ -597,7 +608,9 @@ def _interpolated_classes(
 
 
 @njit_fast
-def _write_alike(n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array) -> int:
+def _write_alike(
+    n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array
+) -> int:
     """Write labels of pixels around which all four pixels of the image have the same best class.
 
     Args:
@@ -626,7 +639,9 @@ def _write_alike(n: int, best: Array, corner: tuple[int, int], buffers: _TileBuf
 
 
 @njit_fast
-def label_images(start: int, stop: int, scores: Array, geometry: CanvasGeometry, labels: Array) -> None:
+def label_images(
+    start: int, stop: int, scores: Array, geometry: CanvasGeometry, labels: Array
+) -> None:
     """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
 
     Where the four pixels of an image around a position have the same best class, so has the
@@ -640,7 +655,11 @@ def label_images(start: int, stop: int, scores: Array, geometry: CanvasGeometry,
         labels: ``(H, W)``, written.
     """
     side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
-    buffers, taps, owns = _tile_buffers(pixels), _tap_buffers(pixels), np.empty(_count(geometry), np.bool_)
+    buffers, taps, owns = (
+        _tile_buffers(pixels),
+        _tap_buffers(pixels),
+        np.empty(_count(geometry), np.bool_),
+    )
     highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
     for tile in _tiles(start, stop, geometry, pixels):

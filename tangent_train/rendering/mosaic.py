@@ -10,7 +10,7 @@ Two backends give the same results: compiled kernels on the CPU (`accumulate`), 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -46,6 +46,7 @@ class ScoreMosaic:
         min_confidence: Probability from which the best class is certain, see `labels`; above 0,
             sums are kept.
         device: Device of the mosaic; sums that are too large for it are kept on the CPU.
+        backend: ``numba`` on the CPU, or ``torch``; None for the one that suits the device.
         spare: `sums` of a mosaic that is no longer used, to reuse its memory.
 
     Attributes:
@@ -66,6 +67,7 @@ class ScoreMosaic:
         averaged: bool = False,
         min_confidence: float = 0.0,
         device: torch.device | str = "cpu",
+        backend: Literal["numba", "torch"] | None = None,
         spare: NDArray[np.float32] | None = None,
     ) -> None:
         self.shape = shape
@@ -76,7 +78,10 @@ class ScoreMosaic:
         self._owned: tuple[object, Any] = None, NO_OWNERS
         self._on_device: DeviceSums | None = None
         self.sums = np.empty((0, 0, 0), np.float32)
-        if torch.device(device).type != "cpu" and fits_on(device, shape, num_classes):
+        if backend is None:
+            suits = torch.device(device).type != "cpu" and fits_on(device, shape, num_classes)
+            backend = "torch" if suits else "numba"
+        if backend == "torch":
             self._on_device = DeviceSums(shape, num_classes, device, averaged=self._averaged)
             return
         self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)

@@ -30,8 +30,7 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
         interpolation: ``bilinear`` averages where the image shrinks; ``nearest`` takes the pixels
             at the centers.
     """
-    is_tensor = isinstance(image, Tensor)
-    height, width = image.shape[1:] if is_tensor else image.shape[:2]
+    height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
     if (height, width) == shape:
         return image
     if interpolation == "nearest":
@@ -39,16 +38,14 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
             (2 * np.arange(after) + 1) * before // (2 * after)
             for after, before in zip(shape, (height, width), strict=True)
         )
-        if is_tensor:
-            return _take(image, rows, columns)
-        return image[rows][:, columns]
+        return _taken(image, rows, columns)
     smaller = shape[0] < height
-    if not is_tensor:
-        method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
-        resized: Any = cv2.resize(image, shape[::-1], interpolation=method)
-        return resized
-    whole = np.array((0.0, 0.0, width, height))
-    return _filtered(image, whole, shape, "area" if smaller else "linear")
+    if isinstance(image, Tensor):
+        whole = np.array((0.0, 0.0, width, height))
+        return _filtered(image, whole, shape, "area" if smaller else "linear")
+    method = cv2.INTER_AREA if smaller else cv2.INTER_LINEAR
+    resized: Any = cv2.resize(image, shape[::-1], interpolation=method)
+    return resized
 
 
 def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpolation) -> Pixels:
@@ -66,9 +63,7 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
             np.linspace(near, far, 2 * count + 1)[1::2].astype(np.intp)
             for near, far, count in zip(box[:2], box[2:], shape[::-1], strict=True)
         )
-        if isinstance(image, Tensor):
-            return _take(image, rows, columns)
-        return image[rows][:, columns]
+        return _taken(image, rows, columns)
     if isinstance(image, Tensor):
         return _filtered(image, box, shape, "triangle")
     corners = tuple(box.tolist())
@@ -77,7 +72,9 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
     return result
 
 
-def _take(image: Tensor, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Tensor:
+def _taken(image: Pixels, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Pixels:
+    if isinstance(image, np.ndarray):
+        return image[rows][:, columns]
     down, across = (torch.from_numpy(index).to(image.device) for index in (rows, columns))
     return image.index_select(-2, down).index_select(-1, across)
 
@@ -95,7 +92,8 @@ def _filtered(
             ((box[1], box[3], shape[0]), (box[0], box[2], shape[1]))
         )
     )
-    return (down @ (image @ across.T)).round()
+    with torch.autocast(image.device.type, enabled=False):
+        return (down @ (image @ across.T)).round()
 
 
 def _weights(

@@ -270,7 +270,7 @@ def canvas_geometry(
 def find_spans(
     grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int], rows: slice
 ) -> NDArray[np.int32]:
-    """``(n, rows, 2)`` see `kernels.CanvasGeometry.spans`; the arguments are `canvas_geometry`'s."""
+    """``(n, rows, 2)`` spans, see `kernels.CanvasGeometry`; arguments as of `canvas_geometry`."""
 
     def build() -> tuple[NDArray[np.int32]]:
         spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)

@@ -91,8 +91,8 @@ def shown_arrays(
     truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
     if truth.ndim == _PANORAMA_DIMENSIONS:
         return image.rgb, truth, labels
-    crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
-    return np.hstack(crops), np.hstack(truth), np.hstack(labels)
+    (crops,) = image.sampler(representation).view_sets()
+    return np.hstack(crops.render(image.rgb, "bilinear")), np.hstack(truth), np.hstack(labels)
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -58,15 +58,16 @@ class EquirectViews(Views):
             shown = rotate_equirect(shown, self.rotation.T, interpolation)
         if self.rows is not None:
             shown = resize(shown, (self.rows, 2 * self.rows), interpolation)
-        if isinstance(shown, Tensor):
-            columns = shown.roll(-self.first, -1)[None, ..., : self.width]
+        if isinstance(image, Tensor):
+            columns: Any = shown.roll(-self.first, -1)[None, ..., : self.width]
             return columns.flip(-1) if self.mirrored else columns
         if self.first or self.width is not None:
             stop = self.first + (self.width or shown.shape[1])
             shown = shown.take(np.arange(self.first, stop), axis=1, mode="wrap")
         if self.mirrored:
             shown = shown[:, ::-1]
-        return np.ascontiguousarray(shown[None])
+        view: Any = np.ascontiguousarray(shown[None])
+        return view
 
     def rays(self) -> NDArray[np.float32]:
         """No rays: it is not a pinhole image."""
@@ -152,7 +153,10 @@ class EquirectRepresentation:
         """The panorama or one crop of it, optionally rotated."""
         first, width, columns = 0, None, self.image_size[1]
         if self.crop_deg is not None or self.random_rotation == "yaw":
-            first, width = int(rng.random() * columns), round(columns * (self.crop_deg or 360) / 360)
+            first, width = (
+                int(rng.random() * columns),
+                round(columns * (self.crop_deg or 360) / 360),
+            )
         rotation = self._rotation
         if self.random_rotation == "so3":
             drawn = random_rotation(rng).T

@@ -42,7 +42,7 @@ class PhotoCrops(Views):
             corner.
         size: Rows and columns of the crops.
         mirrored: True if they are mirrored left to right.
-        part: Crops that are rendered.
+        numbers: ``(n,)`` crops that are rendered; None for all.
         canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
         overlapping: See `Placement`.
     """
@@ -50,7 +50,7 @@ class PhotoCrops(Views):
     boxes: NDArray[np.float64]
     size: tuple[int, int]
     mirrored: bool = False
-    part: slice = slice(None)
+    numbers: NDArray[np.int64] | None = None
     canvas_boxes: NDArray[np.float64] | None = None
     overlapping: bool = True
 
@@ -58,14 +58,12 @@ class PhotoCrops(Views):
         return len(self.chosen)
 
     def __getitem__(self, part: slice) -> Self:
-        inner = self.chosen[part]
-        first = int(inner[0]) if len(inner) else 0
-        return replace(self, part=slice(first, first + len(inner)))
+        return replace(self, numbers=self.chosen[part])
 
     @property
     def chosen(self) -> NDArray[np.int64]:
         """See `Placement`."""
-        return np.arange(len(self.boxes))[self.part]
+        return np.arange(len(self.boxes)) if self.numbers is None else self.numbers
 
     @property
     def all_images(self) -> object:
@@ -74,7 +72,7 @@ class PhotoCrops(Views):
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`; for ``bilinear`` an array is uint8."""
-        parts: Any = [crop(image, b, self.size, interpolation) for b in self.boxes[self.part]]
+        parts: Any = [crop(image, b, self.size, interpolation) for b in self.boxes[self.chosen]]
         if isinstance(image, Tensor):
             crops = torch.stack(parts)
             return crops.flip(-1) if self.mirrored else crops
@@ -114,7 +112,7 @@ class PhotoCrops(Views):
         self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
     ) -> CanvasGeometry:
         """See `Placement`."""
-        boxes = self._on_canvas[self.part]
+        boxes = self._on_canvas[self.chosen]
         across, down = (self.size[1 - i] / (boxes[:, 2 + i] - boxes[:, i]) for i in (0, 1))
         # Of the ray (j, 1, i): pixel j of the photo is at j + ½ from its corner.
         matrices = np.zeros((len(boxes), 3, 3))
@@ -128,7 +126,7 @@ class PhotoCrops(Views):
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """See `Placement`."""
-        return _spans(self._owned_pixels(shape)[self.part], shape)
+        return _spans(self._owned_pixels(shape)[self.chosen], shape)
 
     def _owned_pixels(self, shape: tuple[int, int]) -> NDArray[np.intp]:
         """``(N, 4)`` first column and row of the owned pixels, and those after the last."""

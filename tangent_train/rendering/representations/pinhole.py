@@ -51,8 +51,8 @@ class PinholeRepresentation:
 
     def __init__(
         self,
-        grid: _Grid,
-        grids: Sequence[_Grid],
+        grid: PinholeGrid,
+        grids: Sequence[PinholeGrid],
         level: int,
         random_rotation: RotationAugmentation,
         mirror: bool,
@@ -64,7 +64,7 @@ class PinholeRepresentation:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
         check_choice("representation.blend", blend, ("nearest", "feather"))
-        self.grid = grid
+        self.grid: PinholeGrid = grid
         self.random_rotation = random_rotation
         self.mirror = mirror
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
@@ -211,9 +211,7 @@ class CubemapRepresentation(PinholeRepresentation):
     ) -> None:
         quarter = equirect_shape(level)[1] // 4
         grid = CubeGrid(quarter + 2 * margin if dim is None else dim, margin=margin)
-        super().__init__(
-            grid, [grid], level, random_rotation, mirror, erp_height, blend, rotations
-        )
+        super().__init__(grid, [grid], level, random_rotation, mirror, erp_height, blend, rotations)
 
 
 def level_list(levels: int | Sequence[int] | None, level: int) -> list[int]:

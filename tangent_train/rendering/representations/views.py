@@ -171,8 +171,11 @@ class PinholeViews:
         images: Any = equirect_to_tangent(image, self.grid, self.faces, interpolation)
         if not self.mirrored:
             return images
-        is_tensor = isinstance(images, Tensor)
-        return images.flip(-1) if is_tensor else np.ascontiguousarray(images[:, :, ::-1])
+        if isinstance(image, Tensor):
+            flipped: Any = images.flip(-1)
+            return flipped
+        mirrored: Any = np.ascontiguousarray(images[:, :, ::-1])
+        return mirrored
 
     def rays(self) -> NDArray[np.float32]:
         """Camera axes, scaled to the images' edges; see `Views`."""

@@ -17,11 +17,12 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.inference.class_maps import ClassMap, map_classes
+from tangent_train.inference.engine import Predictor
 from tangent_train.inference.export import export_network
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.photo_networks.score_kinds import try_network
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews
+from tangent_train.inference.representations import PanoramaViews
 from tests.models.onnx_files import write_linear
 
 UNIT = Normalization((0, 0, 0), (1, 1, 1))
@@ -249,7 +250,7 @@ def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path
         expected = network(images).sigmoid()
         found = again.network(images).softmax(dim=1)
     torch.testing.assert_close(found[:, :1], expected, atol=1e-5, rtol=1e-4)
-    assert again.labels(np.array([0, 1], np.uint8)).tolist() == [1, 0]
+    assert again.labels(torch.tensor([0, 1], dtype=torch.uint8)).tolist() == [1, 0]
 
 
 def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path) -> None:
