@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from datamodules.core.split_module import Kind
+from datamodules.core.labeled_data import Kind
 from tangent_train.errors import SettingError
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of

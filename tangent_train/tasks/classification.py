@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from datamodules.core.split_module import Kind
+from datamodules.core.labeled_data import Kind
 from tangent_train.metrics.classification import ClassCounts, classification_scores
 from tangent_train.registry import registered
 from tangent_train.tasks.base import Task

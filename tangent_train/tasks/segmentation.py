@@ -11,7 +11,7 @@ from jaxtyping import Float, Integer
 from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
-from datamodules.core.split_module import Kind
+from datamodules.core.labeled_data import Kind
 from tangent_train.errors import SettingError
 from tangent_train.inference.predictor import sees_rays, view_scores
 from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
