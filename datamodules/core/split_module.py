@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from lightning import LightningDataModule
@@ -19,15 +19,13 @@ from torch.utils.data import DataLoader, Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
 from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
 from datamodules.core.inputs import Normalization
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
 from tangent_train.threads import in_threads
-
-Kind = Literal["segmentation", "classification"]
-"""Kind of labels: classes of pixels, or of whole shapes."""
 
 _GO_ON = (
     "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
@@ -61,8 +59,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         skip_broken: Leave broken items out, after reading all once, instead of refusing.
 
     Attributes:
-        class_names: Name of every label; in segmentation the first is unknown, which is no class.
-        kind: Kind of its labels.
+        class_names: Name of every label; the first of pixel classes is unknown, not a class.
+        labels: Labels that its items have, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
         is_made: Whether `make_files` generates all of it.
         label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
@@ -73,7 +71,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         SettingError: A setting is invalid.
     """
 
-    kind: ClassVar[Kind] = "segmentation"
+    labels: ClassVar[str] = PIXEL_CLASSES
     noun: ClassVar[str]
     is_made: ClassVar[bool] = False
 
@@ -284,7 +282,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             SettingError: It does not.
         """
         names = getattr(self, "class_names", ())
-        if not names or (self.kind == "segmentation" and names[0] != "unknown"):
+        if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
             raise SettingError(
                 f"class_names of {type(self).__name__}",
                 found=f"{names[0]} first" if names else "none",
@@ -348,7 +346,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     @property
     def num_classes(self) -> int:
         """Classes K: the scores of a network."""
-        return len(self.class_names) - (self.kind == "segmentation")
+        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
 
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Weights of the classes in the loss, from the labels of the training split.

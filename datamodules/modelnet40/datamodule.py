@@ -15,9 +15,10 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from datamodules.core.found import Found, Split, SplitItems, draw_groups
+from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
-from datamodules.core.split_module import Kind, SplitDataModule
+from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Declared, Store
 from datamodules.modelnet40.meshes import CHANNELS
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
@@ -62,7 +63,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
-    kind: ClassVar[Kind] = "classification"
+    labels: ClassVar[str] = IMAGE_CLASS
 
     shapes_per_step: int = 16
     test_rotation: TestRotation = None

@@ -65,7 +65,7 @@ def build(
 
 
 def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
-    """The data module of a run, of the kind that its task takes; see `build`."""
+    """The data module of a run, with the labels that its task needs; see `build`."""
     representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
@@ -73,9 +73,14 @@ def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()
-    kind = getattr(resolve_target(settings["task"], "task", source), "kind", data.kind)
-    if kind != data.kind:
-        raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
+    task = resolve_target(settings["task"], "task", source)
+    needed = getattr(task, "labels", data.labels)
+    if needed != data.labels:
+        raise SettingError(
+            "task",
+            found=f"{getattr(task, '__name__', task)}, which needs {needed}",
+            expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
+        )
     return data
 
 

@@ -34,11 +34,9 @@ from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.results.evaluation import (
-    classification_record,
     confusion_table,
     headline,
     result_tables,
-    segmentation_record,
     write_results,
 )
 from tangent_train.results.html import write_report
@@ -130,11 +128,14 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        contents = {"kind": self.task.kind, "config": self.settings, **shown(self.data)}
-        common = [CheckpointContents(contents), ProgressBar(), ClassScores()]
-        if self.task.kind == "segmentation":
-            common.append(PredictionPanels(self.folder / "panels", self.settings["panels"]))
-            common.append(ValidationPictures(self.settings["tensorboard_images"]))
+        contents = {"predicts": self.task.predicts, "config": self.settings, **shown(self.data)}
+        common = [
+            CheckpointContents(contents),
+            ProgressBar(),
+            ClassScores(),
+            PredictionPanels(self.folder / "panels", self.settings["panels"]),
+            ValidationPictures(self.settings["tensorboard_images"]),
+        ]
         section = self.settings["trainer"]
         # Devices found, advertisements, what the settings say anyway.
         logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
@@ -168,12 +169,8 @@ class Run:
         if getattr(self.data, "upright", None) == "auto":
             self.data.judge = NetworkJudge(self._as_trained(), trainer.strategy.root_device)
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        task, noun = self.task, self.data.noun
-        if task.kind == "classification":
-            record = classification_record(task.matrices, task.class_names, noun)
-        else:
-            names, absent = task.class_names, task.absent_class
-            record = segmentation_record(task.matrices, names, absent, noun)
+        noun = self.data.noun
+        record = self.task.record(self.task.result, noun)
         total = len(self.data.source("test"))
         if record.images != total:
             raise RuntimeError(f"{record.images} of {total} test {noun} were counted")

@@ -65,7 +65,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     checkpoints = run.folder / "checkpoints"
     needed = _typed_local(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
-    best = BestCheckpoint(checkpoints, run.task.monitor)
+    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.monitor_mode)
     trainer = run.trainer([last, LearningRateMonitor(), best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])

@@ -76,7 +76,7 @@ def write_checkpoint(
             "representation": representation,
             "level": representation["level"],
         },
-        "kind": "segmentation",
+        "predicts": "pixel_classes",
         "state_dict": trained.network.state_dict(),
         **shown(trained),
     }

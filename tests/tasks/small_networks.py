@@ -70,7 +70,7 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
         settings["network"], data.in_channels, data.num_classes
     )
     with_statistics(task.network)
-    content = {"config": settings, "kind": task.kind, **shown(data)}
+    content = {"config": settings, "predicts": task.predicts, **shown(data)}
     torch.save(content | {"state_dict": task.state_dict()}, path)
     trained: SegmentationTask = task.eval()
     return trained
