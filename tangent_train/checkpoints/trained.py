@@ -26,7 +26,7 @@ from tangent_train.checkpoints.content import (
     ScoreKind,
     read_checkpoint,
 )
-from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
 from tangent_train.registry import SettingsFile, Text, build_from_config, check_fields, check_plain
@@ -75,7 +75,7 @@ class TrainedNetwork:
         source: The file that `representation` and `settings` come from.
     """
 
-    network: Scores
+    network: ClassScoreNetwork
     class_names: tuple[str, ...]
     inputs: tuple[Input, ...]
     normalization: Normalization
@@ -102,7 +102,7 @@ class TrainedNetwork:
 
 
 @dataclass(frozen=True)
-class Start:
+class NetworkDescription:
     """The description of the network that training starts from.
 
     Attributes:
@@ -200,7 +200,7 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
-def start_in(path: Path) -> Start | None:
+def describe_network(path: Path) -> NetworkDescription | None:
     """The description of the network in a file of this package; None for other files.
 
     Raises:
@@ -221,7 +221,7 @@ def start_in(path: Path) -> Start | None:
         content["settings"] = content["config"].get("network")
     if not isinstance(content["settings"], Mapping):
         return None
-    return Start(
+    return NetworkDescription(
         class_names=tuple(content["class_names"]),
         inputs=tuple(content["inputs"] or ()) or None,
         normalization=content["normalization"],
@@ -306,7 +306,9 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     size = build_from_config(config["representation"], "representation", source).image_size
     network = _network(described, tensors, source)
     kind = described["score_kind"]
-    scores = Scores(network, len(described["class_names"]) - 1, described["groups"], kind=kind)
+    scores = ClassScoreNetwork(
+        network, len(described["class_names"]) - 1, described["groups"], kind=kind
+    )
     fixed, multiple = content["fixed_size"], None
     if fixed is None:
         multiple = size_multiple_of(scores, len(channel_names(described["inputs"])))
@@ -350,7 +352,9 @@ def _trained(
     if tile is not None and min(tile) < 1:
         raise ValueError(f"fixed_size={fixed}")
     known = {
-        "network": Scores(network, len(names) - 1, groups, tile, described["score_kind"]).eval(),
+        "network": ClassScoreNetwork(
+            network, len(names) - 1, groups, tile, described["score_kind"]
+        ).eval(),
         "class_names": names,
         "inputs": tuple(described["inputs"]),
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),

@@ -173,8 +173,8 @@ class ImportSettings:
     weights: str | Path | None
     file: Path | None = field(metadata=_EXISTS)
     classes: Path | None = field(metadata=_EXISTS)
-    nothing: tuple[str, ...]
-    nothing_wins: bool
+    unknown_classes: tuple[str, ...]
+    unknown_wins: bool
     scores: ScoreKind | None
     image_size: tuple[int, ...] | None
     fov: float
@@ -216,6 +216,14 @@ class TrainSettings(RunSettings):
     name: str | Path
     init_from: Path | None = field(metadata=_EXISTS)
     resume: Path | None = field(metadata=_EXISTS)
+
+
+@dataclass(frozen=True)
+class ClassMapSettings:
+    """Class map of an evaluation, see ``configs/evaluate.yaml``."""
+
+    class_map: str | Path
+    unmapped: Literal["unknown", "never"]
 
 
 @dataclass(frozen=True, kw_only=True)

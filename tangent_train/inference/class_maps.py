@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Literal
 
 from datamodules.images.image_files import composed
-from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
@@ -167,7 +167,7 @@ def map_classes(
         nothing += [k for place in left for k in groups[place]]
     scores += [nothing] if nothing else []
     how = scores, trained.fixed_size, trained.score_kind
-    network = Scores(trained.network.network, len(targets), *how).eval()
+    network = ClassScoreNetwork(trained.network.network, len(targets), *how).eval()
     names = ("unknown", *targets)
     found = {str(target): [own[k] for k in group] for target, group in places.items()}
     return MappedNetwork(

@@ -22,7 +22,7 @@ from tangent_train.checkpoints.trained import (
 )
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path
-from tangent_train.inference.quiet import quiet
+from tangent_train.inference.library_output import hide_output
 
 SUFFIXES = (".onnx", ".safetensors")
 
@@ -135,7 +135,7 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
         least = -(-_LEAST_TRACED // step)
         size = step * max(3, least), step * max(4, least + 1)  # no two dimensions are equal
     returns_labels = trained.score_kind == "labels"
-    with quiet():
+    with hide_output():
         program: Any = torch.onnx.export(
             trained.network.network if returns_labels else trained.network,
             (_random_images(trained, 2, size),),

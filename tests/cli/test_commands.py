@@ -23,9 +23,9 @@ from torch import nn
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
-from tangent_train.cli.build import _fault
 from tangent_train.cli.compose import path_text
 from tangent_train.cli.stored import stored_run
+from tangent_train.cli.trials import find_fault
 from tangent_train.console import print_text
 from tangent_train.results.record import load_record
 from tangent_train.results.tables import Table
@@ -226,8 +226,8 @@ def test_a_trial_of_a_network_finds_its_fault_whatever_the_memory_holds() -> Non
 
     torch.use_deterministic_algorithms(True)  # new memory is filled with large numbers
     try:
-        assert "more than 1 value" in str(_fault(Indexed(), (1, 3, 4, 4), trains=True))
-        assert _fault(Indexed(), (2, 3, 4, 4), trains=True) is None
+        assert "more than 1 value" in str(find_fault(Indexed(), (1, 3, 4, 4), trains=True))
+        assert find_fault(Indexed(), (2, 3, 4, 4), trains=True) is None
     finally:
         torch.use_deterministic_algorithms(False)
 

@@ -119,7 +119,7 @@ def test_the_network_judges_which_way_is_up(
         asked.append(max_tilt_deg)
         return np.array([0.0, 0, -1])
 
-    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
     given = ["data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]
     mapped = _written(tmp_path / "map.json", MAP)
     run("evaluate", network, *ROOMS, *given, mapped, "hydra.run.dir=imported")

@@ -14,7 +14,7 @@ import torch
 from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.checkpoints.trained import (
     TrainedNetwork,
     load_trained,
@@ -40,8 +40,8 @@ def import_network(
     fov_deg: float = 60.0,
     level: int | None = None,
     base_level: int | None = None,
-    nothing: Collection[str] = (),
-    nothing_wins: bool = True,
+    unknown_classes: Collection[str] = (),
+    unknown_wins: bool = True,
     image_size: tuple[int, int] | None = None,
     score_kind: ScoreKind | None = None,
 ) -> TrainedNetwork:
@@ -53,8 +53,8 @@ def import_network(
         fov_deg: Horizontal field of view of the photos it was trained on.
         level: Level s of the panoramas; None for the angular resolution of those photos.
         base_level: Base level b of the tangent images; None for the size of those photos.
-        nothing: Names of scores that mean nothing, such as a background.
-        nothing_wins: Whether these may win, which is then written as unknown (label 0).
+        unknown_classes: Names of scores of no class, such as a background.
+        unknown_wins: True if these may win, which is then written as unknown (label 0).
         image_size: The only rows and columns to give the network; None for the size that it says
             and, where it takes others, any.
         score_kind: What it returns; None for what its library says, or to find it by trying.
@@ -75,13 +75,13 @@ def import_network(
     if image_size is not None:
         network = replace(network, image_size=image_size, fixed_size=True)
     kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
-    names, groups = _groups(network.score_names, kind, count, nothing, nothing_wins)
-    scores = Scores(network.network, len(names) - 1, groups, kind=kind)
+    names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
+    scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
     fixed = None if multiple else network.image_size
     seen = representation_of(network.image_size, fov_deg, level, base_level, is_fixed=not multiple)
     described = TrainedNetwork(
-        network=Scores(network.network, len(names) - 1, groups, fixed, kind),
+        network=ClassScoreNetwork(network.network, len(names) - 1, groups, fixed, kind),
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
@@ -144,29 +144,38 @@ def _groups(
     score_names: Sequence[str],
     kind: ScoreKind,
     count: int,
-    nothing: Collection[str],
+    unknown_classes: Collection[str],
     wins: bool,
 ) -> tuple[list[str], Groups | None]:
     """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
-    score_names, nothing = list(map(composed, score_names)), list(map(composed, nothing))
-    missing = set(nothing) - set(score_names)
+    score_names, unknown_classes = (
+        list(map(composed, score_names)),
+        list(map(composed, unknown_classes)),
+    )
+    missing = set(unknown_classes) - set(score_names)
     if missing:
         raise SettingError(
-            "nothing", found=", ".join(sorted(missing)), expected=f"of {', '.join(score_names)}"
+            "unknown_classes",
+            found=", ".join(sorted(missing)),
+            expected=f"of {', '.join(score_names)}",
         )
     places, rest = _places(len(score_names), kind, count)
-    kept = [(k, name) for k, name in zip(places, score_names, strict=True) if name not in nothing]
+    kept = [
+        (k, name)
+        for k, name in zip(places, score_names, strict=True)
+        if name not in unknown_classes
+    ]
     if not kept:
-        raise SettingError("nothing", found="all classes", expected="some of them")
+        raise SettingError("unknown_classes", found="all classes", expected="some of them")
     if not wins and (len(kept) == 1 or kind == "labels"):
         raise SettingError(
-            "nothing_wins",
+            "unknown_wins",
             found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
-            expected="true: where nothing may not win, the network has no other class to give",
+            expected="true: where they may not win, the network has no other class to give",
         )
-    rest += [k for k, name in zip(places, score_names, strict=True) if name in nothing]
+    rest += [k for k, name in zip(places, score_names, strict=True) if name in unknown_classes]
     names = ["unknown", *(name for _, name in kept)]
-    if kind in ("logits", "probabilities") and not nothing:
+    if kind in ("logits", "probabilities") and not unknown_classes:
         return names, None
     return names, [[k] for k, _ in kept] + ([rest] if rest and wins else [])
 
