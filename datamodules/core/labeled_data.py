@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from lightning.pytorch.utilities import rank_zero_only
@@ -17,15 +17,13 @@ from torch.utils.data import Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
 from datamodules.core.index import SPLITS, DatasetIndex, Item, Split
 from datamodules.core.inputs import Normalization
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.problems import Problems
 from datamodules.core.reading import SplitReader
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
 from tangent_train.threads import in_threads
-
-Kind = Literal["segmentation", "classification"]
-"""Kind of labels: classes of pixels, or of whole shapes."""
 
 _Item = TypeVar("_Item", bound=Item)
 
@@ -60,8 +58,8 @@ class LabeledData(ABC, Generic[_Item]):
         skip_broken: Read all items first and leave out broken ones, instead of refusing the data.
 
     Attributes:
-        class_names: Name of every label; in segmentation the first is unknown, which is no class.
-        kind: Kind of its labels.
+        class_names: Name of every label; the first of pixel classes is unknown, not a class.
+        labels: Labels that its items have, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
         is_generated: True if `make_files` generates the whole data set.
         label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
@@ -70,7 +68,7 @@ class LabeledData(ABC, Generic[_Item]):
         SettingError: A setting is invalid.
     """
 
-    kind: ClassVar[Kind] = "segmentation"
+    labels: ClassVar[str] = PIXEL_CLASSES
     noun: ClassVar[str]
     is_generated: ClassVar[bool] = False
 
@@ -200,7 +198,7 @@ class LabeledData(ABC, Generic[_Item]):
         """
         names = getattr(self, "class_names", ())
         setting = f"class_names of {type(self).__name__}"
-        if not names or (self.kind == "segmentation" and names[0] != "unknown"):
+        if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
             raise SettingError(
                 setting,
                 found=f"{names[0]} first" if names else "none",
@@ -331,7 +329,7 @@ class LabeledData(ABC, Generic[_Item]):
     @property
     def num_classes(self) -> int:
         """Classes K: the scores of a network."""
-        return len(self.class_names) - (self.kind == "segmentation")
+        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
 
     def source(self, split: Split) -> SplitReader[_Item, Any]:
         """Return the reader of a split; with `in_memory`, everything is read now."""

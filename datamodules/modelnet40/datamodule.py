@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from datamodules.core.index import DatasetIndex, Split, draw_groups
-from datamodules.core.labeled_data import Kind
+from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
 from datamodules.core.reading import SplitReader
@@ -65,7 +65,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
-    kind: ClassVar[Kind] = "classification"
+    labels: ClassVar[str] = IMAGE_CLASS
 
     shapes_per_step: int = 16
     test_rotation: TestRotation = None

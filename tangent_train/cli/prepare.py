@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tangent_train.cli.build import Settings
 from tangent_train.cli.jobs import Shard
+from tangent_train.cli.run import Settings
 from tangent_train.console import print_text
 from tangent_train.registry import build_from_config
 
