@@ -204,7 +204,7 @@ class RunSettings:
     seed: int
     level: int
     panels: int
-    tensorboard_images: int
+    validation_images: int
     checkpoint_every_n_steps: int | None
     ema: float | None
 

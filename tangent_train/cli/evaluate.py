@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,14 +12,10 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.loading import explained
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -28,11 +23,12 @@ from tangent_train.cli.build import Settings, build, build_trained, check_fits, 
 from tangent_train.cli.command_settings import EvaluateSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS, run_settings
+from tangent_train.cli.trainer import build_trainer
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.registry import SettingsFile, build_from_config
+from tangent_train.registry import SettingsFile
 from tangent_train.results.evaluation import (
     classification_record,
     confusion_table,
@@ -130,29 +126,11 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        contents = {"kind": self.task.kind, "config": self.settings, **shown(self.data)}
-        common = [CheckpointContents(contents), ProgressBar(), ClassScores()]
-        if self.task.kind == "segmentation":
-            common.append(PredictionPanels(self.folder / "panels", self.settings["panels"]))
-            common.append(ValidationPictures(self.settings["tensorboard_images"]))
-        section = self.settings["trainer"]
-        # Devices found, advertisements, what the settings say anyway.
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
-        if epochs not in (None, -1):
-            at_least("trainer.max_epochs", epochs, 1)
-        return build_from_config(
-            section,
-            "trainer",
-            self.source,
-            # A run shorter than that is validated at its end.
-            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
-            default_root_dir=str(self.folder),
-            callbacks=[*callbacks, *common],
-            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
-            plugins=[AtomicCheckpointIO()],
-            # The data module's samplers count every image once on any number of processes.
-            use_distributed_sampler=False,
+        # Checkpoints are passed on; settings of a logger may hold the address of a server.
+        config = {name: value for name, value in self.settings.items() if name != "logger"}
+        contents = {"kind": self.task.kind, "config": config, **shown(self.data)}
+        return build_trainer(
+            self.settings, self.folder, self.task, contents, callbacks, self.source
         )
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
