@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from datamodules.core.found import Found, Split, SplitItems, Transform
+from datamodules.core.index import DatasetIndex, Split
 from datamodules.core.inputs import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
@@ -32,12 +32,19 @@ from datamodules.core.panoramas import (
     Turn,
     check_headers,
 )
-from datamodules.core.pipeline import EstimatedUp, PanoramaJudge, PosedUp, RotatedPanoramas, masked
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
+from datamodules.core.reading import SplitReader, Transform
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
+from datamodules.core.transforms import (
+    EstimatedUp,
+    PanoramaJudge,
+    PosedUp,
+    RotatedPanoramas,
+    masked,
+)
 from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import DataError, SettingError
@@ -99,16 +106,16 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """Make sure, without decoding them, that files are whole and fit the settings."""
 
-    def find(self, problems: Problems) -> Found[ImageFiles]:
+    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
         name, read = self.reading(reader)
         store = Store.of(self.store, name, reader.settings, read.layout)
-        found = Found(self.noun, splits, read, store)
+        index = DatasetIndex(self.noun, splits, read, store)
         check = partial(self.check_image, reader=reader, problems=problems)
-        for _ in in_threads(check, found.of()):
+        for _ in in_threads(check, index.of()):
             pass
-        return found
+        return index
 
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""
@@ -198,7 +205,9 @@ class PanoramaDataModule(ImageDataModule):
             with problems.noted(files.name):
                 self._masks.check(files.name)
 
-    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
+    def split_reader(
+        self, index: DatasetIndex[ImageFiles], split: Split
+    ) -> SplitReader[ImageFiles, Panorama]:
         """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         rotated = None
@@ -212,9 +221,9 @@ class PanoramaDataModule(ImageDataModule):
             transforms.append(rotated)
         if self.upright == "auto":
             judge = self._judge if split == "test" else None
-            reading: Any = found.read
+            reading: Any = index.read
             transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
-        return SplitItems(found, split, Panorama, transforms)
+        return SplitReader(index, split, Panorama, transforms)
 
     def estimate_up(self, judge: PanoramaJudge) -> None:
         """Let a network help to estimate the up directions of the test panoramas.
@@ -274,9 +283,11 @@ class PhotoDataModule(ImageDataModule):
         """See `ImageDataModule`."""
         return "photos", PhotoReading(reader, len(self.class_names))
 
-    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
+    def split_reader(
+        self, index: DatasetIndex[ImageFiles], split: Split
+    ) -> SplitReader[ImageFiles, Photo]:
         """Photos from files or store."""
-        return SplitItems(found, split, Photo)
+        return SplitReader(index, split, Photo)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; crops must fit into the photo, too."""

@@ -65,7 +65,12 @@ def build_trainer(
     if epochs not in (None, -1):
         at_least("trainer.max_epochs", epochs, 1)
     # Null settings of loggers and callbacks that the run knows.
-    known = {"save_dir": str(folder), "monitor": task.monitor, "mode": "max", **_names(folder)}
+    known = {
+        "save_dir": str(folder),
+        "monitor": task.monitor,
+        "mode": task.monitor_mode,
+        **_names(folder),
+    }
     loggers = _build_named(settings, "logger", known)
     plugins = section.pop("plugins", None) or []
     named = dict(enumerate(plugins if isinstance(plugins, list) else [plugins]))
@@ -79,7 +84,11 @@ def build_trainer(
         callbacks=[
             *callbacks,
             *_build_named(settings, "callbacks", known),
-            *_of_every_run(settings, folder, task, contents),
+            CheckpointContents(contents),
+            ProgressBar(),
+            ClassScores(),
+            PredictionPanels(folder / "panels", settings["panels"]),
+            ValidationPictures(settings["validation_images"]),
             *[LearningRateMonitor()] * bool(loggers),
         ],
         logger=loggers,
@@ -89,16 +98,6 @@ def build_trainer(
     for logger in trainer.loggers:
         logger.log_hyperparams(dict(flat_settings(contents["config"])))
     return trainer
-
-
-def _of_every_run(
-    settings: Mapping[str, Any], folder: Path, task: Any, contents: dict[str, Any]
-) -> list[Callback]:
-    callbacks = [CheckpointContents(contents), ProgressBar(), ClassScores()]
-    if task.kind == "segmentation":
-        callbacks.append(PredictionPanels(folder / "panels", settings["panels"]))
-        callbacks.append(ValidationPictures(settings["validation_images"]))
-    return callbacks
 
 
 def _build_named(settings: Mapping[str, Any], group: str, known: Mapping[str, Any]) -> list[Any]:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
@@ -211,7 +212,7 @@ def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
     tensors = described.network.state_dict()
     content = {
         "config": config,
-        "kind": "segmentation",
+        "predicts": PIXEL_CLASSES,
         "class_names": list(described.class_names),
         "fixed_size": described.fixed_size and list(described.fixed_size),
         "groups": described.groups,
