@@ -183,12 +183,10 @@ class Run:
         """The network of the run, with what it was trained on."""
         if self.trained is not None:
             return self.trained
-        data, network = (
-            self.data,
-            ClassScoreNetwork(self.task.network, self.data.num_classes).eval(),
-        )
+        data = self.data
+        network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
         return TrainedNetwork(
-            network=network,
+            inner=self.task.network,
             class_names=data.class_names,
             inputs=data.inputs,
             normalization=data.normalization,
