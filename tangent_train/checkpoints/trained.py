@@ -18,6 +18,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
+from datamodules.core.labels import PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork, graph_checksum
 from tangent_train.checkpoints.content import (
     GROUPS,
@@ -111,7 +112,7 @@ class TrainedNetwork:
 
 
 @dataclass(frozen=True)
-class Start:
+class NetworkDescription:
     """The description of the network that training starts from.
 
     Attributes:
@@ -199,7 +200,7 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
-def start_in(path: Path) -> Start | None:
+def describe_network(path: Path) -> NetworkDescription | None:
     """The description of the network in a file of this package; None for other files.
 
     Raises:
@@ -220,7 +221,7 @@ def start_in(path: Path) -> Start | None:
         content["settings"] = content["config"].get("network")
     if not isinstance(content["settings"], Mapping):
         return None
-    return Start(
+    return NetworkDescription(
         class_names=tuple(content["class_names"]),
         inputs=tuple(content["inputs"] or ()) or None,
         normalization=content["normalization"],
@@ -299,12 +300,12 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     """A network with the sizes of images it takes, found by trial."""
     path = source.path
     content = read_checkpoint(path)
-    if content["kind"] != "segmentation":
+    if content["predicts"] != PIXEL_CLASSES:
         raise DataError(
             path,
-            found=f"a network for {content['kind']}",
-            expected="one for segmentation, with scores of every pixel",
-            remedy=f"tangent-evaluate checkpoint={path} is for both.",
+            found=f"a network that predicts {content['predicts'] or 'something else'}",
+            expected=f"one that predicts {PIXEL_CLASSES}",
+            remedy=f"tangent-evaluate checkpoint={path} takes networks of all tasks.",
         )
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")

@@ -218,6 +218,14 @@ class TrainSettings(RunSettings):
     resume: Path | None = field(metadata=_EXISTS)
 
 
+@dataclass(frozen=True)
+class ClassMapSettings:
+    """Class map of an evaluation, see ``configs/evaluate.yaml``."""
+
+    class_map: str | Path
+    unmapped: Literal["unknown", "never"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(RunSettings):
     """See ``configs/evaluate.yaml``; stages of a transfer may have no class map."""

@@ -12,7 +12,7 @@ from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from tangent_train.checkpoints.trained import TrainedNetwork
-from tangent_train.cli.build import shown
+from tangent_train.cli.run import inputs_and_classes
 from tangent_train.geometry import equirect_directions
 from tangent_train.registry import build_from_config
 
@@ -75,9 +75,9 @@ def write_checkpoint(
             "representation": representation,
             "level": representation["level"],
         },
-        "kind": "segmentation",
+        "predicts": "pixel_classes",
         "state_dict": trained.network.state_dict(),
-        **shown(trained),
+        **inputs_and_classes(trained),
     }
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.save(content, path)

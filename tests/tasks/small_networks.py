@@ -12,7 +12,7 @@ from torch import nn
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
-from tangent_train.cli.build import build, shown
+from tangent_train.cli.run import build, inputs_and_classes
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
@@ -70,7 +70,7 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
         settings["network"], data.in_channels, data.num_classes
     )
     with_statistics(task.network)
-    content = {"config": settings, "kind": task.kind, **shown(data)}
+    content = {"config": settings, "predicts": task.predicts, **inputs_and_classes(data)}
     torch.save(content | {"state_dict": task.state_dict()}, path)
     trained: SegmentationTask = task.eval()
     return trained
