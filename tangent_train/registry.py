@@ -74,16 +74,17 @@ class SettingsFile:
         path: The file, for messages.
         trust: Full names of classes and functions that it may name besides the registered ones;
             their arguments may be any plain values.
-        own: Settings (``data.fold``), with all below them, whose values are the user's own.
+        user_settings: Settings (``data.fold``) of the user; with all below them, they do not come
+            from the file.
     """
 
     path: Path
     trust: Collection[str] = ()
-    own: Collection[str] = ()
+    user_settings: Collection[str] = ()
 
-    def owns(self, place: str) -> bool:
-        """Whether the value at a place comes from the file, not from the user."""
-        return not any(f"{place}.".startswith(f"{own}.") for own in self.own)
+    def gave(self, place: str) -> bool:
+        """True if the value at a place comes from the file, False if it is the user's."""
+        return not any(f"{place}.".startswith(f"{name}.") for name in self.user_settings)
 
     def refused(self, place: str, value: Any, expected: str) -> DataError:
         """The error for an invalid value of the file."""
@@ -119,7 +120,7 @@ def build_from_config(
     _check_taken(maker, settings["_target_"], arguments, place, file)
     if is_partial:
         return partial(maker, **arguments, **given)
-    source, name = file if file is not None and file.owns(place) else None, settings["_target_"]
+    source, name = file if file is not None and file.gave(place) else None, settings["_target_"]
     try:
         with nullcontext() if source is None else offline():
             return maker(**arguments | given)
@@ -149,7 +150,7 @@ def _check_taken(
         return
     name = f"{place}.{unknown[0]}"
     found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"
-    if file is not None and file.owns(name):
+    if file is not None and file.gave(name):
         raise DataError(file.path, found=f"{place}: {found}", expected=expected)
     raise SettingError(
         place,
@@ -269,7 +270,7 @@ def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, M
     found = _find(str(target))
     if found is not None:
         return found
-    if file is None or target in file.trust or not file.owns(f"{place}._target_"):
+    if file is None or target in file.trust or not file.gave(f"{place}._target_"):
         return import_named(target, place), {"**": Any}
     raise DataError(
         file.path,
@@ -283,7 +284,7 @@ def _argument(
     value: Any, place: str, file: SettingsFile | None, kind: Any, kinds: Collection[str] = ()
 ) -> Any:
     """A value from settings, with the objects in it made."""
-    if file is not None and file.owns(place):
+    if file is not None and file.gave(place):
         _check_argument(value, place, file, kind, kinds)
     elif isinstance(value, str) and _is_whole(kind):
         raise SettingError(place, found=value, expected=inspect.formatannotation(kind))

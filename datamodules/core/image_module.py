@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Literal
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from datamodules.core.found import Found, Split, SplitItems, Transform
+from datamodules.core.index import DatasetIndex, Split
 from datamodules.core.inputs import (
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
@@ -32,12 +32,19 @@ from datamodules.core.panoramas import (
     Turn,
     check_headers,
 )
-from datamodules.core.pipeline import EstimatedUp, PanoramaJudge, PosedUp, RotatedPanoramas, masked
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
+from datamodules.core.reading import SplitReader, Transform
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
+from datamodules.core.transforms import (
+    EstimatedUp,
+    PanoramaJudge,
+    PosedUp,
+    RotatedPanoramas,
+    masked,
+)
 from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import DataError, SettingError
@@ -99,17 +106,16 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """Make sure, without decoding them, that files are whole and fit the settings."""
 
-    def find(self, problems: Problems) -> Found[ImageFiles]:
+    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
-        self._rgb = reader.rgb
         name, read = self.reading(reader)
         store = Store.of(self.store, name, reader.settings, read.layout)
-        found = Found(self.noun, splits, read, store)
+        index = DatasetIndex(self.noun, splits, read, store)
         check = partial(self.check_image, reader=reader, problems=problems)
-        for _ in in_threads(check, found.of()):
+        for _ in in_threads(check, index.of()):
             pass
-        return found
+        return index
 
     def training_samples(self) -> TrainingImages:
         """Samples `TrainingSample`."""
@@ -148,13 +154,11 @@ class PanoramaDataModule(ImageDataModule):
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
-            the image, see `judge`.
+            the image.
         max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
 
     Attributes:
         erp_height: Rows of the panoramas read.
-        judge: Of `auto`, for the test split: helps to estimate, see `estimate_up`. To be set before
-            that split is read.
 
     Raises:
         DataError: The mask cannot be used.
@@ -177,7 +181,7 @@ class PanoramaDataModule(ImageDataModule):
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
         )
         self.erp_height: int = self.representation.erp_height
-        self.judge: PanoramaJudge | None = None
+        self._judge: PanoramaJudge | None = None
         rotation = self.test_rotation
         tilt = type(rotation) in (int, float) and 0 <= float(rotation or 0) <= _HALF_TURN_DEG
         fine = tilt or rotation in (None, "so3")
@@ -201,7 +205,9 @@ class PanoramaDataModule(ImageDataModule):
             with problems.noted(files.name):
                 self._masks.check(files.name)
 
-    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Panorama]:
+    def split_reader(
+        self, index: DatasetIndex[ImageFiles], split: Split
+    ) -> SplitReader[ImageFiles, Panorama]:
         """Panoramas from files or store: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         rotated = None
@@ -214,14 +220,28 @@ class PanoramaDataModule(ImageDataModule):
             rotated = RotatedPanoramas(self.test_rotation, self.seed, known=known)
             transforms.append(rotated)
         if self.upright == "auto":
-            judge = self.judge if split == "test" else None
-            transforms.append(EstimatedUp(self.max_tilt_deg, self._rgb, rotated, judge))
-        return SplitItems(found, split, Panorama, transforms)
+            judge = self._judge if split == "test" else None
+            reading: Any = index.read
+            transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
+        return SplitReader(index, split, Panorama, transforms)
+
+    def estimate_up(self, judge: PanoramaJudge) -> None:
+        """Let a network help to estimate the up directions of the test panoramas.
+
+        They are estimated when the loader of the test split is made: the network is on its device
+        then. Without ``upright=auto`` nothing changes.
+
+        Args:
+            judge: Log-likelihoods of up directions, see `gravity.estimate_up`.
+        """
+        if self.upright == "auto":
+            self._judge = judge
+            self._sources.pop("test", None)
 
     def test_dataloader(self) -> DataLoader[Any]:
-        """Batches for the test; what is to be judged is estimated first, in this process."""
+        """Batches for the test; a network estimates up directions first, in this process."""
         source = self.source("test")
-        if self.judge is not None:
+        if self._judge is not None:
             read = (source.read(index) for index in range(len(source)))
             show_progress(read, "Estimating up", self.noun, len(source))
         return super().test_dataloader()
@@ -263,9 +283,11 @@ class PhotoDataModule(ImageDataModule):
         """See `ImageDataModule`."""
         return "photos", PhotoReading(reader, len(self.class_names))
 
-    def pipeline(self, found: Found[ImageFiles], split: Split) -> SplitItems[ImageFiles, Photo]:
+    def split_reader(
+        self, index: DatasetIndex[ImageFiles], split: Split
+    ) -> SplitReader[ImageFiles, Photo]:
         """Photos from files or store."""
-        return SplitItems(found, split, Photo)
+        return SplitReader(index, split, Photo)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; crops must fit into the photo, too."""

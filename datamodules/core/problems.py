@@ -13,7 +13,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
 
-    from datamodules.core.found import Item
+    from datamodules.core.index import Item
 
 
 _Item = TypeVar("_Item", bound="Item")

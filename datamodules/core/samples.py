@@ -14,10 +14,10 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
-from datamodules.core.found import SplitItems
 from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.reading import SplitReader
 from tangent_train.geometry import equirect_elevations
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
@@ -77,7 +77,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
     """
 
-    source: SplitItems[Any, Any]
+    source: SplitReader[Any, Any]
     representation: Any
     seed: Seed
     inputs: Sequence[Input]
@@ -109,7 +109,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         inputs: Inputs of the network, see `Input`.
     """
 
-    source: SplitItems[Any, Any]
+    source: SplitReader[Any, Any]
     representation: Any
     inputs: Sequence[Input]
 

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, Generic, Literal, TypeVar
+from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 from lightning import LightningDataModule
@@ -17,17 +17,16 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset
 
 from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
-from datamodules.core.found import SPLITS, Found, Item, Split, SplitItems
+from datamodules.core.index import SPLITS, DatasetIndex, Item, Split
 from datamodules.core.inputs import Normalization
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.loading import EpochSampler, make_loader, this_process
 from datamodules.core.problems import Problems
+from datamodules.core.reading import SplitReader
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
 from tangent_train.threads import in_threads
-
-Kind = Literal["segmentation", "classification"]
-"""Kind of labels: classes of pixels, or of whole shapes."""
 
 _GO_ON = (
     "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
@@ -61,8 +60,8 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         skip_broken: Leave broken items out, after reading all once, instead of refusing.
 
     Attributes:
-        class_names: Name of every label; in segmentation the first is unknown, which is no class.
-        kind: Kind of its labels.
+        class_names: Name of every label; the first of pixel classes is unknown, not a class.
+        labels: Labels that its items have, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
         is_made: Whether `make_files` generates all of it.
         label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
@@ -73,7 +72,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         SettingError: A setting is invalid.
     """
 
-    kind: ClassVar[Kind] = "segmentation"
+    labels: ClassVar[str] = PIXEL_CLASSES
     noun: ClassVar[str]
     is_made: ClassVar[bool] = False
 
@@ -100,14 +99,14 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         self.require(self._per_step, self.per_step >= 1, "1 or more")
         self.label_counts: dict[Split, NDArray[np.int64]] = {}
         self.try_step: Callable[[int], None] | None = None
-        self._found: Found[_Item] | None = None
-        self._sources: dict[Split, SplitItems[_Item, Any]] = {}
+        self._index: DatasetIndex[_Item] | None = None
+        self._sources: dict[Split, SplitReader[_Item, Any]] = {}
         self._start = (0, 0)
 
     # --- what a kind of data says ------------------------------------------------------------
 
     @abstractmethod
-    def find(self, problems: Problems) -> Found[_Item]:
+    def find(self, problems: Problems) -> DatasetIndex[_Item]:
         """Find the items of all splits and check them without decoding.
 
         Args:
@@ -118,7 +117,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """
 
     @abstractmethod
-    def pipeline(self, found: Found[_Item], split: Split) -> SplitItems[_Item, Any]:
+    def split_reader(self, index: DatasetIndex[_Item], split: Split) -> SplitReader[_Item, Any]:
         """Reading pipeline of the items of a split."""
 
     @abstractmethod
@@ -196,7 +195,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             DataError: Something is broken: all that was found is named.
             SettingError: A setting does not suit the data.
         """
-        self.found()
+        self.index()
 
     def prepare_data(self) -> None:
         """Generate the files and complete the store; before training, decode some images.
@@ -208,15 +207,15 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """
         self.make_files()
         stage = None if self.trainer is None else self.trainer.state.fn
-        self._found = found = self._usable(sample=stage == TrainerFn.FITTING)
+        self._index = index = self._usable(sample=stage == TrainerFn.FITTING)
         if self.try_step is not None and self.trainer is not None and stage == TrainerFn.FITTING:
-            count = len(found.splits["train"]) // self.trainer.world_size
+            count = len(index.splits["train"]) // self.trainer.world_size
             for size in {min(self.per_step, count), count % self.per_step} - {0}:
                 self.try_step(size)  # the last step of an epoch may be smaller
-        if not self.skip_broken and found.store is not None:
+        if not self.skip_broken and index.store is not None:
             problems = Problems()
             splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS
-            found.read_all(splits, problems, whole=self.trainer is None)
+            index.read_all(splits, problems, whole=self.trainer is None)
             problems.refuse(self.root, _GO_ON)
 
     def prepare_part(self, part: Callable[[Sequence[_Item]], Sequence[_Item]]) -> int:
@@ -234,24 +233,24 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
         """
         self.make_files()
         problems = Problems()
-        found = self._checked(problems)
-        if found.store is None:
+        index = self._checked(problems)
+        if index.store is None:
             expected = "a folder: files of the store are all that can be prepared in parts"
             raise SettingError("data.store", found="none, with shard=", expected=expected)
         if not self.skip_broken:
             problems.refuse(self.root, _GO_ON)
-        items = part(found.of())
-        part_of = replace(found, splits={"train": items, "val": [], "test": []})
+        items = part(index.of())
+        part_of = replace(index, splits={"train": items, "val": [], "test": []})
         part_of.read_all(SPLITS, problems, whole=True)
         if not self.skip_broken:
             problems.refuse(self.root, _GO_ON)
         return len(problems.without(items))
 
-    def found(self) -> Found[_Item]:
+    def index(self) -> DatasetIndex[_Item]:
         """Items found by `setup`."""
-        if self._found is None:
-            self._found = self._usable()
-        return self._found
+        if self._index is None:
+            self._index = self._usable()
+        return self._index
 
     def check(self) -> tuple[Problems, int]:
         """Read the whole data set, and count its labels; nothing is generated or written.
@@ -269,10 +268,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     expected="the data set",
                     remedy="Run tangent-prepare with the same settings.",
                 )
-            found = self._listed(problems)
-            count = found.check(problems, of_images)
+            index = self._listed(problems)
+            count = index.check(problems, of_images)
             for split in SPLITS:
-                counts = [of_images[i.name] for i in found.splits[split] if i.name in of_images]
+                counts = [of_images[i.name] for i in index.splits[split] if i.name in of_images]
                 none = np.zeros(len(self.class_names), np.int64)
                 self.label_counts[split] = np.sum([none, *counts], axis=0)
         return problems, count
@@ -284,7 +283,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
             SettingError: It does not.
         """
         names = getattr(self, "class_names", ())
-        if not names or (self.kind == "segmentation" and names[0] != "unknown"):
+        if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
             raise SettingError(
                 f"class_names of {type(self).__name__}",
                 found=f"{names[0]} first" if names else "none",
@@ -298,37 +297,37 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 expected="names without control characters and line ends",
             )
 
-    def _listed(self, problems: Problems) -> Found[_Item]:
+    def _listed(self, problems: Problems) -> DatasetIndex[_Item]:
         """Items of all splits, with the checks that hold for every data set."""
         self.check_classes()
-        found = self.find(problems)
-        if not found.of() and not problems.items:
+        index = self.find(problems)
+        if not index.of() and not problems.items:
             expected = f"{self.noun}, as docs and the docstring of the data set describe them"
             raise DataError(self.root, found=f"no {self.noun}", expected=expected)
-        return found
+        return index
 
-    def _checked(self, problems: Problems) -> Found[_Item]:
+    def _checked(self, problems: Problems) -> DatasetIndex[_Item]:
         """Items with files that look whole, or broken ones; refuse a data set that has none."""
-        found: Any = None
+        index: Any = None
         with problems.noted():
-            found = self._listed(problems)
+            index = self._listed(problems)
         if problems.fatal:
             problems.refuse(self.root)
-        return found
+        return index
 
-    def _usable(self, *, sample: bool = False) -> Found[_Item]:
+    def _usable(self, *, sample: bool = False) -> DatasetIndex[_Item]:
         """Usable items; refuse the data set if one is broken, unless broken ones are left out."""
         problems = Problems()
-        found = self._checked(problems)
+        index = self._checked(problems)
         if not self.skip_broken:
             if sample and self.store is None:
-                found.read_some(self.seed, problems)
+                index.read_some(self.seed, problems)
             problems.refuse(self.root, _GO_ON)
-            return found
-        found.read_all(SPLITS, problems, whole=self.trainer is None)
-        left = found.without(problems)
+            return index
+        index.read_all(SPLITS, problems, whole=self.trainer is None)
+        left = index.without(problems)
         for split in SPLITS:
-            if found.splits[split] and not left.splits[split]:
+            if index.splits[split] and not left.splits[split]:
                 raise DataError(
                     self.root,
                     found=f"no {self.noun} for {split} that can be used",
@@ -336,7 +335,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                     remedy="tangent-check lists their problems.",
                 )
         if problems.items:
-            total = len(problems.items.union(item.name for item in found.of()))
+            total = len(problems.items.union(item.name for item in index.of()))
             tell(
                 f"{len(problems.items)} of {total} {self.noun} are broken and left out "
                 "(data.skip_broken=true); tangent-check lists them."
@@ -348,7 +347,7 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
     @property
     def num_classes(self) -> int:
         """Classes K: the scores of a network."""
-        return len(self.class_names) - (self.kind == "segmentation")
+        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
 
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Weights of the classes in the loss, from the labels of the training split.
@@ -367,10 +366,10 @@ class SplitDataModule(LightningDataModule, ABC, Generic[_Item]):
                 tell(f"Warning: {doubt}")
         return class_weights(counts[1:], kind)
 
-    def source(self, split: Split) -> SplitItems[_Item, Any]:
+    def source(self, split: Split) -> SplitReader[_Item, Any]:
         """The images of one split: in memory, if asked for."""
         if split not in self._sources:
-            source = self.pipeline(self.found(), split)
+            source = self.split_reader(self.index(), split)
             if self.in_memory:
                 source.remember(self.root)
             self._sources[split] = source

@@ -17,8 +17,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from datamodules.core.found import Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.index import Split
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems

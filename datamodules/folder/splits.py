@@ -8,7 +8,7 @@ from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from datamodules.core.found import SPLITS, Split, draw_groups
+from datamodules.core.index import SPLITS, Split, draw_groups
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.images.image_files import composed

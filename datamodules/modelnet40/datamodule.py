@@ -14,10 +14,12 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from datamodules.core.found import Found, Split, SplitItems, draw_groups
+from datamodules.core.index import DatasetIndex, Split, draw_groups
+from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
-from datamodules.core.split_module import Kind, SplitDataModule
+from datamodules.core.reading import SplitReader
+from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Declared, Store
 from datamodules.modelnet40.meshes import CHANNELS
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
@@ -62,7 +64,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
-    kind: ClassVar[Kind] = "classification"
+    labels: ClassVar[str] = IMAGE_CLASS
 
     shapes_per_step: int = 16
     test_rotation: TestRotation = None
@@ -87,7 +89,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             return MODELNET40
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
 
-    def find(self, problems: Problems) -> Found[ShapeFile]:
+    def find(self, problems: Problems) -> DatasetIndex[ShapeFile]:
         """See `SplitDataModule`."""
         del problems
         meshes = find_shapes(self.root)
@@ -101,11 +103,13 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
         store = Store(folder, {"spheres": Declared("uint16", (*shape, CHANNELS), MOST_STEPS)})
-        return Found(self.noun, splits, partial(make_spheres, shape), store, _in_processes)
+        return DatasetIndex(self.noun, splits, partial(make_spheres, shape), store, _in_processes)
 
-    def pipeline(self, found: Found[ShapeFile], split: Split) -> SplitItems[ShapeFile, Spheres]:
+    def split_reader(
+        self, index: DatasetIndex[ShapeFile], split: Split
+    ) -> SplitReader[ShapeFile, Spheres]:
         """The spheres in the store."""
-        return SplitItems(found, split, Spheres)
+        return SplitReader(index, split, Spheres)
 
     def training_samples(self) -> ShapeViews:
         """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""

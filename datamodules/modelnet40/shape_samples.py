@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from datamodules.core.found import SplitItems
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.reading import SplitReader
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import ShapeFile
 from tangent_train.geometry import random_rotation, rotation_about
 
-_Shapes = SplitItems[ShapeFile, Any]
+_Shapes = SplitReader[ShapeFile, Any]
 
 
 SPHERE_NORMALIZATION = Normalization(

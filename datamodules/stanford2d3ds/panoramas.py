@@ -32,8 +32,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from datamodules.core.found import Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.index import Split, draw_groups
 from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, GET_IT, list_pictures

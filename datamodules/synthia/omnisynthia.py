@@ -20,8 +20,8 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import ClassVar
 
-from datamodules.core.found import Found, Split
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.index import DatasetIndex, Split
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
@@ -195,7 +195,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         if not self.skip_broken:
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
-    def find(self, problems: Problems) -> Found[ImageFiles]:
+    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `SplitDataModule`; panoramas that could not be generated count as broken."""
         problems.add_all(self._not_made)
         return super().find(problems)

@@ -42,8 +42,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.found import SPLITS, Split, draw_groups
 from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.index import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems

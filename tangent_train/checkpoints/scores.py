@@ -24,7 +24,7 @@ Groups = Sequence[Sequence[int]]
 """For every class, the scores whose probabilities add up to that of the class."""
 
 
-class Scores(nn.Module):
+class ClassScoreNetwork(nn.Module):
     """A network whose result is the score of every class.
 
     Args:

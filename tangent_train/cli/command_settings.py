@@ -173,8 +173,8 @@ class ImportSettings:
     weights: str | Path | None
     file: Path | None = field(metadata=_EXISTS)
     classes: Path | None = field(metadata=_EXISTS)
-    nothing: tuple[str, ...]
-    nothing_wins: bool
+    unknown_classes: tuple[str, ...]
+    unknown_wins: bool
     scores: ScoreKind | None
     image_size: tuple[int, ...] | None
     fov: float
@@ -185,8 +185,8 @@ class ImportSettings:
 
 
 @dataclass(frozen=True)
-class KeypointsSettings:
-    """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
+class KeypointSettings:
+    """Settings of ``configs/keypoints.yaml``, except for data and fields of `Comparer`."""
 
     output: Path
     left: Path | None = field(metadata=_EXISTS)
@@ -218,6 +218,14 @@ class TrainSettings(RunSettings):
     resume: Path | None = field(metadata=_EXISTS)
 
 
+@dataclass(frozen=True)
+class ClassMapSettings:
+    """Class map of an evaluation, see ``configs/evaluate.yaml``."""
+
+    class_map: str | Path
+    unmapped: Literal["unknown", "never"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(RunSettings):
     """See ``configs/evaluate.yaml``; stages of a transfer may have no class map."""
@@ -238,7 +246,7 @@ SETTINGS: Mapping[str, type[Any]] = {
     "evaluate": EvaluateSettings,
     "export": ExportSettings,
     "import": ImportSettings,
-    "keypoints": KeypointsSettings,
+    "keypoints": KeypointSettings,
     "predict": PredictSettings,
     "prepare": RunSettings,
     "render": RenderSettings,

@@ -65,8 +65,8 @@ def import_network(config: Mapping[str, Any]) -> None:
             fov_deg=settings.fov,
             level=settings.level,
             base_level=settings.base_level,
-            nothing=settings.nothing,
-            nothing_wins=settings.nothing_wins,
+            unknown_classes=settings.unknown_classes,
+            unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
         )
@@ -131,7 +131,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
     own = trained.source.trust if trained.source is not None else ()
     if own:
         lines.append(f"of your own: every command that reads it needs trust=[{','.join(own)}]")
-    if settings.nothing:
-        said = "are written as unknown" if settings.nothing_wins else "never win"
-        lines.insert(2, f"{', '.join(settings.nothing)}: mean nothing, {said}")
+    if settings.unknown_classes:
+        effect = "written as unknown" if settings.unknown_wins else "never win"
+        lines.insert(2, f"{', '.join(settings.unknown_classes)}: {effect}")
     return "\n".join(lines)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from tangent_train.cli.build import Settings
 from tangent_train.cli.jobs import Shard
+from tangent_train.cli.run import Settings
 from tangent_train.console import print_text
 from tangent_train.registry import build_from_config
 
@@ -23,5 +23,5 @@ def prepare(settings: Settings) -> None:
     else:
         data.prepare_data()
         data.setup()
-        counts = ", ".join(f"{len(data.found().splits[s])} {s}" for s in ("train", "val", "test"))
+        counts = ", ".join(f"{len(data.index().splits[s])} {s}" for s in ("train", "val", "test"))
         print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

@@ -8,9 +8,9 @@ import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import lightning
 from hydra.core.hydra_config import HydraConfig
@@ -21,11 +21,10 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.cli.build import Settings
 from tangent_train.cli.command_settings import TrainSettings
-from tangent_train.cli.evaluate import Run, machine_faults
-from tangent_train.cli.fine_tuning import begin_from, load_start
+from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.remembered import remember_paths, remembered_paths
+from tangent_train.cli.run import Run, Settings, machine_faults
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
@@ -39,39 +38,32 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
 
     Args:
-        settings: Of the run: the composed ``train.yaml``, or of a run that is resumed.
-        source: The file they come from, see `registry.build_from_config`.
+        settings: Settings of the run: the composed ``train.yaml``, or those of a resumed run.
+        source: File that settings come from, see `registry.build_from_config`.
 
     Returns:
         The best validation score, which sweeps compare; None without a validation split.
     """
-    resumed, files = None, parse_settings(TrainSettings, settings)
-    start = None if files.resume else files.init_from
+    files, resumed = parse_settings(TrainSettings, settings), None
     if files.resume is not None:
         resumed = files.resume / "checkpoints" / "last.ckpt"
-        content = read_checkpoint(resumed, ("config", "epoch", "state_dict"))
-        _check_resumed(settings, content["config"], content["epoch"])
-    elif start is not None:
-        settings, source = begin_from(start, settings)
-    run = Run.begin(settings, source)
-    if start is not None:
-        load_start(start, run)
-    elif resumed is None and run.task.backbone_lr_factor != 1:
-        raise SettingError(
-            "optimizer.backbone_lr_factor",
-            found=run.task.backbone_lr_factor,
-            expected="1 without init_from=, which says what the backbone is",
-        )
+        _check_resumed(settings, resumed)
+    elif files.init_from is not None:
+        settings, source = with_pretrained_network(files.init_from, settings)
+    run = Run.create(settings, source)
+    if resumed is None:
+        load_pretrained(files.init_from, run)
     checkpoints = run.folder / "checkpoints"
     needed = _typed_local(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
-    best = BestCheckpoint(checkpoints, run.task.monitor)
+    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.monitor_mode)
     trainer = run.trainer([last, LearningRateMonitor(), best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     with machine_faults(run.folder, run.data):
-        _fit(run, trainer, resumed, last)
+        with _training_faults(resumed, last):
+            trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
         # First: an error in the test must not cost a sweep its figure.
         score = _best_on_validation(trainer, best, run.folder)
         run.test(trainer, _tested(trainer, best, last.path))
@@ -101,7 +93,9 @@ def _best_on_validation(
     return score
 
 
-def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastCheckpoint) -> None:
+@contextmanager
+def _training_faults(resumed: Path | None, last: LastCheckpoint) -> Iterator[None]:
+    """Explain errors of a training, without warnings that do not apply to its runs."""
     with warnings.catch_warnings():
         # The checkpoints of a resumed run are meant to be there.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
@@ -113,11 +107,14 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
         # network.frozen_statistics=true
         warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
         try:
-            trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
+            yield
         except SIGTERMException:
             sys.exit(128 + signal.SIGTERM)
-        except (AttributeError, KeyError, TypeError, ValueError) as error:
-            if resumed is None or last.has_begun or isinstance(error, DataError | SettingError):
+        except (AttributeError, KeyError, RuntimeError, TypeError, ValueError) as error:
+            other = isinstance(error, DataError | SettingError) or (
+                isinstance(error, RuntimeError) and "state_dict" not in str(error)
+            )
+            if resumed is None or last.has_begun or other:
                 raise
             raise DataError(
                 resumed,
@@ -128,16 +125,17 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None, last: LastC
             raise SettingError("trainer", found=error, expected="valid settings") from error
 
 
-def _check_resumed(settings: Settings, config: Mapping[str, Any], epoch: int | None) -> None:
+def _check_resumed(settings: Settings, checkpoint: Path) -> None:
     """Refuse to resume a run as another one, or for fewer epochs than it has."""
-    for name, now, then in differing_settings(settings, config, "resume"):
+    content = read_checkpoint(checkpoint, ("config", "epoch", "state_dict"))
+    for name, now, then in differing_settings(settings, content["config"], "resume"):
         raise SettingError(
             name,
             found=f"{now!r} for a run that began with {then!r}",
             expected="the same as before",
             remedy="Start a new run for it.",
         )
-    begun, epochs = (epoch or 0) + 1, settings["trainer"].get("max_epochs")
+    begun, epochs = (content["epoch"] or 0) + 1, settings["trainer"].get("max_epochs")
     if isinstance(epochs, int) and -1 < epochs < begun:  # other types are refused when it is made
         raise SettingError(
             "trainer.max_epochs",
@@ -168,10 +166,10 @@ def _remember(run: Run) -> Collection[str]:
 
 def _typed_local(remembered: Collection[str]) -> list[str]:
     """Typed machine-specific settings that a resumed run needs again: no file holds them."""
-    overrides = [said.lstrip("+") for said in HydraConfig.get().overrides.task]
-    named = [(said, *said.partition("=")[::2]) for said in overrides]
+    overrides = [text.lstrip("+") for text in HydraConfig.get().overrides.task]
+    named = [(text, *text.partition("=")[::2]) for text in overrides]
     return [
-        said
-        for said, name, value in named
+        text
+        for text, name, value in named
         if name == "trust" or not (name in remembered or from_file(name, value))
     ]

@@ -101,7 +101,7 @@ def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) 
 
 def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
     """Build the data and networks of all stages: errors come before hours of training."""
-    from tangent_train.cli.build import build, build_trained, check_fits, shown
+    from tangent_train.cli.run import build, build_trained, check_fits, inputs_and_classes
 
     first: Any = None
     built: dict[Any, tuple[Stage, Any]] = {}
@@ -116,7 +116,7 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
             settings = {**stage.config, "checkpoint": str(stage.weights)}
             data = (build_trained(settings, trained) if trained else build(settings))[0]
             first = first or data
-            check_fits(data, shown(first), f"the network of stage {stages[0].name}")
+            check_fits(data, inputs_and_classes(first), f"the network of stage {stages[0].name}")
             # Files are the same for all rotations, and for all views of as many rows.
             built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
     for stage, data in built.values():  # after all settings: this makes files

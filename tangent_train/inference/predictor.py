@@ -15,7 +15,7 @@ import torch
 
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.scores import Scores, plain_scores
+from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
 from tangent_train.errors import SettingError
 from tangent_train.rendering.mosaic import ScoreMosaic
 
@@ -33,7 +33,7 @@ _PIXELS_PER_FORWARD = 2**20
 
 def sees_rays(network: nn.Module) -> bool:
     """Whether a network takes viewing rays, as for cross-image attention."""
-    inner = network.network if isinstance(network, Scores) else network
+    inner = network.network if isinstance(network, ClassScoreNetwork) else network
     return "rays" in inspect.signature(inner.forward).parameters
 
 

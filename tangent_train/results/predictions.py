@@ -39,10 +39,10 @@ _RESULTS = (
     "classes.json", _SUMMARY, "summary.csv", "report.html", "shards",
 )  # fmt: skip
 
-Kind = Literal["labels", "color", "overlay", "probabilities"]
+OutputKind = Literal["labels", "color", "overlay", "probabilities"]
 """What is written of an image, each into a folder of its own."""
 
-_PICTURES: tuple[Kind, ...] = ("color", "overlay")
+_PICTURES: tuple[OutputKind, ...] = ("color", "overlay")
 
 Entry = dict[str, Any]
 """Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
@@ -119,7 +119,7 @@ class PredictionFolder:
 
     path: Path
     class_names: Sequence[str]
-    kinds: Sequence[Kind]
+    kinds: Sequence[OutputKind]
 
     def files(self, name: str) -> dict[str, Path]:
         """The files of one image, by kind."""
@@ -229,7 +229,7 @@ class PredictionFolder:
                 write_video(file, path, size, partial(self._painted, name, kind), every)
 
     def _painted(
-        self, name: str, kind: Kind, number: int, rgb: NDArray[np.uint8]
+        self, name: str, kind: OutputKind, number: int, rgb: NDArray[np.uint8]
     ) -> NDArray[np.uint8]:
         labels = read_pixels(self.of_frames.files(frame_name(name, number))["labels"], indices=True)
         count = len(self.class_names)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tangent_train.checkpoints.scores import Scores
+from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.errors import SettingError
 
 
@@ -25,13 +25,13 @@ def test_other_numbers_of_names_than_of_scores_are_refused(
     num_classes: int, groups: list[list[int]] | None, told: str
 ) -> None:
     with pytest.raises(SettingError, match=told):
-        Scores(nn.Conv2d(3, 5, 1), num_classes, groups)(torch.zeros(1, 3, 2, 2))
+        ClassScoreNetwork(nn.Conv2d(3, 5, 1), num_classes, groups)(torch.zeros(1, 3, 2, 2))
 
 
 def test_label_maps_are_certain() -> None:
     """Other values are in the last group."""
     images = torch.tensor([0.0, 2.0, 1.0, -1.0, 3.0, 255.0, torch.nan]).expand(1, 3, 2, 7)
-    scores = Scores(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
+    scores = ClassScoreNetwork(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
     assert scores.argmax(dim=1).tolist() == [[[0, 2, 1, 3, 3, 3, 3]] * 2]
     assert float(scores.softmax(dim=1).amax(dim=1).min()) > 0.999
 
@@ -43,7 +43,7 @@ def test_larger_images_are_divided(size: tuple[int, int]) -> None:
     expected, seen = network(images), []
     network.register_forward_pre_hook(lambda _, given: seen.append(given[0].shape[-2:]))
     with torch.no_grad():
-        found = Scores(network, 2, tile=(4, 6))(images)
+        found = ClassScoreNetwork(network, 2, tile=(4, 6))(images)
     torch.testing.assert_close(found, expected.detach())
     assert set(seen) == {(4, 6)}
     assert len(seen) == -(-size[0] // 4) * -(-size[1] // 6)

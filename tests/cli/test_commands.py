@@ -23,9 +23,9 @@ from torch import nn
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
-from tangent_train.cli.build import _fault
 from tangent_train.cli.compose import path_text
 from tangent_train.cli.stored import stored_run
+from tangent_train.cli.trials import find_fault
 from tangent_train.console import print_text
 from tangent_train.results.record import load_record
 from tangent_train.results.tables import Table
@@ -66,7 +66,7 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     for name in ("best", "last"):
         content = torch.load(run_folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
         assert content["config"]["data"]["rooms"]["height"] == 32
-        assert content["kind"] == "segmentation"
+        assert content["predicts"] == "pixel_classes"
         assert content["inputs"] == ["rgb", "depth"]
         assert content["class_names"][:2] == ["unknown", "beam"]
         assert content["tangent_train_version"]
@@ -226,8 +226,8 @@ def test_a_trial_of_a_network_finds_its_fault_whatever_the_memory_holds() -> Non
 
     torch.use_deterministic_algorithms(True)  # new memory is filled with large numbers
     try:
-        assert "more than 1 value" in str(_fault(Indexed(), (1, 3, 4, 4), trains=True))
-        assert _fault(Indexed(), (2, 3, 4, 4), trains=True) is None
+        assert "more than 1 value" in str(find_fault(Indexed(), (1, 3, 4, 4), trains=True))
+        assert find_fault(Indexed(), (2, 3, 4, 4), trains=True) is None
     finally:
         torch.use_deterministic_algorithms(False)
 
@@ -288,7 +288,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["network=unet"], "image size for the UNet: found 48 × 48"),
         (["network.num_classes=5"], "scores of the network"),
         (["network.in_channels=3"], "network: found UNet, which does not take"),
-        (["task=classification"], "task: found classification, with panoramas"),
+        (["task=classification"], "task: found ClassificationTask, which needs image_class"),
         (["checkpoint_every_n_steps=0"], "checkpoint_every_n_steps: found 0"),
         (["tensorboard_images=-1"], "tensorboard_images: found -1"),
         (["panels=-1"], "panels: found -1"),

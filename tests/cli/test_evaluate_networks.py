@@ -119,7 +119,7 @@ def test_the_network_judges_which_way_is_up(
         asked.append(max_tilt_deg)
         return np.array([0.0, 0, -1])
 
-    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
     given = ["data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]
     mapped = _written(tmp_path / "map.json", MAP)
     run("evaluate", network, *ROOMS, *given, mapped, "hydra.run.dir=imported")
@@ -161,7 +161,7 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
-        ({"data": "data=synthshapes"}, "task: found segmentation, with shapes"),
+        ({"data": "data=synthshapes"}, "task: found SegmentationTask, which needs pixel_classes"),
         ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
     ],
 )

@@ -43,11 +43,11 @@ def test_an_onnx_file_labels_panoramas(
     wins: bool, here: Path, run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Blocks of one colour: the labels are those of every pixel's own scores."""
-    nothing = ("nothing=[background]", f"nothing_wins={wins}".lower())
+    nothing = ("unknown_classes=[background]", f"unknown_wins={wins}".lower())
     run("import", *OF_ONNX, *nothing, "fov=90", "output=ours.onnx")
     said = capsys.readouterr().out
     assert "3 classes: dark, green, bright\n" in said
-    assert f"background: mean nothing, {'are written as unknown' if wins else 'never win'}" in said
+    assert f"background: {'written as unknown' if wins else 'never win'}" in said
     trained = load_trained(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
@@ -136,7 +136,7 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: 
     network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=imagenet")
-    size = ("level=6", "base_level=1", "nothing=[background]")
+    size = ("level=6", "base_level=1", "unknown_classes=[background]")
     run("import", "network=unet_small", *given, *size, "output=net.ckpt")
     trained = load_trained(here / "net.ckpt")
     assert trained.normalization.mean == (0.485, 0.456, 0.406)
@@ -219,8 +219,8 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("classes=escapes.json",), r"escapes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
-        (("nothing=[sky]",), "nothing: found sky; expected of background, dark"),
-        (("nothing=[background,dark,green,bright]",), "nothing: found all classes"),
+        (("unknown_classes=[sky]",), "unknown_classes: found sky; expected of background, dark"),
+        (("unknown_classes=[background,dark,green,bright]",), "unknown_classes: found all classes"),
         (("output=ours.ckpt",), r"output: found ours\.ckpt; expected .*\.onnx"),
         (
             ("network=torchvision", "model=resnet50", "output=net.ckpt"),

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.found import Split
+from datamodules.core.index import Split
 from datamodules.core.split_module import SplitDataModule
 
 GPANO_TAGS = {

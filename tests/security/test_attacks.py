@@ -16,9 +16,9 @@ import yaml  # type: ignore[import-untyped]
 from safetensors.torch import load_file, save_file
 
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.checkpoints.trained import METADATA_KEY, load_trained, start_in
-from tangent_train.cli.build import build
+from tangent_train.checkpoints.trained import METADATA_KEY, describe_network, load_trained
 from tangent_train.cli.keypoints import earlier_results
+from tangent_train.cli.run import build
 from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import build_from_config
@@ -52,11 +52,13 @@ def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
     path, lighter = forbidden.parent / "x.ckpt", _light(content)
     evaluated = _evaluation(lighter, path)
     all_places = [("config", *place) for place in places(content["config"])]
-    all_places += [(name,) for name in ("config", "class_names", "inputs", "kind", "state_dict")]
+    all_places += [
+        (name,) for name in ("config", "class_names", "inputs", "predicts", "state_dict")
+    ]
     all_places += [("normalization",), ("normalization", "mean")]
     for place, value in sampled(list(attacks(forbidden)), all_places):
         torch.save(replaced(lighter, place, value), path)
-        for use in (load_trained, evaluated, start_in):
+        for use in (load_trained, evaluated, describe_network):
             _nothing_happens(use, path, forbidden, (place, value))
 
 
@@ -99,7 +101,7 @@ def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbi
     assert ("data", "mask") in at
     for config in second_readings(content["config"], at, forbidden):
         torch.save(lighter | {"config": config}, path)
-        for use in (load_trained, evaluated, start_in):
+        for use in (load_trained, evaluated, describe_network):
             _nothing_happens(use, path, forbidden, config)
 
 
@@ -126,7 +128,7 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         onnx.save(model, other)
         for path in (one, other):
             _nothing_happens(load_trained, path, forbidden, (place, value))
-        _nothing_happens(start_in, one, forbidden, (place, value))
+        _nothing_happens(describe_network, one, forbidden, (place, value))
     for place, text in _named_twice(described, forbidden, json.dumps):
         save_file(tensors, one, {METADATA_KEY: text})
         with pytest.raises(DataError, match="is there twice"):

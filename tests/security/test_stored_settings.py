@@ -17,8 +17,8 @@ from tangent_train import registry
 from tangent_train.callbacks.checkpoints import BestCheckpoint
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import completed_settings, load_trained
-from tangent_train.cli.build import build
 from tangent_train.cli.compose import config_folder
+from tangent_train.cli.run import build
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, build_from_config
 from tests.cli.tiny_runs import results, run_command
@@ -68,7 +68,7 @@ def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
     assert masked(-60)[0] == -60
     assert masked(-60, "data.mask=null")[0] is None
     mask, source = masked(-60, "data.mask=pole.png")
-    assert (mask, source.owns("data.mask")) == ("pole.png", False)
+    assert (mask, source.gave("data.mask")) == ("pole.png", False)
     with pytest.raises(SettingError, match=r"data\.mask: found none.*had data\.mask='pole\.png'"):
         masked("pole.png")
 

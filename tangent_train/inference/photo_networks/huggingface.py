@@ -13,6 +13,7 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
 from tangent_train.errors import DataError
+from tangent_train.inference.library_output import hide_output
 from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
@@ -20,7 +21,6 @@ from tangent_train.inference.photo_networks.network import (
     names_of,
 )
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
-from tangent_train.inference.quiet import quiet
 from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, build_from_config
 
@@ -109,7 +109,7 @@ def _processor(folder: Path) -> dict[str, Any]:
         if name in kind.valid_kwargs.__annotations__ and not isinstance(value, str)
     }
     try:
-        with quiet():
+        with hide_output():
             made = kind(**known)
             order, black, gain = _response(made)
     except Exception as error:  # whatever a processor raises about its settings
@@ -222,7 +222,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
 def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
     """Load weights through transformers, which knows their names in its older versions."""
     inner = network.network
-    with quiet():
+    with hide_output():
         loaded, found = type(inner).from_pretrained(
             None,
             config=inner.config,

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
+from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.checkpoints.scores import Groups, Scores, size_multiple_of
+from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.checkpoints.trained import (
     TrainedNetwork,
     load_trained,
-    metadata_json,
+    metadata_of,
     write_metadata,
 )
 from tangent_train.errors import SettingError, width_height
@@ -39,8 +40,8 @@ def import_network(
     fov_deg: float = 60.0,
     level: int | None = None,
     base_level: int | None = None,
-    nothing: Collection[str] = (),
-    nothing_wins: bool = True,
+    unknown_classes: Collection[str] = (),
+    unknown_wins: bool = True,
     image_size: tuple[int, int] | None = None,
     score_kind: ScoreKind | None = None,
 ) -> TrainedNetwork:
@@ -52,8 +53,8 @@ def import_network(
         fov_deg: Horizontal field of view of the photos it was trained on.
         level: Level s of the panoramas; None for the angular resolution of those photos.
         base_level: Base level b of the tangent images; None for the size of those photos.
-        nothing: Names of scores that mean nothing, such as a background.
-        nothing_wins: Whether these may win, which is then written as unknown (label 0).
+        unknown_classes: Names of scores of no class, such as a background.
+        unknown_wins: True if these may win, which is then written as unknown (label 0).
         image_size: The only rows and columns to give the network; None for the size that it says
             and, where it takes others, any.
         score_kind: What it returns; None for what its library says, or to find it by trying.
@@ -74,13 +75,12 @@ def import_network(
     if image_size is not None:
         network = replace(network, image_size=image_size, fixed_size=True)
     kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
-    names, groups = _groups(network.score_names, kind, count, nothing, nothing_wins)
-    scores = Scores(network.network, len(names) - 1, groups, kind=kind)
+    names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
+    scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
-    fixed = None if multiple else network.image_size
     seen = representation_of(network.image_size, fov_deg, level, base_level, is_fixed=not multiple)
     described = TrainedNetwork(
-        network=Scores(network.network, len(names) - 1, groups, fixed, kind),
+        inner=network.network,
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
@@ -88,14 +88,17 @@ def import_network(
         representation=seen,
         image_size=(seen["dim"], seen["dim"]),
         size_multiple=multiple or 1,
-        fixed_size=fixed,
+        fixed_size=None if multiple else network.image_size,
         groups=groups,
         score_kind=kind,
         settings=network.settings,
     )
     check_size(described, described.image_size)
     with atomic_path(path) as temporary:
-        (_write_onnx if network.settings is None else _write_checkpoint)(described, temporary)
+        if isinstance(network.network, OnnxNetwork):
+            write_metadata(network.network.path, temporary, described)
+        else:
+            _write_checkpoint(described, temporary)
         trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
@@ -143,29 +146,38 @@ def _groups(
     score_names: Sequence[str],
     kind: ScoreKind,
     count: int,
-    nothing: Collection[str],
+    unknown_classes: Collection[str],
     wins: bool,
 ) -> tuple[list[str], Groups | None]:
     """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
-    score_names, nothing = list(map(composed, score_names)), list(map(composed, nothing))
-    missing = set(nothing) - set(score_names)
+    score_names, unknown_classes = (
+        list(map(composed, score_names)),
+        list(map(composed, unknown_classes)),
+    )
+    missing = set(unknown_classes) - set(score_names)
     if missing:
         raise SettingError(
-            "nothing", found=", ".join(sorted(missing)), expected=f"of {', '.join(score_names)}"
+            "unknown_classes",
+            found=", ".join(sorted(missing)),
+            expected=f"of {', '.join(score_names)}",
         )
     places, rest = _places(len(score_names), kind, count)
-    kept = [(k, name) for k, name in zip(places, score_names, strict=True) if name not in nothing]
+    kept = [
+        (k, name)
+        for k, name in zip(places, score_names, strict=True)
+        if name not in unknown_classes
+    ]
     if not kept:
-        raise SettingError("nothing", found="all classes", expected="some of them")
+        raise SettingError("unknown_classes", found="all classes", expected="some of them")
     if not wins and (len(kept) == 1 or kind == "labels"):
         raise SettingError(
-            "nothing_wins",
+            "unknown_wins",
             found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
-            expected="true: where nothing may not win, the network has no other class to give",
+            expected="true: where they may not win, the network has no other class to give",
         )
-    rest += [k for k, name in zip(places, score_names, strict=True) if name in nothing]
+    rest += [k for k, name in zip(places, score_names, strict=True) if name in unknown_classes]
     names = ["unknown", *(name for _, name in kept)]
-    if kind in ("logits", "probabilities") and not nothing:
+    if kind in ("logits", "probabilities") and not unknown_classes:
         return names, None
     return names, [[k] for k, _ in kept] + ([rest] if rest and wins else [])
 
@@ -193,29 +205,15 @@ def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[in
 
 
 def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
-    config = {
-        "network": described.settings,
-        "representation": dict(described.representation),
-        "level": described.level,
+    content = metadata_of(described)
+    names = ("settings", "representation", "level")
+    network, representation, level = (content.pop(name) for name in names)
+    content |= {
+        "config": {"network": network, "representation": representation, "level": level},
+        "predicts": PIXEL_CLASSES,
+        "state_dict": {
+            name: t.contiguous().float() if t.is_floating_point() else t
+            for name, t in described.network.state_dict().items()
+        },
     }
-    mean, std = described.normalization.mean, described.normalization.std
-    tensors = described.network.state_dict()
-    content = {
-        "config": config,
-        "kind": "segmentation",
-        "class_names": list(described.class_names),
-        "fixed_size": described.fixed_size and list(described.fixed_size),
-        "groups": described.groups,
-        "inputs": ["rgb"],
-        "normalization": {"mean": list(mean), "std": list(std)},
-        "score_kind": described.score_kind,
-        "state_dict": {name: t.contiguous().float() if t.is_floating_point() else t
-                       for name, t in tensors.items()},
-        "tangent_train_version": version("tangent-train"),
-    }  # fmt: skip
     torch.save(content, path)
-
-
-def _write_onnx(described: TrainedNetwork, path: Path) -> None:
-    inner: Any = described.network.network
-    write_metadata(inner.path, path, metadata_json(described))

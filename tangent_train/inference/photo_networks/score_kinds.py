@@ -199,7 +199,7 @@ def _check_labels(found: Sequence[float], named: int) -> None:
             "class names of the network",
             found=f"{named}, for labels {', '.join(f'{label:g}' for label in found[:_LISTED])}",
             expected="a name for every label; one name is that of label 1, beside a background 0",
-            remedy="Name the others too, and set nothing= to the names of those that mean nothing."
+            remedy="Name the others too; unknown_classes= names those that are written as unknown."
             + f" {_FACTOR}" * (named <= _MASK_NAMES),
         )
 

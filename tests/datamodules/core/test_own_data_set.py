@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 import datamodules
-from datamodules.core.found import Split
 from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.index import Split
 from datamodules.core.panoramas import ImageFiles, PngReader
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_pixels

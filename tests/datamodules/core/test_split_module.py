@@ -84,7 +84,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
     tagged = np.array([0.6, 0, 0.8])
-    monkeypatch.setattr("datamodules.core.pipeline.up_of", lambda path: tagged)
+    monkeypatch.setattr("datamodules.core.transforms.up_of", lambda path: tagged)
     known = make_module(test_rotation=30, upright="pose")
     np.testing.assert_array_equal(known.source("train").read(0).up, tagged)
     turned = known.source("test").read(0).up
@@ -96,13 +96,33 @@ def test_up_is_estimated_from_the_file_of_a_small_panorama(
     stanford_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[NDArray[np.uint8]] = []
-    estimate = "datamodules.core.pipeline.estimate_up"
+    estimate = "datamodules.core.transforms.estimate_up"
     monkeypatch.setattr(estimate, lambda rgb, *_: seen.append(rgb))
     for level in (3, 4):  # the files have 32 rows
         representation = EquirectRepresentation(level)
         module = Stanford2D3DS(stanford_root, representation, test_rotation=30, upright="auto")
         rotated = module.source("test").read(0).rgb
     np.testing.assert_array_equal(seen, [rotated, rotated])
+
+
+def test_a_network_estimates_up_of_test_panoramas_that_were_read_before(
+    make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
+        return None if judge is None else np.eye(3)[judge(np.eye(3)).argmax()]
+
+    def judge(panorama: Any, ups: NDArray[np.float64]) -> NDArray[np.float64]:
+        return ups[:, 1]
+
+    monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
+    auto, upright = make_module(upright="auto"), make_module()
+    assert auto.source("test").read(0).up is None
+    for module in (auto, upright):
+        module.estimate_up(judge)
+        module.test_dataloader()
+    assert auto.source("test").read(0).up.tolist() == [0, 1, 0]
+    assert auto.source("val").read(0).up is None
+    assert upright.source("test").read(0).up is None
 
 
 def test_processes_share_the_panoramas(

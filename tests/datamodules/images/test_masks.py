@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from datamodules import FolderPanoramas
-from datamodules.core.pipeline import RotatedPanoramas
+from datamodules.core.transforms import RotatedPanoramas
 from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import write_pixels

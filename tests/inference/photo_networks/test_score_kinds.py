@@ -252,12 +252,12 @@ def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path
     assert again.labels(np.array([0, 1], np.uint8)).tolist() == [1, 0]
 
 
-def test_where_no_sigmoid_is_above_one_half_nothing_wins(tmp_path: Path) -> None:
+def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path) -> None:
     sigmoid = _node("Sigmoid", "linear", "scores")
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS - 2, sigmoid)
     images, shown = _images(16, 24), _linear(_images(16, 24)) - 2
     for wins in (True, False):
-        trained = _imported(path, nothing_wins=wins)
+        trained = _imported(path, unknown_wins=wins)
         labels = trained.labels(trained.network(images).argmax(dim=1).numpy().astype(np.uint8))
         best = shown.argmax(axis=-1) + 1
         unknown = (shown.max(axis=-1) < 0) & wins
@@ -302,8 +302,8 @@ def test_other_values_of_label_maps_are_unknown(
     labels = trained.labels(found.argmax(dim=1).numpy().astype(np.uint8))
     np.testing.assert_array_equal(labels, np.where(best == 3, 0, best + 1))
     assert float(found.softmax(dim=1).amax(dim=1).min()) > 0.999
-    with pytest.raises(SettingError, match="nothing_wins: found false, for label maps"):
-        _imported(path, names, nothing_wins=False)
+    with pytest.raises(SettingError, match="unknown_wins: found false, for label maps"):
+        _imported(path, names, unknown_wins=False)
     merged = ClassMap("two", None, {"x": ["a", "b"], "y": ["c"]})
     mapped = map_classes(trained, merged).trained
     labels = mapped.labels(mapped.network(images).argmax(dim=1).numpy().astype(np.uint8))
@@ -331,7 +331,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     name = f"{LabelMaps.__module__}.{LabelMaps.__qualname__}"
     network, names = LabelMaps(), ("a", "b", "(void)", "c")
     photo = PhotoNetwork(network, {"_target_": name}, names, UNIT, (16, 24))
-    settings: dict[str, Any] = {"level": 5, "base_level": 0, "nothing": ["(void)"]}
+    settings: dict[str, Any] = {"level": 5, "base_level": 0, "unknown_classes": ["(void)"]}
     trained = import_network(photo, tmp_path / "net.ckpt", **settings)
     if suffix != "ckpt":
         export_network(trained, tmp_path / f"net.{suffix}")
@@ -400,7 +400,7 @@ def test_what_cannot_be_understood_is_refused(
     torch.manual_seed(2)
     network = PhotoNetwork(Wrong(classes, function), {}, names, UNIT, (16, 24))
     with pytest.raises(SettingError, match=message):
-        import_network(network, tmp_path / "net.ckpt", nothing=names[1:2])
+        import_network(network, tmp_path / "net.ckpt", unknown_classes=names[1:2])
     assert not (tmp_path / "net.ckpt").exists()
 
 

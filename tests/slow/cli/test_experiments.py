@@ -9,7 +9,7 @@ import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.cli.build import build
+from tangent_train.cli.run import build
 from tangent_train.cli.transfer_stages import plan
 from tangent_train.registry import build_from_config
 from tests.cli.test_compose import EXPERIMENTS

@@ -17,8 +17,8 @@ import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
-from datamodules.core import found as found_module
-from datamodules.core.found import SPLITS
+from datamodules.core import index as index_module
+from datamodules.core.index import SPLITS
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
@@ -237,7 +237,7 @@ def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:
 def test_training_begins_with_a_look_at_some_images_of_all_splits(
     kind: str, root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(found_module, "SAMPLED", 100)
+    monkeypatch.setattr(index_module, "SAMPLED", 100)
     _as_in_training(_module(kind, root)).prepare_data()
     broken = [_partner(kind, path, "labels") for path in _colors(kind, root)[1::3]]
     for path in broken:

@@ -21,7 +21,7 @@ import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO
-from tangent_train.cli.evaluate import machine_faults
+from tangent_train.cli.run import machine_faults
 from tangent_train.files import NoRoomError, atomic_path, reserve, write_text
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 from torch.utils.data import get_worker_info
 
-from tangent_train.cli.evaluate import machine_faults
+from tangent_train.cli.run import machine_faults
 from tangent_train.errors import SettingError
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.found import Found, SplitItems
+from datamodules.core.index import DatasetIndex
 from datamodules.core.panoramas import ImageFiles, Panorama
-from datamodules.core.pipeline import EstimatedUp, PosedUp, RotatedPanoramas
+from datamodules.core.reading import SplitReader
+from datamodules.core.transforms import EstimatedUp, PosedUp, RotatedPanoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
 
@@ -74,7 +75,7 @@ def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> No
         asked.append(str(path))
         return UP if str(path) == "1" else None
 
-    monkeypatch.setattr("datamodules.core.pipeline.up_of", up_of)
+    monkeypatch.setattr("datamodules.core.transforms.up_of", up_of)
     posed = PosedUp()
     for _ in range(2):
         assert posed(_heights(), 0, FILES[0]).up is None
@@ -93,7 +94,7 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
         asked.append(max_tilt_deg)
         return found
 
-    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
     upright = EstimatedUp(50, _rgb)
     for _ in range(2):
         np.testing.assert_array_equal(upright(_heights()._replace(up=-UP), 1, FILES[1]).up, -UP)
@@ -113,7 +114,7 @@ def test_a_judge_sees_the_panorama_and_stays_in_its_process(
         assert judge is None or judge(np.eye(3)).argmax() != 0
         return up if judge is not None else UP
 
-    monkeypatch.setattr("datamodules.core.pipeline.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
     upright = EstimatedUp(180, _rgb, None, judge)
     judged = upright(_heights(), 0, FILES[0]).up
     sent = pickle.loads(pickle.dumps(upright))  # as to a worker
@@ -133,7 +134,9 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     def double(panorama: Panorama, index: int, files: Any) -> Panorama:
         return panorama._replace(labels=panorama.labels * 0 + index)
 
-    items = SplitItems(Found("panoramas", {"test": FILES}, decode), "test", Panorama, [double])
+    items = SplitReader(
+        DatasetIndex("panoramas", {"test": FILES}, decode), "test", Panorama, [double]
+    )
     items.remember("data")
     for index in (0, 1):
         np.testing.assert_array_equal(items.read(index).rgb, _heights().rgb)
@@ -142,4 +145,6 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     assert sorted(read) == ["0", "1"]
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
-        SplitItems(Found("panoramas", {"test": broken}, decode), "test", Panorama).remember("data")
+        SplitReader(DatasetIndex("panoramas", {"test": broken}, decode), "test", Panorama).remember(
+            "data"
+        )

@@ -13,8 +13,8 @@ from omegaconf import OmegaConf
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.build import build
-from tangent_train.cli.fine_tuning import begin_from
+from tangent_train.cli.pretrained import with_pretrained_network
+from tangent_train.cli.run import build
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
@@ -66,7 +66,7 @@ def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tupl
     everything: Any = OmegaConf.to_container(config, resolve=False)
     del everything["hydra"]
     settings: Any = OmegaConf.to_container(OmegaConf.create(everything), resolve=True)
-    return begin_from(path, settings)
+    return with_pretrained_network(path, settings)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +97,7 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
         assert (source is None) != taken
         if source is None:
             continue
-        assert [name for name in settings if source.owns(name)] == ["network"]
+        assert [name for name in settings if source.gave(name)] == ["network"]
         _, task = build(settings, source)
         assert task(torch.zeros(1, 3, 32, 32)).shape == (1, 13, 32, 32)
 
@@ -119,7 +119,7 @@ def test_a_network_that_holds_the_file_s_is_kept(
     config = composed("train", "level=5", return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
     settings = composed_settings("train", "network=unet_small_context")
-    begun, source = begin_from(imported, settings)
+    begun, source = with_pretrained_network(imported, settings)
     assert begun["network"] == settings["network"]
     assert source is None
 

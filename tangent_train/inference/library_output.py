@@ -1,4 +1,4 @@
-"""Libraries whose notes are for their developers."""
+"""Output of other libraries that is for their developers."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 
 
 @contextmanager
-def quiet() -> Iterator[None]:
-    """Hide what a library logs, warns of and prints: what it returns is verified anyway."""
+def hide_output() -> Iterator[None]:
+    """Hide log records, warnings and printed lines of a library whose results are verified."""
     disabled = logging.root.manager.disable
     logging.disable()
     try:

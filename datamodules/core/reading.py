@@ -1,0 +1,111 @@
+"""Reading the images or shapes of one split: from files, a store or memory."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.index import DatasetIndex, Item, Split
+from datamodules.core.problems import Problems
+from datamodules.core.store import Store
+from tangent_train.threads import in_threads
+
+_Item = TypeVar("_Item", bound=Item)
+_Image = TypeVar("_Image")
+
+Transform = Callable[[_Image, int, _Item], _Image]
+"""Changes an image, given its place in the split and its files."""
+
+
+class SplitReader(Generic[_Item, _Image]):
+    """The images of one split, by number.
+
+    Args:
+        index: All images; arrays of its store are memory-mapped, not copied.
+        split: The split.
+        kind: Named tuple that they are, which stored arrays are wrapped in too.
+        transforms: Changes to every image, in their order.
+
+    Attributes:
+        items: Their files.
+    """
+
+    def __init__(
+        self,
+        index: DatasetIndex[_Item],
+        split: Split,
+        kind: type[_Image],
+        transforms: Sequence[Transform[_Image, _Item]] = (),
+    ) -> None:
+        self.items = index.splits[split]
+        self._decode, self._store = index.read, index.store
+        self._kind = kind
+        self._transforms = transforms
+        self._kept: list[_Image] = []
+
+    def __len__(self) -> int:
+        return len(self.items)
+
+    def name(self, index: int) -> str:
+        """Unique short name of an item; ``/`` between groups."""
+        return self.items[index].name
+
+    def read(self, index: int) -> _Image:
+        """One image; its arrays may be shared or read-only.
+
+        Raises:
+            DataError: A file is broken, or its prepared version is missing or out of date.
+        """
+        if self._kept:
+            return self._kept[index]
+        item = self.items[index]
+        image = self._decode(item) if self._store is None else self._stored(self._store, item)
+        for transform in self._transforms:
+            image = transform(image, index, item)
+        return image
+
+    def labels(self, index: int) -> NDArray[np.uint8]:
+        """The labels of one image, cheaper than the whole image."""
+        decode: Any = self._decode
+        image: Any = None
+        if self._kept or self._transforms or self._store is not None:
+            image = self.read(index)
+        labels: NDArray[np.uint8] = (
+            decode.labels(self.items[index]) if image is None else image.labels
+        )
+        return labels
+
+    def remember(self, root: object) -> None:
+        """Read all images now and keep them in memory.
+
+        Done before the loader's workers start, which then share the memory (on systems that fork);
+        every process of a distributed run keeps its own.
+
+        Args:
+            root: The data set, for messages.
+
+        Raises:
+            DataError: Some are broken; all of these are named.
+        """
+        problems = Problems()
+
+        def keep(index: int) -> Any:
+            with problems.noted(self.name(index)):
+                image: Any = self.read(index)
+                # Copies: arrays that are views of a file would keep it open.
+                return image._make(None if a is None else np.array(a) for a in image)
+
+        kept = list(in_threads(keep, range(len(self))))
+        problems.refuse(root)
+        self._kept = kept
+
+    def _stored(self, store: Store, item: _Item) -> _Image:
+        arrays = store.read(item.name, item.parts)
+        # Prepared with depth, they also serve runs without.
+        read = {key: a for key, a in arrays.items() if key != "depth" or "depth" in item.parts}
+        kind: Any = self._kind
+        image: _Image = kind(**{**dict.fromkeys(kind._fields), **read})
+        return image

@@ -1,0 +1,154 @@
+"""The network and the tensors that a training takes from another file, ``init_from``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.utilities import rank_zero_only
+
+from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
+from models import initialize
+from tangent_train.checkpoints.trained import (
+    NetworkDescription,
+    completed_settings,
+    describe_network,
+)
+from tangent_train.cli.run import Run, Settings
+from tangent_train.cli.settings import Trust, parse_settings
+from tangent_train.console import print_text
+from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.registry import SettingsFile, build_from_config
+
+_RGB = 3
+_TYPED = re.compile(r"[+~]*network[.@=]")
+
+
+def with_pretrained_network(path: Path, settings: Settings) -> tuple[Settings, SettingsFile | None]:
+    """Return the settings of a run with the network and the normalization of a file.
+
+    The network is that of the file, unless the user typed one (``network=…``,
+    ``network.widths=…``), or the composed one wraps a network of the file's class, as
+    `SphereContext` does. The data decide its classes and channels. The normalization is that of the
+    file, unless the config has one.
+
+    Args:
+        path: A file of any kind that `initialize` reads. A file that does not describe its network,
+            such as a state dict, changes nothing; nor do configs without the group ``network``,
+            such as the stages of a transfer, which are complete.
+        settings: Settings of the run.
+
+    Returns:
+        Settings of the run, and the source of those that the file gave, if any.
+
+    Raises:
+        DataError: It is an ONNX file, or its network returns no scores that can be trained.
+    """
+    if path.suffix.lower() == ".onnx":
+        raise DataError(
+            path,
+            found="an ONNX file, whose tensors cannot be trained",
+            expected="a checkpoint, a state dict or a .safetensors file",
+            remedy="Give the checkpoint that it was exported from.",
+        )
+    description, hydra = describe_network(path), HydraConfig.get()
+    if description is None or "network" not in hydra.runtime.choices:
+        return settings, None
+    changed, source, notes = dict(settings), None, []
+    network = changed["network"]
+    target = description.settings.get("_target_")
+    if any(map(_TYPED.match, hydra.overrides.task)) or _wraps(network, target):
+        notes.append(f"Network of the config: {network['_target_']}")
+    else:
+        if description.score_kind in ("probabilities", "sigmoid", "labels"):
+            raise DataError(
+                path,
+                found=f"a network that returns {description.score_kind}",
+                expected="scores before a softmax or sigmoid, which the losses need",
+                remedy="Take the last step out of the network, and import it again.",
+            )
+        changed["network"] = description.settings
+        trust = parse_settings(Trust, settings).trust
+        source = SettingsFile(path, trust, settings.keys() - {"network"})
+        notes.append(f"Network of {path}: {target} (another: network=…)")
+    normalization = _normalization(description, changed["data"])
+    if normalization is not None:
+        changed["data"] = changed["data"] | {"normalization": normalization}
+        mean, std = (" ".join(f"{value:.4g}" for value in v) for v in normalization.values())
+        notes.append(
+            f"Normalization of {path}: mean {mean}, std {std} (another: data.normalization=…)"
+        )
+    _print("\n".join(notes))
+    return changed, source
+
+
+def load_pretrained(path: Path | None, run: Run) -> None:
+    """Load the tensors of a file into the network of a new run, and print their names.
+
+    Args:
+        path: The file; None to train from scratch.
+        run: Its network is changed in place; its task learns which tensors are new.
+
+    Raises:
+        DataError: The file cannot be read, or nothing in it fits.
+        SettingError: Other learning rates are set for a backbone that is not loaded.
+    """
+    if path is None:
+        if run.task.backbone_lr_factor != 1:
+            raise SettingError(
+                "optimizer.backbone_lr_factor",
+                found=run.task.backbone_lr_factor,
+                expected="1 without init_from=, which says what the backbone is",
+            )
+        return
+    description, network = describe_network(path), run.task.network
+    channels = None
+    of_other_classes: Collection[str] = ()
+    if description is not None:
+        names = tuple(run.data.class_names)
+        if description.groups is not None or description.class_names != names:
+            of_other_classes = _heads(run)
+        inputs = getattr(run.data, "inputs", None)
+        if description.inputs is not None and inputs is not None:
+            channels = (channel_names(description.inputs), channel_names(inputs))
+    origins = initialize(network, path, channels, of_other_classes)
+    run.task.fresh = frozenset(origins.fresh)
+    _print(f"Tensors from {path}\n{origins}")
+
+
+@rank_zero_only
+def _print(text: str) -> None:
+    print_text(printable(text))
+
+
+def _wraps(section: Mapping[str, Any], target: Any) -> bool:
+    """True if the settings of a network contain a network of this class."""
+    inner = [value for value in section.values() if isinstance(value, Mapping)]
+    return any(value.get("_target_") == target or _wraps(value, target) for value in inner)
+
+
+def _normalization(
+    description: NetworkDescription, data: Mapping[str, Any]
+) -> dict[str, list[float]] | None:
+    """The normalization of a file for the inputs of the data; None to keep that of the data."""
+    inputs = data.get("inputs")
+    if description.inputs is None or inputs is None or data.get("normalization") is not None:
+        return None
+    default = {"mean": RGBD_NORMALIZATION.mean, "std": RGBD_NORMALIZATION.std}
+    count = _RGB + ("depth" in inputs)
+    return {
+        name: [*values, *default[name][len(values) :]][:count]
+        for name, values in ((name, description.normalization.get(name, ())) for name in default)
+    }
+
+
+def _heads(run: Run) -> set[str]:
+    """Names of the tensors that grow with another class."""
+    section, data = run.settings["network"], run.data
+    more = completed_settings(section, data.in_channels, data.num_classes + 1, restored=True)
+    larger = build_from_config(more, "network", run.source).state_dict()
+    tensors = run.task.network.state_dict()
+    return {name for name, tensor in tensors.items() if tensor.shape != larger[name].shape}

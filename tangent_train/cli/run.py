@@ -1,0 +1,372 @@
+"""A run: its folder, settings, data and task. Training and evaluation share this."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import lightning
+from hydra.core.hydra_config import HydraConfig
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
+from torch import nn
+
+from datamodules.core.loading import explained
+from datamodules.core.split_module import SplitDataModule
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
+from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.progress import ProgressBar
+from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
+from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
+from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
+from tangent_train.cli.command_settings import ClassMapSettings
+from tangent_train.cli.settings import parse_settings
+from tangent_train.cli.stored import GROUPS
+from tangent_train.cli.trials import try_network, try_training
+from tangent_train.console import print_text
+from tangent_train.errors import SettingError, at_least
+from tangent_train.files import no_room
+from tangent_train.inference.class_maps import load_class_map, map_classes
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.views import check_size
+from tangent_train.registry import SettingsFile, build_from_config, resolve_target
+from tangent_train.results.evaluation import (
+    confusion_table,
+    headline,
+    result_tables,
+    write_results,
+)
+from tangent_train.results.html import write_report
+from tangent_train.results.record import Record
+
+# lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
+warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
+
+Settings = Mapping[str, Any]
+"""All settings of a run, resolved: plain values in nested sections."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run with its objects.
+
+    Attributes:
+        folder: Output folder.
+        settings: Settings kept in its checkpoints.
+        source: File that settings come from; None if all are the user's.
+        data: The data module.
+        task: The task.
+        trained: Its network, if that is not built from the settings.
+        notes: Notes on the classes of that network.
+    """
+
+    folder: Path
+    settings: Settings
+    source: SettingsFile | None
+    data: Any
+    task: Any
+    trained: TrainedNetwork | None = None
+    notes: Sequence[str] = ()
+
+    @staticmethod
+    def create(
+        settings: Settings,
+        source: SettingsFile | None,
+        trained: TrainedNetwork | None = None,
+        *,
+        trains: bool = True,
+    ) -> Run:
+        """Build the objects, and write the settings to the run's folder.
+
+        Args:
+            settings: Settings of the run.
+            source: File that settings come from.
+            trained: Network to evaluate; None to build it from the settings.
+            trains: False if the task is only evaluated, see `build`.
+        """
+        folder = Path(HydraConfig.get().runtime.output_dir)
+        seed = at_least("seed", settings["seed"], 0)
+        lightning.seed_everything(seed, workers=True, verbose=False)
+        notes: list[str] = []
+        if trained is None:
+            data, task = build(settings, source, trains=trains)
+        else:
+            data, task, notes = build_trained(settings, trained, source)
+        kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
+        kept = {"choices": _choices(settings, source), **kept}
+        write_settings(folder / "config.yaml", kept)
+        return Run(folder, kept, source, data, task, trained, notes)
+
+    def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
+        """The trainer of the config, with callbacks besides those of every run."""
+        kept = {"config": self.settings, **inputs_and_classes(self.data)}
+        common = [
+            CheckpointContents({"predicts": self.task.predicts, **kept}),
+            ProgressBar(),
+            ClassScores(),
+            PredictionPanels(self.folder / "panels", self.settings["panels"]),
+            ValidationPictures(self.settings["tensorboard_images"]),
+        ]
+        section = self.settings["trainer"]
+        # Devices found, advertisements, what the settings say anyway.
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
+        if epochs not in (None, -1):
+            at_least("trainer.max_epochs", epochs, 1)
+        return build_from_config(
+            section,
+            "trainer",
+            self.source,
+            # A run shorter than that is validated at its end.
+            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
+            default_root_dir=str(self.folder),
+            callbacks=[*callbacks, *common],
+            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
+            plugins=[AtomicCheckpointIO()],
+            # The data module's samplers count every image once on any number of processes.
+            use_distributed_sampler=False,
+        )
+
+    def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
+        """Evaluate weights on the test fold and write the results.
+
+        Raises:
+            SettingError: The data or the network do not match the weights.
+        """
+        if self.trained is None:
+            content = read_checkpoint(checkpoint)
+            check_fits(self.data, content, checkpoint)
+            self._load(content["state_dict"], checkpoint)
+        if getattr(self.data, "upright", None) == "auto":
+            self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
+        trainer.test(self.task, datamodule=self.data, verbose=False)
+        noun = self.data.noun
+        record = self.task.record(self.task.result, noun)
+        total = len(self.data.source("test"))
+        if record.images != total:
+            raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
+        self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+
+    def _as_trained(self) -> TrainedNetwork:
+        """The network of the run, with what it was trained on."""
+        if self.trained is not None:
+            return self.trained
+        data = self.data
+        network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
+        return TrainedNetwork(
+            inner=self.task.network,
+            class_names=data.class_names,
+            inputs=data.inputs,
+            normalization=data.normalization,
+            level=self.settings["level"],
+            representation=self.settings["representation"],
+            image_size=data.representation.image_size,
+            size_multiple=size_multiple_of(network, data.in_channels) or 1,
+            source=self.source,
+        )
+
+    def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
+        try:
+            self.task.load_state_dict(tensors)
+        except RuntimeError as error:
+            raise SettingError(
+                "network",
+                found=f"other tensors than in {checkpoint} ({error})",
+                expected="the network and inputs of the checkpoint",
+            ) from error
+
+    @rank_zero_only
+    def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
+        own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
+        name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
+        record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
+        notes = [f"Checkpoint: {name}", *self.notes]
+        write_results(record, self.folder, notes)
+        write_report(
+            self.folder / "report.html",
+            f"Evaluation of {checkpoint.name}",
+            tables=[*result_tables(record), confusion_table(record)],
+            images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
+            class_names=self.task.class_names,
+            notes=[headline(record), *notes],
+        )
+        for line in (*self.notes, headline(record)):
+            print_text(line)
+        result_tables(record)[0].print()
+        print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
+
+
+def build(
+    settings: Settings, source: SettingsFile | None = None, *, trains: bool = True
+) -> tuple[Any, Any]:
+    """Build the data module and the task of a run, and try them on empty inputs.
+
+    Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
+    ``classes``, also of a network inside the network's settings. Where a checkpoint will bring the
+    tensors, no others are fetched first.
+
+    Args:
+        settings: Settings of the run.
+        source: File that settings come from, see `registry.build_from_config`.
+        trains: False if the task is only evaluated: its optimizer and scheduler are not built.
+
+    Returns:
+        Data module and task.
+
+    Raises:
+        SettingError: A setting, or a combination of settings, is invalid.
+    """
+    data = build_data(settings, source)
+    restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
+    section = completed_settings(
+        settings["network"], data.in_channels, data.num_classes, restored=restored
+    )
+    network = build_from_config(section, "network", source)
+    task = _build_task(settings, data, network, source, trains=trains)
+    try_network(task, data.in_channels)
+    if trains:
+        try_training(task, data, settings)
+    return data, task
+
+
+def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
+    """Build the data module of a run, with the labels that its task needs; see `build`."""
+    representation = build_from_config(settings["representation"], "representation", source)
+    data_set = resolve_target(settings["data"], "data", source)
+    if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
+        expected = "labelled images or shapes; pairs are for tangent-keypoints"
+        raise SettingError("data", found=data_set.__name__, expected=expected)
+    data = build_from_config(settings["data"], "data", source, representation=representation)
+    data.check_classes()
+    task = resolve_target(settings["task"], "task", source)
+    needed = getattr(task, "labels", data.labels)
+    if needed != data.labels:
+        raise SettingError(
+            "task",
+            found=f"{getattr(task, '__name__', task)}, which needs {needed}",
+            expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
+        )
+    return data
+
+
+def build_trained(
+    settings: Settings, trained: TrainedNetwork, source: SettingsFile | None = None
+) -> tuple[Any, Any, list[str]]:
+    """Build the data module and the task that evaluate a network from a file.
+
+    Args:
+        settings: Settings of the evaluation, perhaps with ``class_map`` and ``unmapped``.
+        trained: The network.
+        source: File that settings come from, see `registry.build_from_config`.
+
+    Returns:
+        Data module, task, and notes on the class map.
+
+    Raises:
+        SettingError: The network does not fit the data, or the class map does not fit one of them.
+    """
+    data = build_data(settings, source)
+    notes = []
+    if settings.get("class_map") is not None:
+        given = parse_settings(ClassMapSettings, settings)
+        class_map = load_class_map(given.class_map)
+        mapped = map_classes(trained, class_map, given.unmapped, data.class_names[1:])
+        trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
+    check_fits(data, inputs_and_classes(trained), settings["checkpoint"])
+    check_size(trained, data.representation.image_size)
+    task = _build_task(settings, data, trained.network, source, trains=False)
+    return data, task, notes
+
+
+def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
+    """Refuse data with other inputs or classes than those of a network.
+
+    Args:
+        data: The data module.
+        network: Its `inputs_and_classes`, perhaps with further fields.
+        name: Name of the network, for the message.
+
+    Raises:
+        SettingError: Inputs or classes differ.
+    """
+    for what, value in inputs_and_classes(data).items():
+        if network[what] != value:
+            raise SettingError(
+                f"data, for {name}",
+                found=f"{what.replace('_', ' ')} {value}",
+                expected=f"{network[what]}, which the network was trained with",
+                remedy="class_map= says which are the same." if what == "class_names" else "",
+            )
+
+
+def inputs_and_classes(of: Any) -> dict[str, Any]:
+    """Return inputs and classes of a data module or a trained network as plain values."""
+    mean, std = list(of.normalization.mean), list(of.normalization.std)
+    inputs = {"inputs": list(of.inputs)} if hasattr(of, "inputs") else {}
+    names = list(of.class_names)
+    return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
+
+
+def _build_task(
+    settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None, *, trains: bool
+) -> Any:
+    parts: dict[str, Any] = {"optimizer": _no_optimizer}
+    if trains:
+        optimizer = dict(settings["optimizer"])
+        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
+        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+    if trains and settings.get("scheduler") is not None:
+        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+    return build_from_config(
+        settings["task"],
+        "task",
+        source,
+        network=network,
+        representation=data.representation,
+        class_names=data.class_names,
+        **parts,
+    )
+
+
+def _no_optimizer(*_: Any, **__: Any) -> Any:
+    raise RuntimeError("a task that is only evaluated has no optimizer")
+
+
+def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
+    """The chosen options of config groups, without those in whose place a file gave a section."""
+    chosen, stored = HydraConfig.get().runtime.choices, settings.get("choices") or ()
+    return {
+        group: chosen[group]
+        for group in GROUPS
+        if chosen.get(group)
+        and (source is None or group in stored or group == "experiment" or not source.gave(group))
+    }
+
+
+@contextmanager
+def machine_faults(folder: Path, data: Any) -> Iterator[None]:
+    """Explain a full disk, and workers that died.
+
+    Args:
+        folder: Folder of the run.
+        data: Its data module.
+
+    Raises:
+        NoRoomError: The disk is full for a file that is not written atomically, such as
+            TensorBoard's events.
+        DataError: A worker died.
+    """
+    try:
+        yield
+    except (OSError, EOFError, RuntimeError, ValueError) as error:
+        explanation = no_room(folder, error) or explained(error, data.num_workers)
+        if explanation is error:
+            raise
+        raise explanation from error

@@ -1,0 +1,125 @@
+"""Trials of a training on empty inputs, before any data is generated."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import torch
+from torch import nn
+
+from tangent_train.errors import SettingError, counted
+
+_RGB = 3
+
+
+def try_training(task: Any, data: Any, settings: Mapping[str, Any]) -> None:
+    """Try a training step of full size, the optimizer and the scheduler.
+
+    The data module tries the last step of an epoch, once it has counted its samples.
+
+    Args:
+        task: The task.
+        data: The data module.
+        settings: Settings of the run.
+
+    Raises:
+        SettingError: The run could not be trained.
+    """
+    synchronized = bool(settings["trainer"].get("sync_batchnorm"))
+    data.try_step = partial(_try_step, copy.deepcopy(task).to("meta"), data, synchronized)
+    data.try_step(data.per_step)
+    _try_schedule(task, settings)
+
+
+def _try_schedule(task: Any, settings: Mapping[str, Any]) -> None:
+    """Make the optimizer, and the scheduler for some number of steps; take one of them."""
+    group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
+
+    def schedule() -> None:
+        made = task.optimization(lambda: 1000)
+        if isinstance(made, dict):
+            made["optimizer"].step(lambda: 0.0)  # some optimizers need a closure
+            made["lr_scheduler"]["scheduler"].step()
+
+    trials: dict[str, Callable[[], object]] = {
+        "optimizer": lambda: task.make_optimizer([group]),
+        "scheduler": schedule,
+    }
+    for name, trial in trials.items():
+        try:
+            trial()
+        except Exception as error:
+            expected = f"settings that {settings[name]['_target_']} takes"
+            raise SettingError(
+                name, found=f"{type(error).__name__}: {error}", expected=expected
+            ) from error
+
+
+def try_network(task: Any, channels: int) -> None:
+    """Run the network on an empty input, to find mismatches before any data is generated."""
+    shape = tuple(task.example(channels).shape)
+    if fault := find_fault(task, shape, trains=False):
+        raise SettingError(
+            "network",
+            found=f"{type(task.network).__name__}, which does not take {shape} ({fault})",
+            expected=f"one that maps {task.takes}",
+            remedy="A network for photos takes data.inputs=[rgb]." if channels > _RGB else "",
+        )
+
+
+def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
+    """Run the network in training mode on the smallest chunk of a training step.
+
+    Batch normalization fails on a single value per channel, such as a single image of 1×1 features.
+
+    Args:
+        probe: The task, on the device ``meta``.
+        data: The data module.
+        synchronized: True if several processes normalize together.
+        samples: Panoramas, photos or shapes of the step.
+
+    Raises:
+        SettingError: The network cannot be trained on it.
+    """
+    if synchronized and (data.trainer is None or data.trainer.world_size > 1):
+        return
+    step = probe.empty_step(data.in_channels, samples)
+    chunk = min(probe.chunks(step), key=len)
+    shape = tuple(chunk.shape)
+    if fault := find_fault(probe.network, shape, trains=True):
+        per_step = f"data.{data.noun}_per_step"
+        is_whole = len(chunk) == len(step)
+        raise SettingError(
+            per_step if is_whole else "task.images_per_chunk",
+            found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
+            f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {shape}, on which "
+            f"it cannot be trained ({fault})",
+            expected="more images at a time, in the last step of an epoch too",
+            remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
+            "normalization.",
+        )
+
+
+def find_fault(module: nn.Module, shape: tuple[int, ...], *, trains: bool) -> str | None:
+    """The first line of the error of a module on empty images; None without an error.
+
+    Nothing is computed where shapes are enough to know.
+    """
+    fault = None
+    for device in ("meta", "cpu"):
+        trial = copy.deepcopy(module).to_empty(device=device).train(trains)
+        try:
+            with torch.random.fork_rng(devices=[]), torch.no_grad():
+                for tensor in (*trial.parameters(), *trial.buffers()):
+                    tensor.zero_()  # memory may hold any numbers, and buffers are indices too
+                trial.forward(torch.zeros(shape, device=device))  # a compiled one is not compiled
+        except SettingError:
+            raise
+        except (RuntimeError, ValueError) as error:
+            fault = str(error).partition("\n")[0]
+        else:
+            return None
+    return fault
