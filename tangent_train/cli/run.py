@@ -140,7 +140,7 @@ class Run:
         data = self.data
         network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
         return TrainedNetwork(
-            network=network,
+            inner=self.task.network,
             class_names=data.class_names,
             inputs=data.inputs,
             normalization=data.normalization,
