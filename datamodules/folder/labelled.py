@@ -5,7 +5,7 @@ On disk::
     root/
       classes.json                  see `read_classes`
       images/[scene/]…/name.jpg     or .png, .tif, .webp
-      labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
+      labels/[scene/]…/name.png     values or colors of the classes, at the size of the image
       depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
       train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
 """
@@ -43,7 +43,7 @@ class LabelledFolder(ImageDataModule):
             `validation_fraction` is that of the training scenes, likewise.
         split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
             different seeds share their splits.
-        depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
+        depth_units_per_m: Units in a meter of depth files of whole numbers, 1000 for millimeters.
 
     Attributes:
         class_names: "unknown", then those of ``classes.json``.
