@@ -12,15 +12,25 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
-from datamodules.core.split_module import Kind
+from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
 from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
-from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
+from tangent_train.metrics.segmentation import (
+    AbsentClass,
+    ConfusionMatrices,
+    ConfusionMatrix,
+    segmentation_scores,
+)
 from tangent_train.registry import registered
 from tangent_train.rendering import EquirectRepresentation
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import Representation
-from tangent_train.tasks.base import Part, Task
+from tangent_train.results.evaluation import segmentation_record
+from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.pictures import prediction_panel, shown_arrays
+from tangent_train.results.record import Record
+from tangent_train.results.tables import percent
+from tangent_train.tasks.base import RGB, Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 
 
@@ -49,10 +59,9 @@ class SegmentationTask(Task):
         **settings: See `Task`.
     """
 
-    kind: ClassVar[Kind] = "segmentation"
+    predicts: ClassVar[str] = PIXEL_CLASSES
     monitor: ClassVar[str] = "val/miou"
     takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
-    metric = ConfusionMatrix
     class_weights: Tensor
 
     def __init__(
@@ -216,21 +225,60 @@ class SegmentationTask(Task):
         return fill(mosaic, self, zip(sets, of_sets, rays, strict=True), self.images_per_forward)
 
     def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of panoramas or photos to `confusion`; returns the predictions."""
+        """Add a batch of panoramas or photos to `metric`; returns the predictions."""
         predictions = []
         for images, target, rotation in zip(
             batch.images, batch.target, batch.rotation, strict=True
         ):
             labels = self.predict_labels(images, tuple(target.shape), rotation.cpu().numpy())
             predictions.append(labels)
-            self.confusion.update(labels, target)
+            self.metric.update(labels, target)
         return torch.stack(predictions)
 
-    def scores(self) -> dict[str, float]:
+    def build_metric(self) -> ConfusionMatrix:
+        """Confusion matrices of pixels, latitude bands and solid angles."""
+        return ConfusionMatrix(len(self.class_names))
+
+    def logged_scores(self, result: ConfusionMatrices) -> dict[str, float]:
         """Means over classes, of panoramas also weighted by solid angle."""
-        pixels = segmentation_scores(self.matrices.pixels, self.absent_class)
+        pixels = segmentation_scores(result.pixels, self.absent_class)
         scores = {"miou": pixels.miou, "macc": pixels.macc}
-        if self.matrices.solid_angle.any():
-            angles = segmentation_scores(self.matrices.solid_angle, self.absent_class)
+        if result.solid_angle.any():
+            angles = segmentation_scores(result.solid_angle, self.absent_class)
             scores |= {"miou_solid_angle": angles.miou, "macc_solid_angle": angles.macc}
         return scores
+
+    def class_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+        """Intersection over union of each class."""
+        scores = segmentation_scores(result.pixels, self.absent_class).iou.tolist()
+        return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
+
+    def record(self, result: ConfusionMatrices, noun: str) -> Record:
+        """The record with scores of classes, latitude bands and solid angles."""
+        return segmentation_record(result, self.class_names, self.absent_class, noun)
+
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB:
+        """Input, ground truth, prediction and error in a 2×2 grid above a legend."""
+        shown = shown_arrays(image, target, prediction, self.representation, most_rows)
+        return prediction_panel(*shown, self.class_names)
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage:
+        """The image with its true and predicted labels."""
+        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
+        classes = len(self.class_names)
+        pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
+        counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+        note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
+        return encode_image(
+            name,
+            rgb,
+            classes,
+            prediction=labels,
+            truth=truth,
+            sphere=target.ndim == 2,
+            note=note,
+        )

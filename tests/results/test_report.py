@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from datamodules.modelnet40.shape_files import MODELNET40
-from datamodules.stanford2d3ds.reader import CLASSES
+from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import published, runs_report, transfer_report
 from tangent_train.results.record import Record
@@ -134,7 +134,7 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
         "data._target_": "datamodules.ModelNet40",
         "level": 5,
         "name": "shapes",
-        "representation.rotation": "yaw",
+        "representation.random_rotation": "yaw",
         "data.test_rotation": "so3",
         "representation.base_level": 0,
     }
