@@ -159,7 +159,7 @@ def panorama_settings(
     """
     chosen = level_list(levels, trained.level)
     level = max(chosen)
-    settings: dict[str, Any] = dict(trained.representation)
+    settings: dict[str, Any] = {k: v for k, v in trained.representation.items() if k != "levels"}
     kind = settings["_target_"]
     if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
@@ -168,15 +168,15 @@ def panorama_settings(
     if level != trained.level:
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = level
-    if settings["_target_"] == _TANGENT:
+    if len(chosen) > 1:
+        if settings["_target_"] != _TANGENT:
+            raise SettingError(
+                "levels",
+                found=chosen,
+                expected="one, for a network that does not take tangent images",
+                remedy="Give base_level= to use tangent images.",
+            )
         settings["levels"] = chosen
-    elif len(chosen) > 1:
-        raise SettingError(
-            "levels",
-            found=chosen,
-            expected="one, for a network that does not take tangent images",
-            remedy="Give base_level= to use tangent images.",
-        )
     if settings["_target_"] == _TANGENT and trained.fixed_size is not None:
         side = max(trained.fixed_size)
         if base_level is None and settings.get("dim") is None:

@@ -229,7 +229,7 @@ def test_one_score_is_of_a_class_and_its_background(
     images = _images(16, 24)
     expected = np.einsum("c,bchw->bhw", weight[0].astype(np.float64), images.double()) - 1
     scores = trained.network(images)
-    labels = trained.labels(scores.argmax(dim=1).numpy().astype(np.uint8))
+    labels = trained.labels(scores.argmax(dim=1).byte())
     background = 0 if len(names) == 1 else 1
     np.testing.assert_array_equal(labels, np.where(expected > 0, background + 1, background))
     shares = scores.softmax(dim=1)[:, len(names) - 1]
@@ -259,7 +259,7 @@ def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path)
     images, shown = _images(16, 24), _linear(_images(16, 24)) - 2
     for wins in (True, False):
         trained = _imported(path, unknown_wins=wins)
-        labels = trained.labels(trained.network(images).argmax(dim=1).numpy().astype(np.uint8))
+        labels = trained.labels(trained.network(images).argmax(dim=1).byte())
         best = shown.argmax(axis=-1) + 1
         unknown = (shown.max(axis=-1) < 0) & wins
         assert unknown.any() == wins
@@ -300,14 +300,14 @@ def test_other_values_of_label_maps_are_unknown(
     best = _linear(images).argmax(axis=-1)
     assert set(np.unique(best)) == set(range(5))
     found = trained.network(images)
-    labels = trained.labels(found.argmax(dim=1).numpy().astype(np.uint8))
+    labels = trained.labels(found.argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, np.where(best == 3, 0, best + 1))
     assert float(found.softmax(dim=1).amax(dim=1).min()) > 0.999
     with pytest.raises(SettingError, match="unknown_wins: found false, for label maps"):
         _imported(path, names, unknown_wins=False)
     merged = ClassMap("two", None, {"x": ["a", "b"], "y": ["c"]})
     mapped = map_classes(trained, merged).trained
-    labels = mapped.labels(mapped.network(images).argmax(dim=1).numpy().astype(np.uint8))
+    labels = mapped.labels(mapped.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, np.array([1, 1, 2, 0, 0])[best])
     with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
         map_classes(trained, merged, "never")
@@ -339,7 +339,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     again, images = load_trained(tmp_path / f"net.{suffix}", [name]), _images(32, 48)
     assert again.score_kind == "labels"
     expected = np.array([1, 2, 0, 3])[network(images)]
-    labels = again.labels(again.network(images).argmax(dim=1).numpy().astype(np.uint8))
+    labels = again.labels(again.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, expected)
     with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
         map_classes(again, ClassMap("one", None, {"x": ["a"]}), "never")
