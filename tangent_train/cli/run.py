@@ -41,6 +41,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -298,11 +299,12 @@ def _build_task(
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
-        optimizer = dict(settings["optimizer"])
-        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+        section = dict(settings["scheduler"])
+        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        scheduler = build_from_config(section, "scheduler", source)
+        parts["scheduler"] = Schedule(scheduler, **stepped)
     return build_from_config(
         settings["task"],
         "task",
