@@ -8,7 +8,7 @@ import threading
 from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from lightning import LightningModule, Trainer
@@ -176,19 +176,22 @@ class LastCheckpoint(Checkpoint):
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keep ``best.ckpt``, the epoch with the highest validation score; none without validation.
+    """Keep ``best.ckpt``, the epoch with the best validation score; none without validation.
 
     Args:
         folder: Output folder, of a resumed run whose folder was moved too.
         monitor: The score.
+        mode: ``max`` or ``min``: the better value.
     """
 
-    def __init__(self, folder: Path | str, monitor: str = "val/miou") -> None:
+    def __init__(
+        self, folder: Path | str, monitor: str = "val/miou", mode: Literal["max", "min"] = "max"
+    ) -> None:
         super().__init__(
             dirpath=folder,
             filename="best",
             monitor=monitor,
-            mode="max",
+            mode=mode,
             auto_insert_metric_name=False,
             enable_version_counter=False,
             save_on_train_epoch_end=False,

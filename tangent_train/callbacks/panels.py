@@ -6,23 +6,18 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 
 from tangent_train.errors import at_least
 from tangent_train.files import write_bytes
-from tangent_train.metrics.segmentation import segmentation_scores
-from tangent_train.results.html import EncodedImage, encode_image
-from tangent_train.results.pictures import evenly_spread, prediction_panel, shown_arrays
-from tangent_train.results.tables import percent
-
-_PANORAMA_DIMENSIONS = 2
+from tangent_train.results.html import EncodedImage
+from tangent_train.results.pictures import evenly_spread
 
 
 class PredictionPanels(Callback):
-    """Writes pictures of test panoramas or photos: input, ground truth, prediction, error.
+    """Writes pictures of a few predictions of the test, see `Task.picture`.
 
     Args:
         folder: Output folder.
@@ -45,29 +40,23 @@ class PredictionPanels(Callback):
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
+        task: Any = pl_module
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
         chosen = evenly_spread(self.count, len(source))
-        for index, prediction, target in zip(
-            batch.index.tolist(), outputs, batch.target, strict=True
-        ):
+        found = zip(batch.index.tolist(), task.targets(batch), outputs, strict=True)
+        for index, target, prediction in found:
             if index in chosen:
-                self._show(source, index, target, prediction, pl_module)
+                self._show(source, index, task, target, prediction)
 
-    def _show(self, source: Any, index: int, target: Any, prediction: Any, task: Any) -> None:
-        name, classes = source.name(index), len(task.class_names)
-        image, representation = source.read(index), task.representation
-        rgb, truth, labels = shown_arrays(image, target, prediction, representation)
-        panel = prediction_panel(rgb, truth, labels, task.class_names)
+    def _show(self, source: Any, index: int, task: Any, *labels: Any) -> None:
+        name, image = source.name(index), source.read(index)
+        panel = task.picture(image, *labels)
+        if panel is None:
+            return
         encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
         file = f"{index}_{name.replace('/', '_')}.png"  # other names may have "_" in them
         write_bytes(self.folder / file, encoded.tobytes())
-        pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
-        counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
-        note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
-        sphere = target.ndim == _PANORAMA_DIMENSIONS
-        self._encoded[index] = encode_image(
-            name, rgb, classes, prediction=labels, truth=truth, sphere=sphere, note=note
-        )
+        self._encoded[index] = task.report_image(name, image, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""

@@ -40,8 +40,8 @@ _FIELDS = {
     "epoch": int | None,  # of runs: the last that has begun, from 0
     "groups": GROUPS,
     "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
-    "kind": Literal["segmentation", "classification"],
     "normalization": NORMALIZATION,
+    "predicts": Text,  # what the network gives, see `datamodules.core.labels`
     "score_kind": ScoreKind | None,  # of imported networks; None: logits
     "state_dict": dict,
 }
@@ -54,8 +54,8 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Args:
         path: The file; tensors are memory-mapped, and compared with their checksums if needed.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``, ``kind``,
-            ``normalization``, ``score_kind``, ``state_dict``.
+            ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
+            ``normalization``, ``predicts``, ``score_kind``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, damaged, no checkpoint, or of another program.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,22 +12,19 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.command_settings import ClassMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
+from tangent_train.cli.trainer import build_trainer
 from tangent_train.cli.trials import try_network, try_training
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
@@ -38,11 +34,9 @@ from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import check_size
 from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
-    classification_record,
     confusion_table,
     headline,
     result_tables,
-    segmentation_record,
     write_results,
 )
 from tangent_train.results.html import write_report
@@ -108,30 +102,15 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        kept = {"config": self.settings, **inputs_and_classes(self.data)}
-        contents = {"kind": self.task.kind, **kept}
-        common = [CheckpointContents(contents), ProgressBar(), ClassScores()]
-        if self.task.kind == "segmentation":
-            common.append(PredictionPanels(self.folder / "panels", self.settings["panels"]))
-            common.append(ValidationPictures(self.settings["tensorboard_images"]))
-        section = self.settings["trainer"]
-        # Devices found, advertisements, what the settings say anyway.
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
-        if epochs not in (None, -1):
-            at_least("trainer.max_epochs", epochs, 1)
-        return build_from_config(
-            section,
-            "trainer",
-            self.source,
-            # A run shorter than that is validated at its end.
-            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
-            default_root_dir=str(self.folder),
-            callbacks=[*callbacks, *common],
-            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
-            plugins=[AtomicCheckpointIO()],
-            # The data module's samplers count every image once on any number of processes.
-            use_distributed_sampler=False,
+        # Checkpoints are passed on; settings of a logger may hold the address of a server.
+        config = {name: value for name, value in self.settings.items() if name != "logger"}
+        contents = {
+            "predicts": self.task.predicts,
+            "config": config,
+            **inputs_and_classes(self.data),
+        }
+        return build_trainer(
+            self.settings, self.folder, self.task, contents, callbacks, self.source
         )
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
@@ -147,12 +126,8 @@ class Run:
         if getattr(self.data, "upright", None) == "auto":
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        task, noun = self.task, self.data.noun
-        if task.kind == "classification":
-            record = classification_record(task.matrices, task.class_names, noun)
-        else:
-            names, absent = task.class_names, task.absent_class
-            record = segmentation_record(task.matrices, names, absent, noun)
+        noun = self.data.noun
+        record = self.task.record(self.task.result, noun)
         total = len(self.data.source("test"))
         if record.images != total:
             raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
@@ -165,7 +140,7 @@ class Run:
         data = self.data
         network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
         return TrainedNetwork(
-            network=network,
+            inner=self.task.network,
             class_names=data.class_names,
             inputs=data.inputs,
             normalization=data.normalization,
@@ -241,7 +216,7 @@ def build(
 
 
 def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
-    """Build the data module of a run, of the kind that its task takes; see `build`."""
+    """Build the data module of a run, with the labels that its task needs; see `build`."""
     representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
@@ -249,9 +224,14 @@ def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()
-    kind = getattr(resolve_target(settings["task"], "task", source), "kind", data.kind)
-    if kind != data.kind:
-        raise SettingError("task", found=f"{kind}, with {data.noun}", expected=data.kind)
+    task = resolve_target(settings["task"], "task", source)
+    needed = getattr(task, "labels", data.labels)
+    if needed != data.labels:
+        raise SettingError(
+            "task",
+            found=f"{getattr(task, '__name__', task)}, which needs {needed}",
+            expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
+        )
     return data
 
 

@@ -75,7 +75,11 @@ def prediction_panel(
 
 
 def shown_arrays(
-    image: Any, target: Any, prediction: Any, representation: Any
+    image: Any,
+    target: Any,
+    prediction: Any,
+    representation: Any,
+    most_rows: int | None = None,
 ) -> tuple[_Image, NDArray[np.integer], NDArray[np.integer]]:
     """A panorama with its labels, or the crops of a photo side by side.
 
@@ -84,15 +88,19 @@ def shown_arrays(
         target: Tensor of its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
         prediction: Tensor of predicted labels, as many.
         representation: Defines the crops.
+        most_rows: Larger images are downsampled to fewer rows; None for all.
 
     Returns:
         RGB ``(H, W, 3)``, truth and prediction ``(H, W)``; W is n·w of crops.
     """
     truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
-    if truth.ndim == _PANORAMA_DIMENSIONS:
-        return image.rgb, truth, labels
-    crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
-    return np.hstack(crops), np.hstack(truth), np.hstack(labels)
+    rgb = image.rgb
+    if truth.ndim != _PANORAMA_DIMENSIONS:
+        crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
+        rgb, truth, labels = map(np.hstack, (crops, truth, labels))
+    step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
+    part = slice(step // 2, None, step)
+    return rgb[part, part], truth[part, part], labels[part, part]
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -6,22 +6,30 @@ import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import lightning
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
+from torchmetrics import Metric, SumMetric
 
-from datamodules.core.split_module import Kind
+from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
+from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.record import Record
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
 from tangent_train.tasks.schedules import ends_at
 
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
+
+RGB = NDArray[np.uint8]
+"""A picture ``(H, W, 3)``."""
 
 
 class Task(lightning.LightningModule, ABC):
@@ -48,11 +56,15 @@ class Task(lightning.LightningModule, ABC):
         backbone_lr_factor: Of the learning rate of the parameters that are not `fresh`.
 
     Attributes:
-        kind: Kind of labels learned.
+        labels: Labels that a data set must have, see `datamodules.core.labels`.
+        predicts: Predictions of the network, for commands that read its checkpoint: such as
+            `PIXEL_CLASSES`.
         monitor: The score on the validation split that selects the best epoch.
+        monitor_mode: ``max`` or ``min``: the better value of that score.
         takes: Input and output of a network for this task, for messages.
-        metric: The torchmetrics class that counts predictions, made from the number of classes.
-        matrices: Confusion matrices of `metric` in the last evaluation.
+        metric: The metric of a split, see `build_metric`.
+        result: What `metric` computed in the last evaluation.
+        evaluated: Number of images or shapes in that evaluation.
         fresh: Names of the network's tensors that did not come from the file that the training
             started from; None where it started from none. Kept in checkpoints.
 
@@ -60,11 +72,13 @@ class Task(lightning.LightningModule, ABC):
         SettingError: A setting is invalid.
     """
 
-    kind: ClassVar[Kind]
+    labels: ClassVar[str] = PIXEL_CLASSES
+    predicts: ClassVar[str] = ""
     monitor: ClassVar[str]
+    monitor_mode: ClassVar[Literal["max", "min"]] = "max"
     takes: ClassVar[str]
-    metric: ClassVar[type[Any]]
-    matrices: Any
+    result: Any
+    evaluated: int
 
     def __init__(
         self,
@@ -106,7 +120,8 @@ class Task(lightning.LightningModule, ABC):
         self.fresh: Collection[str] | None = None
         # A tuple: in a list of modules their tensors would have second names.
         self._frozen = tuple(freeze(self.network, frozen))
-        self.confusion: Any = self.metric(len(self.class_names))
+        self.metric: Any = self.build_metric()
+        self._counted = SumMetric()
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
         self._trained_length: Mapping[str, int] | None = None
@@ -129,11 +144,71 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
-        """Add the predictions for a batch to `confusion` and return them."""
+        """Add the predictions for a batch to `metric` and return them."""
 
     @abstractmethod
-    def scores(self) -> dict[str, float]:
-        """The scores of `matrices` by name."""
+    def build_metric(self) -> Metric:
+        """The metric of a split. Its state is summed over all processes."""
+
+    @abstractmethod
+    def logged_scores(self, result: Any) -> dict[str, float]:
+        """Scores over the whole split by name, such as ``miou``; logged as ``val/miou``.
+
+        Args:
+            result: A result of `metric`.
+        """
+
+    def class_scores(self, result: Any) -> dict[str, float]:
+        """Scores of single classes by name, such as ``iou/wall``; those of absent classes are NaN.
+
+        Args:
+            result: A result of `metric`.
+        """
+        return {}
+
+    @abstractmethod
+    def record(self, result: Any, noun: str) -> Record:
+        """The record of an evaluation.
+
+        Args:
+            result: A result of `metric`.
+            noun: Plural name of the images: panoramas, photos, shapes.
+        """
+
+    def targets(self, batch: Any) -> Tensor:
+        """The true labels of an evaluated batch, as many as there are predictions."""
+        targets: Tensor = batch.target
+        return targets
+
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB | None:
+        """A picture of one prediction, for `panels` and loggers; None if the task has none.
+
+        Args:
+            image: A `Panorama` or `Photo`.
+            target: Its true labels, one of `targets`.
+            prediction: One of the predictions that `evaluate` returns.
+            most_rows: Rows of the image in the picture, for smaller files; None for all.
+
+        Returns:
+            uint8 RGB ``(H, W, 3)``.
+        """
+        return None
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage | None:
+        """An image for the viewer of the report; by default the picture of the prediction.
+
+        Args:
+            name: Name of the image.
+            image: See `picture`.
+            target: See `picture`.
+            prediction: See `picture`.
+        """
+        picture = self.picture(image, target, prediction)
+        return None if picture is None else encode_image(name, picture, 0, sphere=False)
 
     def empty_step(self, channels: int, samples: int) -> Tensor:
         """Empty inputs of the network for a training step of some samples, without memory."""
@@ -270,14 +345,17 @@ class Task(lightning.LightningModule, ABC):
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Evaluate a batch of the validation or test split."""
-        return self.evaluate(batch)
+        predictions = self.evaluate(batch)
+        self._counted.update(len(predictions))
+        return predictions
 
     def on_validation_epoch_end(self) -> None:
         """Log the scores of the validation or test split."""
         stage = "test" if self.trainer.testing else "val"
-        self.matrices = self.confusion.compute()
-        self.confusion.reset()
-        for name, score in self.scores().items():
+        self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
+        self.metric.reset()
+        self._counted.reset()
+        for name, score in self.logged_scores(self.result).items():
             key = f"{stage}/{name}"
             # Every process has the same number: the mean over processes changes nothing.
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)

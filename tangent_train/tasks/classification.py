@@ -9,9 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from datamodules.core.split_module import Kind
+from datamodules.core.labels import IMAGE_CLASS
 from tangent_train.metrics.classification import ClassCounts, classification_scores
 from tangent_train.registry import registered
+from tangent_train.results.evaluation import classification_record
+from tangent_train.results.record import Record
 from tangent_train.tasks.base import Task
 
 
@@ -24,13 +26,13 @@ class ClassificationTask(Task):
     module ``(B, N, C, h, w) -> (B, K)``, N views each of B shapes.
 
     Attributes:
-        matrices: ``(K, K)`` counts of the last evaluation, rows truth, columns prediction.
+        result: ``(K, K)`` counts of the last evaluation, rows truth, columns prediction.
     """
 
-    kind: ClassVar[Kind] = "classification"
+    labels: ClassVar[str] = IMAGE_CLASS
+    predicts: ClassVar[str] = IMAGE_CLASS
     monitor: ClassVar[str] = "val/accuracy"
     takes: ClassVar[str] = "views of shapes (B, N, C, h, w) to scores of classes (B, K)"
-    metric = ClassCounts
 
     def forward(
         self, images: Float[Tensor, "shapes views channels height width"]
@@ -65,12 +67,30 @@ class ClassificationTask(Task):
         return torch.full((), float(len(labels)), device=labels.device)
 
     def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of shapes to `confusion`; returns the predictions ``(B,)``."""
+        """Add a batch of shapes to `metric`; returns the predictions ``(B,)``."""
         prediction = self(batch.images).argmax(dim=1)
-        self.confusion.update(prediction, batch.label)
+        self.metric.update(prediction, batch.label)
         return prediction
 
-    def scores(self) -> dict[str, float]:
+    def targets(self, batch: Any) -> Tensor:
+        """Classes ``(B,)``."""
+        labels: Tensor = batch.label
+        return labels
+
+    def build_metric(self) -> ClassCounts:
+        """The confusion matrix of whole shapes."""
+        return ClassCounts(len(self.class_names))
+
+    def logged_scores(self, result: Any) -> dict[str, float]:
         """Accuracy over shapes, and its mean over classes."""
-        scores = classification_scores(self.matrices)
+        scores = classification_scores(result)
         return {"accuracy": scores.accuracy, "class_accuracy": scores.class_accuracy}
+
+    def class_scores(self, result: Any) -> dict[str, float]:
+        """Accuracy of each class."""
+        scores = classification_scores(result).of_class.tolist()
+        return {f"accuracy/{n}": s for n, s in zip(self.class_names, scores, strict=True)}
+
+    def record(self, result: Any, noun: str) -> Record:
+        """The record with the scores of every class and the confusion matrix."""
+        return classification_record(result, self.class_names, noun)

@@ -11,14 +11,24 @@ from jaxtyping import Float, Integer
 from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
-from datamodules.core.split_module import Kind
+from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
 from tangent_train.inference.predictor import sees_rays, view_scores
-from tangent_train.metrics.segmentation import AbsentClass, ConfusionMatrix, segmentation_scores
+from tangent_train.metrics.segmentation import (
+    AbsentClass,
+    ConfusionMatrices,
+    ConfusionMatrix,
+    segmentation_scores,
+)
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.rendering.representations.views import Representation
-from tangent_train.tasks.base import Part, Task
+from tangent_train.results.evaluation import segmentation_record
+from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.pictures import prediction_panel, shown_arrays
+from tangent_train.results.record import Record
+from tangent_train.results.tables import percent
+from tangent_train.tasks.base import RGB, Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 
 
@@ -47,10 +57,9 @@ class SegmentationTask(Task):
         **settings: See `Task`.
     """
 
-    kind: ClassVar[Kind] = "segmentation"
+    predicts: ClassVar[str] = PIXEL_CLASSES
     monitor: ClassVar[str] = "val/miou"
     takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
-    metric = ConfusionMatrix
     class_weights: Tensor
     representation: Assembler
 
@@ -218,20 +227,59 @@ class SegmentationTask(Task):
         return all_scores
 
     def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of panoramas or photos to `confusion`; returns the predictions."""
+        """Add a batch of panoramas or photos to `metric`; returns the predictions."""
         predictions = []
         for images, target, rays, rotations in zip(
             batch.images, batch.target, batch.rays, batch.rotations, strict=True
         ):
             predictions.append(self.predict_labels(images, tuple(target.shape), rays, rotations))
-            self.confusion.update(predictions[-1], target)
+            self.metric.update(predictions[-1], target)
         return torch.stack(predictions)
 
-    def scores(self) -> dict[str, float]:
+    def build_metric(self) -> ConfusionMatrix:
+        """Confusion matrices of pixels, latitude bands and solid angles."""
+        return ConfusionMatrix(len(self.class_names))
+
+    def logged_scores(self, result: ConfusionMatrices) -> dict[str, float]:
         """Means over classes, of panoramas also weighted by solid angle."""
-        pixels = segmentation_scores(self.matrices.pixels, self.absent_class)
+        pixels = segmentation_scores(result.pixels, self.absent_class)
         scores = {"miou": pixels.miou, "macc": pixels.macc}
-        if self.matrices.solid_angle.any():
-            angles = segmentation_scores(self.matrices.solid_angle, self.absent_class)
+        if result.solid_angle.any():
+            angles = segmentation_scores(result.solid_angle, self.absent_class)
             scores |= {"miou_solid_angle": angles.miou, "macc_solid_angle": angles.macc}
         return scores
+
+    def class_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+        """Intersection over union of each class."""
+        scores = segmentation_scores(result.pixels, self.absent_class).iou.tolist()
+        return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
+
+    def record(self, result: ConfusionMatrices, noun: str) -> Record:
+        """The record with scores of classes, latitude bands and solid angles."""
+        return segmentation_record(result, self.class_names, self.absent_class, noun)
+
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB:
+        """Input, ground truth, prediction and error in a 2×2 grid above a legend."""
+        shown = shown_arrays(image, target, prediction, self.representation, most_rows)
+        return prediction_panel(*shown, self.class_names)
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage:
+        """The image with its true and predicted labels."""
+        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
+        classes = len(self.class_names)
+        pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
+        counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+        note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
+        return encode_image(
+            name,
+            rgb,
+            classes,
+            prediction=labels,
+            truth=truth,
+            sphere=target.ndim == 2,
+            note=note,
+        )

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import torch
+from torch import nn
 
 from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.tasks import SegmentationTask
 from tests.decoded import decoded
 
 NAMES = ("unknown", "wall", "floor")
@@ -33,7 +36,8 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     """After all ten, two a batch; the first labelled pixel is wrong."""
     panels = PredictionPanels(tmp_path, 4)
     trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
-    task: Any = SimpleNamespace(class_names=NAMES, representation=None)
+    representation: Any = None
+    task = SegmentationTask(nn.Identity(), representation, NAMES, partial(torch.optim.SGD, lr=1))
     for first in range(0, 10, 2):
         target = torch.ones((2, *SHAPE), dtype=torch.uint8)
         prediction = target.clone().long()

@@ -98,7 +98,7 @@ def test_figures_of_every_class_are_those_of_numpy(
 ) -> None:
     folder, task, data = trained
     events = _events(folder)
-    matrix = task.matrices.pixels
+    matrix = task.result.pixels
     present = [k for k in range(1, 14) if matrix[k].sum()]
     named = {f"val_iou/{data.class_names[k]}": k for k in present}
     assert _tags(events, "scalars", "val_iou/") == sorted(named)

@@ -66,7 +66,7 @@ def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
     for name in ("best", "last"):
         content = torch.load(run_folder / "checkpoints" / f"{name}.ckpt", weights_only=True)
         assert content["config"]["data"]["rooms"]["height"] == 32
-        assert content["kind"] == "segmentation"
+        assert content["predicts"] == "pixel_classes"
         assert content["inputs"] == ["rgb", "depth"]
         assert content["class_names"][:2] == ["unknown", "beam"]
         assert content["tangent_train_version"]
@@ -288,9 +288,9 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["network=unet"], "image size for the UNet: found 48 × 48"),
         (["network.num_classes=5"], "scores of the network"),
         (["network.in_channels=3"], "network: found UNet, which does not take"),
-        (["task=classification"], "task: found classification, with panoramas"),
+        (["task=classification"], "task: found ClassificationTask, which needs image_class"),
         (["checkpoint_every_n_steps=0"], "checkpoint_every_n_steps: found 0"),
-        (["tensorboard_images=-1"], "tensorboard_images: found -1"),
+        (["validation_images=-1"], "validation_images: found -1"),
         (["panels=-1"], "panels: found -1"),
         (["seed=abc"], "seed: found abc"),
         (["network.widths=8"], "network: found models.UNet cannot be made"),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.stanford2d3ds.reader import CLASSES
+from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import read_settings
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import ERP, TANGENT, write_checkpoint
@@ -161,7 +161,7 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
-        ({"data": "data=synthshapes"}, "task: found segmentation, with shapes"),
+        ({"data": "data=synthshapes"}, "task: found SegmentationTask, which needs pixel_classes"),
         ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
     ],
 )

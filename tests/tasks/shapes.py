@@ -27,7 +27,7 @@ class Shapes(lightning.LightningDataModule):
         batch_size: Of training; evaluation takes two at a time.
     """
 
-    kind = "classification"
+    labels = "image_class"
 
     def __init__(self, count: int = 9, batch_size: int = 3) -> None:
         super().__init__()

@@ -50,10 +50,10 @@ def test_every_shape_is_counted_once_in_integers() -> None:
     task = shape_task(Oracle())
     data = Shapes(10)  # 4 of class 0, 3 of 1, 3 of 2
     (figures,) = quiet_trainer().test(task, datamodule=data, verbose=False)
-    np.testing.assert_array_equal(task.matrices, [[4, 0, 0], [0, 3, 0], [3, 0, 0]])
-    assert task.matrices.dtype == np.int64
+    np.testing.assert_array_equal(task.result, [[4, 0, 0], [0, 3, 0], [3, 0, 0]])
+    assert task.result.dtype == np.int64
     assert figures["test/accuracy"] == pytest.approx(0.7)
     assert figures["test/class_accuracy"] == pytest.approx(2 / 3)
     (figures,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
     assert set(figures) == {"val/accuracy", "val/class_accuracy"}
-    assert task.matrices.sum() == 10, "counted anew"
+    assert task.result.sum() == 10, "counted anew"

@@ -52,8 +52,8 @@ def _weights(task: nn.Module) -> Tensor:
 def test_two_steps_and_a_test() -> None:
     expected, found = _trained("cpu"), _trained("gpu")
     torch.testing.assert_close(_weights(found), _weights(expected), rtol=1e-4, atol=1e-5)
-    counted = expected.matrices.pixels
-    assert np.abs(found.matrices.pixels - counted).sum() < 0.01 * counted.sum()
+    counted = expected.result.pixels
+    assert np.abs(found.result.pixels - counted).sum() < 0.01 * counted.sum()
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])

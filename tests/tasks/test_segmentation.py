@@ -83,10 +83,10 @@ def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
     task = _task(SignNetwork(), images_per_forward=7)
     trainer = quiet_trainer()
     (figures,) = trainer.test(task, datamodule=Data(), verbose=False)
-    assert task.matrices.images == 3
-    assert task.matrices.pixels[0].sum() == 0, "unknown truth counts for nothing"
-    assert task.matrices.pixels[:, 0].sum() == 0, "unknown is never predicted"
-    assert task.matrices.pixels.sum() == 3 * 30 * 64
+    assert task.result.images == 3
+    assert task.result.pixels[0].sum() == 0, "unknown truth counts for nothing"
+    assert task.result.pixels[:, 0].sum() == 0, "unknown is never predicted"
+    assert task.result.pixels.sum() == 3 * 30 * 64
     assert figures["test/miou"] > 0.75
 
 
@@ -154,7 +154,7 @@ def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() 
     samples: Any = [EvaluationSample(torch.zeros(40, 2, 16, 16), target, *where, 0)]
     quiet_trainer().test(task, DataLoader(samples), verbose=False)
     assert network.told == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
-    pixels = task.matrices.pixels
+    pixels = task.result.pixels
     assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
     network.told.clear()
     task(torch.zeros(2, 2, 16, 16))

@@ -63,7 +63,7 @@ def test_panoramas_without_a_labelled_pixel(root: Path, tmp_path: Path, absent: 
     panels = PredictionPanels(tmp_path / "panels", count=2)
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
-    record = segmentation_record(task.matrices, task.class_names, absent, data.noun)
+    record = segmentation_record(task.result, task.class_names, absent, data.noun)
     write_results(record, tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert written["images"] == 5

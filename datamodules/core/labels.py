@@ -1,0 +1,7 @@
+"""Kinds of labels: what a data set gives and a task needs."""
+
+PIXEL_CLASSES = "pixel_classes"
+"""A class index for every pixel; 0 is unknown, which is not a class of the network."""
+
+IMAGE_CLASS = "image_class"
+"""One class index for an image or shape."""
