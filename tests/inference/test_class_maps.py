@@ -15,7 +15,7 @@ from torch import nn
 from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
-from datamodules.stanford2d3ds.reader import CLASSES as STANFORD
+from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.scores import Groups
