@@ -26,7 +26,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
-from tangent_train.offline import offline
+from tangent_train.imports import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
