@@ -32,7 +32,7 @@ from tangent_train.files import no_room
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import check_size
-from tangent_train.registry import SettingsFile, build_from_config, resolve_target
+from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
     headline,
@@ -97,7 +97,7 @@ class Run:
         else:
             data, task, notes = build_trained(settings, trained, source)
         kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
-        kept = {"choices": _choices(settings, source), **kept}
+        kept = {"choices": _choices(settings, source), **named_arguments(kept)}
         write_settings(folder / "config.yaml", kept)
         return Run(folder, kept, source, data, task, trained, notes)
 
