@@ -48,7 +48,7 @@ def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     [
         (None, "No such file"),
         ("[]", "list instead of a mapping"),
-        ('{"kind": "keypoints"}', "kind='keypoints'"),
+        ('{"noun": "pairs"}', "no images"),
         ("[" * 100_000, "nested too deeply"),
     ],
 )
