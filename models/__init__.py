@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
     from models.fcn_resnet import FCNResNet as FCNResNet
-    from models.fine_tuning import initialize as initialize
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+    from models.initialization import initialize as initialize
     from models.shape_classifier import ShapeClassifier as ShapeClassifier
     from models.sphere_attention import SphereAttention as SphereAttention
     from models.sphere_context import SphereContext as SphereContext
@@ -27,7 +27,7 @@ _FILES = {
     "SphereAttention": "sphere_attention",
     "SphereContext": "sphere_context",
     "UNet": "unet",
-    "initialize": "fine_tuning",
+    "initialize": "initialization",
     "widen_stem": "stem",
 }
 

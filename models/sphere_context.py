@@ -186,7 +186,7 @@ class SphereContext(nn.Module):
 def token_directions(
     rays: Float[Tensor, "spheres images 3 3"], rows: int, columns: int
 ) -> Float[Tensor, "spheres images 3 rows columns"]:
-    """Unit viewing directions of the token centres.
+    """Unit viewing directions of the token centers.
 
     Args:
         rays: They map image coordinates to directions, see `SphereContext.forward`.

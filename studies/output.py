@@ -15,7 +15,7 @@ Row = dict[str, Any]
 """A line of a table: values by column name."""
 
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
-"""The palette of Okabe and Ito, which colour-blind readers can tell apart."""
+"""The palette of Okabe and Ito, which color-blind readers can tell apart."""
 
 
 def save(

@@ -2,7 +2,7 @@
 
 A map of the sphere onto a plane has two principal scales at each point, a ≥ b (Tissot). The angle
 between two directions changes by up to 2 asin((a − b)/(a + b)); areas are scaled by σ = a b. For
-pinhole images a = 1/cos²θ and b = 1/cos θ at the angle θ from the centre, for the ERP a = 1/cos φ
+pinhole images a = 1/cos²θ and b = 1/cos θ at the angle θ from the center, for the ERP a = 1/cos φ
 and b = 1 at the latitude φ.
 """
 
@@ -35,7 +35,7 @@ GRIDS: dict[str, PinholeGrid | None] = {
 
 
 def angle_to_owner(grid: PinholeGrid, directions: Array) -> Array:
-    """``(...)`` angles θ in radians from ``(..., 3)`` directions to the nearest image centre."""
+    """``(...)`` angles θ in radians from ``(..., 3)`` directions to the nearest image center."""
     chord, _ = cKDTree(grid.centers_xyz).query(directions)
     return 2 * np.arcsin(np.minimum(chord / 2, 1))
 

@@ -15,7 +15,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules.stanford2d3ds.reader import CLASSES
+from datamodules.stanford2d3ds.files import CLASSES
 from tests.datamodules.data_files import write_png
 
 SLOW = Path(__file__).parent / "slow"

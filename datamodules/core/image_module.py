@@ -49,6 +49,7 @@ from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
+from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
 
@@ -117,14 +118,13 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
             pass
         return index
 
-    def training_samples(self) -> TrainingImages:
-        """Samples `TrainingSample`."""
-        source, seed = self.source("train"), (self.seed, self.stream)
-        return TrainingImages(source, self.representation, seed, self.inputs, self.color_jitter)
-
-    def evaluation_samples(self, split: Split) -> EvaluationImages:
-        """Samples `EvaluationSample`."""
-        return EvaluationImages(self.source(split), self.representation, self.inputs)
+    def dataset(self, split: Split) -> TrainingImages | EvaluationImages:
+        """See `LabeledData`: samples `TrainingSample` or `EvaluationSample`."""
+        source, inputs = self.source(split), self.inputs
+        if split != "train":
+            return EvaluationImages(source, self.representation, inputs)
+        seed = self.seed, self.sampling_seed
+        return TrainingImages(source, self.representation, seed, inputs, self.color_jitter)
 
     @property
     def in_channels(self) -> int:
@@ -175,7 +175,7 @@ class PanoramaDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.need_representation(
+        self.require_representation(
             "erp_height",
             "one for panoramas",
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
@@ -192,6 +192,10 @@ class PanoramaDataModule(ImageDataModule):
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
+
+    def default_representation(self) -> TangentRepresentation:
+        """Tangent images of base level 0, at level 7."""
+        return TangentRepresentation(0, 7 if self.level is None else self.level)
 
     def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading]:
         """See `ImageDataModule`."""
@@ -236,7 +240,7 @@ class PanoramaDataModule(ImageDataModule):
         """
         if self.upright == "auto":
             self._judge = judge
-            self._sources.pop("test", None)
+            self._readers.pop("test", None)
 
     def test_dataloader(self) -> DataLoader[Any]:
         """Batches for the test; a network estimates up directions first, in this process."""
@@ -266,7 +270,7 @@ class PhotoDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.need_representation(
+        self.require_representation(
             "of_camera",
             "one for photos",
             "Choose representation=perspective, or panoramas, as data=synthrooms.",
@@ -278,6 +282,10 @@ class PhotoDataModule(ImageDataModule):
             "Train on photos without it, then on panoramas with it and init_from=…: "
             "its filters start at zero.",
         )
+
+    def default_representation(self) -> PerspectiveRepresentation:
+        """Crops of 45° at the resolution of level 7."""
+        return PerspectiveRepresentation(7 if self.level is None else self.level)
 
     def reading(self, reader: ImageReader) -> tuple[str, PhotoReading]:
         """See `ImageDataModule`."""

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.split_module import tell
+from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.images.gpano import area_of
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
@@ -79,9 +79,11 @@ class PanoramaPairs(ABC):
     """Pairs to read one by one.
 
     Attributes:
+        is_generated: True if `make_files` generates the whole data set.
         published: The paper's scores by the name of a pair, for the paper's pairs.
     """
 
+    is_generated: ClassVar[bool] = False
     published: Mapping[str, PublishedPair] = MappingProxyType({})
 
     def make_files(self) -> None:  # noqa: B027, most have all their files
@@ -170,10 +172,12 @@ class ImagePairs(PanoramaPairs):
         if pairing not in ("consecutive", "all"):
             raise SettingError("pairing", found=pairing, expected="consecutive or all")
         if input is not None:
-            paths = image_paths(input, tell=tell)
+            paths = image_paths(input, tell=print_on_rank_zero)
         else:
             paths = [
-                path for side in (str(left), str(right)) for path in image_paths(side, tell=tell)
+                path
+                for side in (str(left), str(right))
+                for path in image_paths(side, tell=print_on_rank_zero)
             ]
         if len(paths) < 2 or (input is None and len(paths) > 2):
             expected = "two panoramas" + ("" if input is None else " or more")

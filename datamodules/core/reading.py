@@ -78,7 +78,7 @@ class SplitReader(Generic[_Item, _Image]):
         )
         return labels
 
-    def remember(self, root: object) -> None:
+    def keep_in_memory(self, root: object) -> None:
         """Read all images now and keep them in memory.
 
         Done before the loader's workers start, which then share the memory (on systems that fork);

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
 from datamodules.core.inputs import MAX_DEPTH_M, Input
-from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.reading import SplitReader
 from tangent_train.geometry import equirect_elevations
@@ -67,7 +67,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
 
 @dataclass(frozen=True)
 class TrainingImages(Dataset[TrainingSample[Inputs]]):
-    """Random views of images, by (epoch, index).
+    """Random views of images, by index or (epoch, index).
 
     Attributes:
         source: The images.
@@ -86,8 +86,8 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
-        epoch, index = key
+    def __getitem__(self, key: int | tuple[int, int]) -> TrainingSample[Inputs]:
+        epoch, index = sample_key(key, len(self))
         image = self.source.read(index)
         rng = sample_rng(self.seed, epoch, index)
         views = image.sampler(self.representation).sample(rng)
@@ -101,7 +101,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
 
 @dataclass(frozen=True)
 class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
-    """Whole images, by (epoch, index); the epoch changes nothing.
+    """Whole images, by index or (epoch, index); the epoch changes nothing.
 
     Attributes:
         source: The images.
@@ -116,8 +116,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
-        _, index = key
+    def __getitem__(self, key: int | tuple[int, int]) -> EvaluationSample[Inputs]:
+        _, index = sample_key(key, len(self))
         image = self.source.read(index)
         views = image.sampler(self.representation).whole()
         return EvaluationSample(

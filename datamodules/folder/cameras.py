@@ -80,7 +80,7 @@ class FolderCameras:
 
         Returns:
             ``(3, 3)`` K of the photo as displayed, its EXIF orientation applied, for integer pixel
-            centres: the entry of ``cameras.json`` for the photo or the nearest folder that it is
+            centers: the entry of ``cameras.json`` for the photo or the nearest folder that it is
             in; or of `fov_deg`, or of its EXIF data, with the principal point in the middle.
 
         Raises:

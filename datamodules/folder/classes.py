@@ -33,14 +33,14 @@ _EXPECTED = (
 
 @dataclass(frozen=True, eq=False)
 class FolderClasses:
-    """Mapping from values or colours of label images to classes.
+    """Mapping from values or colors of label images to classes.
 
     Attributes:
         names: K names; the label of a class is its place here plus one.
-        codes: ``(n,)`` int32, in rising order: values, or colours as R · 65536 + G · 256 + B.
+        codes: ``(n,)`` int32, in rising order: values, or colors as R · 65536 + G · 256 + B.
         labels: ``(n,)`` uint8, the class of each.
-        in_colors: Whether the codes are colours.
-        length: Of the list that named the classes; None where they were given values or colours.
+        in_colors: Whether the codes are colors.
+        length: Of the list that named the classes; None where they were given values or colors.
     """
 
     names: tuple[str, ...]
@@ -59,7 +59,7 @@ class FolderClasses:
         """Labels of the pixels of a label image; 0 where they have no class.
 
         Args:
-            stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colours.
+            stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colors.
             path: Their file, for messages.
 
         Returns:
@@ -115,11 +115,11 @@ def read_classes(path: Path) -> FolderClasses:
 
           {"wall": 1, "floor": [2, 3], "window": 255}
 
-    * An object of names and colours, one or several::
+    * An object of names and colors, one or several::
 
           {"wall": "#ff0000", "floor": ["#00ff00", "#00ee00"]}
 
-    Values and colours that are not named, 255 among them, are unknown: such pixels count neither
+    Values and colors that are not named, 255 among them, are unknown: such pixels count neither
     in training nor in evaluation. "unknown" is therefore no class.
 
     Args:
@@ -183,7 +183,7 @@ def _check_names(path: Path, names: list[Any]) -> None:
 
 
 def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:
-    """The label of every value or colour."""
+    """The label of every value or color."""
     if len({isinstance(value, str) for _, values in named for value in values}) > 1:
         raise DataError(path, found="values and colours", expected="either values or colours")
     labels: dict[int, int] = {}

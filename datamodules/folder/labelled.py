@@ -5,7 +5,7 @@ On disk::
     root/
       classes.json                  see `read_classes`
       images/[scene/]…/name.jpg     or .png, .tif, .webp
-      labels/[scene/]…/name.png     values or colours of the classes, at the size of the image
+      labels/[scene/]…/name.png     values or colors of the classes, at the size of the image
       depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
       train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
 """
@@ -20,9 +20,9 @@ import numpy as np
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.index import Split
 from datamodules.core.inputs import Input
+from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.split_module import tell
 from datamodules.folder.cameras import read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
@@ -43,7 +43,7 @@ class LabelledFolder(ImageDataModule):
             `validation_fraction` is that of the training scenes, likewise.
         split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
             different seeds share their splits.
-        depth_units_per_m: Units in a metre of depth files of whole numbers, 1000 for millimetres.
+        depth_units_per_m: Units in a meter of depth files of whole numbers, 1000 for millimeters.
 
     Attributes:
         class_names: "unknown", then those of ``classes.json``.
@@ -85,7 +85,7 @@ class LabelledFolder(ImageDataModule):
     def prepare_data(self) -> None:
         """See `SplitDataModule`; files that are not images are counted."""
         super().prepare_data()
-        image_paths(self.root / "images", tell=tell)
+        image_paths(self.root / "images", tell=print_on_rank_zero)
 
     def check(self) -> tuple[Problems, int]:
         """See `SplitDataModule`; files that training would pass over are named too."""

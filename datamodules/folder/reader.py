@@ -41,7 +41,7 @@ class FolderReader(ImageReader):
 
     Attributes:
         classes: Meaning of their labels.
-        depth_units_per_m: Units in a metre of depth files of whole numbers.
+        depth_units_per_m: Units in a meter of depth files of whole numbers.
         cameras: Of photos.
     """
 
@@ -64,7 +64,7 @@ class FolderReader(ImageReader):
         return read_image_size(path)
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours, whatever the format."""
+        """Colors, whatever the format."""
         return read_rgb(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -176,11 +176,11 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
 
     Args:
         path: The PNG.
-        in_colors: Whether classes are told by colours, not values. Of palettes, values are the
+        in_colors: Whether classes are told by colors, not values. Of palettes, values are the
             numbers of the entries.
 
     Returns:
-        ``(H, W)`` values, or ``(H, W, 3)`` colours; transparency is left out.
+        ``(H, W)`` values, or ``(H, W, 3)`` colors; transparency is left out.
 
     Raises:
         DataError: The file is broken.

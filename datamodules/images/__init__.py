@@ -1,1 +1,1 @@
-"""Reading and writing image files: colour, depth, GPano."""
+"""Reading and writing image files: color, depth, GPano."""

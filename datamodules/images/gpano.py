@@ -183,7 +183,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
     Args:
         path: The image, for the message.
         size: Its rows and columns. One column too many or too few is allowed, a rounding error of
-            other programs: it is left out, or its neighbour is repeated.
+            other programs: it is left out, or its neighbor is repeated.
         remedy: For the message.
 
     Raises:

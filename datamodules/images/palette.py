@@ -1,4 +1,4 @@
-"""Colours of classes."""
+"""Colors of classes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _SEEN = np.array(
         [[0.3673, 0.8606, -0.2280], [0.2801, 0.6725, 0.0474], [-0.0118, 0.0429, 0.9689]],
     ]
 )
-"""Linear RGB as seen with full colour vision, and without red or green cones."""
+"""Linear RGB as seen with full color vision, and without red or green cones."""
 
 
 @lru_cache
 def class_colors(num_classes: int) -> NDArray[np.uint8]:
-    """Distinct colours, black for the unknown class 0.
+    """Distinct colors, black for the unknown class 0.
 
-    Each is the one that is farthest from all before it in CIELAB: by full colour vision plus three
+    Each is the one that is farthest from all before it in CIELAB: by full color vision plus three
     times by the worse of eyes without red and without green cones. Classes with small numbers,
-    often neighbours, differ most.
+    often neighbors, differ most.
 
     Args:
         num_classes: K + 1, to 256.

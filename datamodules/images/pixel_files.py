@@ -1,13 +1,13 @@
-"""Reading and writing images: colours, depth, labels, arrays.
+"""Reading and writing images: colors, depth, labels, arrays.
 
 Pillow opens and identifies every image; OpenCV writes, and decodes what Pillow would cut to 8 bits
-or read in the wrong byte order: 16-bit colours, and TIFF files of more than 8 bits.
+or read in the wrong byte order: 16-bit colors, and TIFF files of more than 8 bits.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,8 @@ import cv2
 import numpy as np
 from numpy.lib.format import open_memmap
 from numpy.typing import DTypeLike, NDArray
-from PIL import ExifTags, Image, TiffImagePlugin, TiffTags, UnidentifiedImageError
+from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
+from PIL.ExifTags import Base as Tag
 
 from datamodules.images.exr import read_exr, read_exr_size
 from datamodules.images.image_files import IMAGE_FORMATS
@@ -29,15 +30,15 @@ from datamodules.images.png import (
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
 
+LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
+"""Formats that change pixels slightly: not for labels and depth."""
+
 _WRITABLE = {
     ".png": ("uint8", "uint16"),
-    ".jpg": ("uint8",),
-    ".jpeg": ("uint8",),
-    ".webp": ("uint8",),
-    ".tif": ("uint8", "uint16", "float32"),
-    ".tiff": ("uint8", "uint16", "float32"),
+    **dict.fromkeys(LOSSY_SUFFIXES, ("uint8",)),
+    **dict.fromkeys((".tif", ".tiff"), ("uint8", "uint16", "float32")),
 }
-"""Pixel types by suffix; ``.npy`` holds any."""
+"""Pixel types by suffix; ``.npy`` holds all types."""
 
 PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
 """Suffixes that `write_pixels` takes, in lower case."""
@@ -45,18 +46,12 @@ PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
 READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
 """Suffixes that `read_pixels` takes."""
 
-LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
-"""Formats that change pixels a little: not for labels and depth."""
-
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
-_REDUCED = 254  # TIFF tag; bit 0 marks a smaller copy of another page
-_COMPRESSION = 259
-_BITS, _PHOTOMETRIC, _BIT_ORDER, _CHANNELS, _PLANES = 258, 262, 266, 277, 284  # TIFF tags
-_EXTRA_CHANNELS, _SAMPLE_FORMAT, _SUBSAMPLING = 338, 339, 530
-_PIXEL_TAGS = (_BITS, _SAMPLE_FORMAT, _CHANNELS, _PHOTOMETRIC, _COMPRESSION)
-_LAYOUT = (*_PIXEL_TAGS, _PLANES, _EXTRA_CHANNELS, _BIT_ORDER)
-_PLACES = ((273, 279), (324, 325))  # starts and sizes of strips and of tiles
+_LAYOUT = (
+    *(Tag.BitsPerSample, Tag.SampleFormat, Tag.SamplesPerPixel, Tag.PhotometricInterpretation),
+    *(Tag.Compression, Tag.PlanarConfiguration, Tag.ExtraSamples, Tag.FillOrder),
+)
 _ASSOCIATED_ALPHA = 1
 _EXACT_TYPES = {
     (number, 8 * size): np.dtype(f"{kind}{size}")
@@ -64,7 +59,7 @@ _EXACT_TYPES = {
     for size in sizes
 }
 """Types of TIFF channels beyond 8 bits, by SampleFormat and BitsPerSample."""
-_MOST_M = 1e4  # depth beyond it marks missing: some files have 1e10 there
+_MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
 _MISSING_UNITS = 65535
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
 
@@ -73,9 +68,9 @@ Image.MAX_IMAGE_PIXELS = MOST_PIXELS
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Image.Image]:
-    """An image whose size is allowed, not decoded yet; errors in the block name the file."""
+    """Open an image of an allowed size without decoding; errors in the block name the file."""
     try:
-        # Not by its name: Pillow would map raw TIFF files into memory, and turn these wrongly.
+        # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
         with path.open("rb") as file, Image.open(file, formats=IMAGE_FORMATS) as image:
             if isinstance(image, TiffImagePlugin.TiffImageFile):
                 _seek_full_size(image)
@@ -88,8 +83,7 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
-        tags = _whole_tiff(path) if isinstance(error, UnidentifiedImageError) else {}
-        if tags:
+        if isinstance(error, UnidentifiedImageError) and (tags := _complete_tiff_tags(path)):
             raise _unknown_layout(path, tags) from error
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
         raise DataError(
@@ -101,16 +95,16 @@ def _opened(path: Path) -> Iterator[Image.Image]:
 
 
 def _seek_full_size(image: TiffImagePlugin.TiffImageFile) -> None:
-    """Go to the first page that is not a thumbnail; stay at the first one if all are."""
-    for page in range(image.n_frames if image.tag_v2.get(_REDUCED, 0) & 1 else 0):
+    """Go to the first page that is not a thumbnail; stay at the first page if all are."""
+    for page in range(image.n_frames if image.tag_v2.get(Tag.NewSubfileType, 0) & 1 else 0):
         image.seek(page)
-        if not image.tag_v2.get(_REDUCED, 0) & 1:
+        if not image.tag_v2.get(Tag.NewSubfileType, 0) & 1:
             return
     image.seek(0)
 
 
-def _whole_tiff(path: Path) -> Mapping[int, Any]:
-    """Tags of the first page of a TIFF file that has all its pixels; empty of another file."""
+def _complete_tiff_tags(path: Path) -> dict[int, Any]:
+    """Return the tags of the first page of a complete TIFF file; of other files nothing."""
     try:
         with path.open("rb") as file:
             head = file.read(8)
@@ -118,14 +112,16 @@ def _whole_tiff(path: Path) -> Mapping[int, Any]:
             tags: Any = TiffImagePlugin.ImageFileDirectory_v2(head)
             file.seek(tags.next)
             tags.load(file)
-        starts, sizes = next((tags[a], tags[b]) for a, b in _PLACES if a in tags and b in tags)
-        return tags if np.add(starts, sizes).max() <= path.stat().st_size else {}
+        in_tiles = Tag.StripOffsets not in tags or Tag.StripByteCounts not in tags
+        starts = tags[Tag.TileOffsets if in_tiles else Tag.StripOffsets]
+        sizes = tags[Tag.TileByteCounts if in_tiles else Tag.StripByteCounts]
+        return dict(tags) if np.add(starts, sizes).max() <= path.stat().st_size else {}
     except Exception:  # the parser raises many kinds of errors
         return {}
 
 
-def _unknown_layout(path: Path, tags: Mapping[int, Any]) -> DataError:
-    known = [f"{TiffTags.lookup(tag).name} {tags[tag]}" for tag in _LAYOUT if tag in tags]
+def _unknown_layout(path: Path, tags: Any) -> DataError:
+    known = [f"{tag.name} {tags[tag]}" for tag in _LAYOUT if tag in tags]
     return DataError(
         path,
         found=f"a TIFF layout that cannot be decoded: {', '.join(known)}",
@@ -136,7 +132,7 @@ def _unknown_layout(path: Path, tags: Mapping[int, Any]) -> DataError:
 
 
 def _exif(image: Image.Image) -> Image.Exif:
-    """EXIF data; none where they are broken."""
+    """Return the EXIF data; none if they are broken."""
     try:
         # Of PNG files, Pillow would decode the pixels to look for more.
         return Image.Image.getexif(image)
@@ -145,13 +141,13 @@ def _exif(image: Image.Image) -> Image.Exif:
 
 
 def read_metadata(path: Path) -> tuple[dict[Any, Any], list[bytes]]:
-    """Read what an image file holds beside its pixels, as Pillow gives it.
+    """Read the metadata of an image file.
 
     Args:
-        path: See `read_pixels`; arrays and OpenEXR images have nothing.
+        path: See `read_pixels`; arrays and OpenEXR images have no metadata.
 
     Returns:
-        Texts and data by name; the APP1 segments of a JPEG file.
+        Texts and data by Pillow's names; the APP1 segments of a JPEG file.
 
     Raises:
         DataError: It cannot be read, or is not an image.
@@ -164,7 +160,7 @@ def read_metadata(path: Path) -> tuple[dict[Any, Any], list[bytes]]:
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
-    """Rows and columns that `read_pixels` gives, from the header of the file.
+    """Read the rows and columns that `read_pixels` would return from the header of a file.
 
     Raises:
         DataError: It cannot be read, or is not an image.
@@ -180,9 +176,9 @@ def read_image_size(path: Path) -> tuple[int, int]:
 
 
 def _orientation(image: Image.Image) -> int:
-    """EXIF orientation of the pixels that Pillow decodes, 1 to 8."""
-    # It turns TIFF files itself.
-    found: Any = 1 if image.format == "TIFF" else _exif(image).get(ExifTags.Base.Orientation)
+    """Return the EXIF orientation of the pixels that Pillow decodes, 1 to 8."""
+    # Pillow rotates TIFF files itself.
+    found: Any = 1 if image.format == "TIFF" else _exif(image).get(Tag.Orientation)
     return found if found in range(1, 9) else 1
 
 
@@ -191,8 +187,8 @@ def _upright_size(image: Image.Image) -> tuple[int, int]:
     return (image.width, image.height) if quarter else (image.height, image.width)
 
 
-def _turned(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Pixels as displayed, by their EXIF orientation (CIPA DC-008, tag 274)."""
+def _displayed(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Rotate pixels by their EXIF orientation (CIPA DC-008, tag 274)."""
     pixels = pixels.swapaxes(0, 1) if orientation >= _FIRST_TRANSPOSED else pixels
     pixels = pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
     pixels = pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
@@ -205,10 +201,10 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
     Args:
         path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (one channel of it) or
             ``.npy``.
-        indices: Of an image with a palette (or of 1 bit), whether to give indices or colours.
+        indices: True to read indices, not colors, from images with a palette or of 1 bit.
 
     Returns:
-        ``(H, W)`` where there is one channel, else ``(H, W, C)``, colours in RGB order. An array is
+        ``(H, W)`` for one channel, else ``(H, W, C)``, colors in RGB order. Arrays are
         memory-mapped and read-only.
 
     Raises:
@@ -227,7 +223,7 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
             if exact is None
             else _decode_exactly(path, image.tell(), *exact)
         )
-        pixels = _turned(pixels, orientation)
+        pixels = _displayed(pixels, orientation)
         if pixels.shape[:2] != size:
             raise ValueError(f"{width_height(pixels.shape)}, in its header {width_height(size)}")
         return pixels
@@ -245,10 +241,10 @@ def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
 
 
 def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | None:
-    """Type of the channels of a file that OpenCV decodes, and if it is grey; None for Pillow.
+    """Return the channel type of a file for OpenCV, and True for grey; None for Pillow.
 
     Raises:
-        DataError: Neither decodes it rightly.
+        DataError: Neither of them decodes it correctly.
     """
     if image.format == "PNG":
         header = read_png_header(path)
@@ -256,17 +252,17 @@ def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | 
     if not isinstance(image, TiffImagePlugin.TiffImageFile):
         return None
     tags: Any = image.tag_v2
-    channels = tags.get(_CHANNELS, 1)
-    bits, kinds = set(tags.get(_BITS, (1,))), set(tags.get(_SAMPLE_FORMAT, (1,)))
+    channels = tags.get(Tag.SamplesPerPixel, 1)
+    bits, kinds = set(tags.get(Tag.BitsPerSample, (1,))), set(tags.get(Tag.SampleFormat, (1,)))
     if kinds == {1} and max(bits) <= 8:
         exact = None
-        right = image.mode != "YCbCr" or tags.get(_SUBSAMPLING) == (1, 1)
-        right &= (tags.get(_PLANES), tags.get(_BIT_ORDER)) != (2, 2)
+        right = image.mode != "YCbCr" or tags.get(Tag.YCbCrSubSampling) == (1, 1)
+        right &= (tags.get(Tag.PlanarConfiguration), tags.get(Tag.FillOrder)) != (2, 2)
     else:
         exact = _EXACT_TYPES.get((*kinds, *bits))
-        is_plain = tags.get(_PHOTOMETRIC) == {1: 1, 3: 2, 4: 2}.get(channels)
-        is_interleaved = channels == 1 or tags.get(_PLANES, 1) == 1
-        is_straight = _ASSOCIATED_ALPHA not in tags.get(_EXTRA_CHANNELS, ())
+        is_plain = tags.get(Tag.PhotometricInterpretation) == {1: 1, 3: 2, 4: 2}.get(channels)
+        is_interleaved = channels == 1 or tags.get(Tag.PlanarConfiguration, 1) == 1
+        is_straight = _ASSOCIATED_ALPHA not in tags.get(Tag.ExtraSamples, ())
         right = exact is not None and is_plain and is_interleaved and is_straight
     if not right:
         raise _unknown_layout(path, tags)
@@ -274,7 +270,7 @@ def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | 
 
 
 def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> NDArray[Any]:
-    # From memory: `cv2.imread` knows no paths beyond the system's code page.
+    # From memory: `cv2.imread` cannot open paths beyond the system's code page.
     content = np.fromfile(path, np.uint8)
     if page:
         _, pages = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
@@ -289,21 +285,21 @@ def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> 
 
 
 def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
-    """Decode the colours of an image, ``(H, W, 3)``.
+    """Decode the colors of an image, ``(H, W, 3)``.
 
-    Of 16 bits per channel the upper 8 are kept; grey becomes three equal channels; alpha is
+    The upper 8 of 16 bits per channel are kept; grey becomes three equal channels; alpha is
     dropped; the EXIF orientation is applied.
 
     Args:
-        image: A file of `IMAGE_FORMATS`, or an image of Pillow, which is not changed.
+        image: A file of `IMAGE_FORMATS`, or a Pillow image, which is not changed.
 
     Raises:
-        DataError: The file cannot be read, is broken, or holds other values than colours.
+        DataError: The file cannot be read, is broken, or does not hold colors.
     """
     if isinstance(image, Path):
         pixels = read_pixels(image, indices=False)
     else:
-        pixels = _turned(_decode(image.copy(), indices=False), _orientation(image))
+        pixels = _displayed(_decode(image.copy(), indices=False), _orientation(image))
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
     if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
@@ -320,13 +316,13 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
     """Read a depth map.
 
     Args:
-        path: PNG, TIFF or array of integers, which are units; or TIFF, array or OpenEXR image of
-            floats, which are metres.
-        units_per_m: Units in a metre, 1000 for millimetres.
+        path: PNG, TIFF or array of integers, in units; or TIFF, array or OpenEXR image of
+            floats, in meters.
+        units_per_m: Units in a meter, 1000 for millimeters.
 
     Returns:
-        ``(H, W)`` metres; 0 where depth is missing: where the file has 0 or less, NaN, infinity,
-        more than 10 km or, of 16-bit integers, 65535.
+        ``(H, W)`` meters; 0 where depth is missing: at values of 0 or less, NaN, infinity, more
+        than 10 km and, in 16-bit integers, 65535.
 
     Raises:
         DataError: The file cannot be read, is broken, or holds no depth.
@@ -344,7 +340,7 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
     depth = stored.astype(np.float32)
     if stored.dtype.kind != "f":
         depth /= np.float32(units_per_m)
-    missing = ~((depth > 0) & (depth <= _MOST_M))
+    missing = ~((depth > 0) & (depth <= _MAX_DEPTH_M))
     if stored.dtype == np.uint16:
         missing |= stored == _MISSING_UNITS
     depth[missing] = 0
@@ -355,7 +351,7 @@ def read_array(path: Path) -> NDArray[Any]:
     """Memory-map the pixels of a ``.npy`` file, read-only.
 
     Returns:
-        ``(H, W)`` or ``(H, W, C)`` numbers; of one channel without the last dimension.
+        ``(H, W)`` or ``(H, W, C)`` numbers; a last dimension of one channel is dropped.
 
     Raises:
         DataError: It cannot be read, or is not an array of pixels.
@@ -378,13 +374,13 @@ def read_array(path: Path) -> NDArray[Any]:
 
 
 def photo_fov_deg(path: Path) -> float | None:
-    """Horizontal field of view of a photo in degrees, from its EXIF data.
+    """Read the horizontal field of view of a photo in degrees from its EXIF data.
 
-    They hold the focal length of a camera with 36×24 mm film and the same field of view along the
-    diagonal (CIPA DCG-001), whatever the aspect ratio of the photo.
+    EXIF data hold the focal length of a camera with 36×24 mm film and the same field of view along
+    the diagonal (CIPA DCG-001), for all aspect ratios of the photo.
 
     Returns:
-        None if they lack it.
+        None if they do not hold it.
 
     Raises:
         DataError: The file cannot be read, or is not an image.
@@ -393,7 +389,7 @@ def photo_fov_deg(path: Path) -> float | None:
         height, width = _upright_size(image)
         try:
             exif = _exif(image).get_ifd(ExifTags.IFD.Exif)
-            film_mm = float(exif.get(ExifTags.Base.FocalLengthIn35mmFilm, 0))
+            film_mm = float(exif.get(Tag.FocalLengthIn35mmFilm, 0))
         except Exception:  # broken EXIF data
             return None
     if not 0 < film_mm < math.inf:  # 0 stands for unknown
@@ -406,12 +402,12 @@ def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:
     """Refuse pixels that a file format cannot hold.
 
     Args:
-        suffix: Of the file, in lower case, with the dot.
-        dtype: Of the pixels.
-        channels: Of the pixels.
+        suffix: Suffix of the file, in lower case, with the dot.
+        dtype: Type of the pixels.
+        channels: Number of channels.
 
     Raises:
-        SettingError: The suffix is unknown, or such a file cannot hold such pixels.
+        SettingError: The suffix is unknown, or the format cannot hold such pixels.
     """
     able = [s for s in _WRITABLE if np.dtype(dtype).name in _WRITABLE[s] and channels in (1, 3)]
     if suffix not in (*able, ".npy"):
@@ -424,12 +420,12 @@ def check_writable(suffix: str, dtype: DTypeLike, channels: int) -> None:
 
 @contextmanager
 def array_file(path: Path, shape: tuple[int, ...], dtype: DTypeLike) -> Iterator[NDArray[Any]]:
-    """A ``.npy`` file as an array to be filled by the block; it appears when that succeeds.
+    """Open a ``.npy`` file as an array to be filled by the block; it appears when that succeeds.
 
     Args:
         path: The file.
-        shape: Of the array, which may be larger than the memory.
-        dtype: Of the array.
+        shape: Shape of the array, which may be larger than the memory.
+        dtype: Type of the array.
     """
     with atomic_path(path) as temporary:
         array = open_memmap(temporary, "w+", dtype, shape)
@@ -443,11 +439,11 @@ def write_pixels(path: Path, pixels: NDArray[Any]) -> None:
     """Write pixels unchanged, atomically.
 
     Args:
-        path: The file; its suffix gives the format.
-        pixels: ``(H, W)`` or ``(H, W, C)``, colours in RGB order.
+        path: The file; its suffix is the format.
+        pixels: ``(H, W)`` or ``(H, W, C)``, colors in RGB order.
 
     Raises:
-        SettingError: Such a file cannot hold them.
+        SettingError: The format cannot hold them.
     """
     suffix = path.suffix.lower()
     check_writable(suffix, pixels.dtype, 1 if pixels.ndim == 2 else pixels.shape[2])

@@ -27,7 +27,7 @@ from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
 
 Kind = Literal["color", "labels", "depth", "features"]
-"""Meaning of pixels: colours and features are interpolated, labels and depth never."""
+"""Meaning of pixels: colors and features are interpolated, labels and depth never."""
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
 _CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}
@@ -101,7 +101,7 @@ class TangentResults:
             files: One for every image, in the order of the grid; from `result_files`.
             grid: The images.
             kind: ``auto`` decides by the first file: ``.npy`` of floats are features; three
-                channels are colours, one channel of integers labels; images of one channel with 16
+                channels are colors, one channel of integers labels; images of one channel with 16
                 bits or floats are depth.
 
         Raises:
@@ -148,9 +148,9 @@ class TangentResults:
             path: The panorama's file. Arrays (``.npy``) keep the dtype; in images, floats are
                 32-bit and labels the smallest integers that hold them.
             shape: ``(H, W)`` of the panorama.
-            blend: Blending of overlapping images, for colours and features.
+            blend: Blending of overlapping images, for colors and features.
             z_depth: Whether depth is along the axes of the images' cameras, to be converted to
-                distance from the centre.
+                distance from the center.
 
         Raises:
             SettingError: Such a file cannot hold it, or `z_depth` is set for no depth.
@@ -210,7 +210,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
-    """Distances from the centre, of depth ``(d, d)`` along the axis of an image's camera."""
+    """Distances from the center, of depth ``(d, d)`` along the axis of an image's camera."""
     lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)

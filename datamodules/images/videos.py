@@ -298,7 +298,7 @@ def write_video(
     ):
         rate = stream.average_rate or 30
         step = max(1, round(1 / (rate * stream.time_base)))
-        # Players want colours at half the resolution, which takes an even size.
+        # Players want colors at half the resolution, which takes an even size.
         pixels = "yuv444p" if rows % 2 or columns % 2 else "yuv420p"
         encoder: Any = output.add_stream(_ENCODER, rate=rate, options=_QUALITY)
         encoder.width, encoder.height, encoder.pix_fmt = columns, rows, pixels

@@ -78,7 +78,7 @@ def _unreadable(path: Path, found: object) -> DataError:
 
 
 def clean_mesh(mesh: Trimesh) -> Trimesh:
-    """Remove duplicates and degenerate triangles, and centre the mesh in the unit sphere.
+    """Remove duplicates and degenerate triangles, and center the mesh in the unit sphere.
 
     The centroid of the surface, which need not be closed, is moved to the origin, and the mesh is
     scaled to `RADIUS`.

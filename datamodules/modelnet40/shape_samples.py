@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from datamodules.core.inputs import Normalization, normalize_channels
-from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.reading import SplitReader
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import ShapeFile
@@ -79,7 +79,7 @@ class ShapeSample(NamedTuple):
 
 @dataclass(frozen=True)
 class ShapeViews(Dataset[ShapeSample]):
-    """Views of shapes, by (epoch, index).
+    """Views of shapes, by index or (epoch, index).
 
     Attributes:
         source: The shapes.
@@ -100,8 +100,8 @@ class ShapeViews(Dataset[ShapeSample]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
-        epoch, index = key
+    def __getitem__(self, key: int | tuple[int, int]) -> ShapeSample:
+        epoch, index = sample_key(key, len(self))
         views = self._views(epoch, index)
         images = views.render(self.source.read(index).spheres, "bilinear")
         # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.

@@ -1,6 +1,6 @@
 """Stanford2D3DS (Armeni et al. 2017): six areas of three buildings, 1,413 panoramas, 70,496 photos.
 
-Features: 2048×4096 RGB, depth and 13 semantic classes (`reader.CLASSES`), captured with a
+Features: 2048×4096 RGB, depth and 13 semantic classes (`files.CLASSES`), captured with a
 Matterport camera; all panoramas are upright. Three folds of its authors, by area.
 
 On disk, as released::
@@ -18,7 +18,7 @@ On disk, as released::
           semantic/  camera_…_domain_semantic.png    8 bit, see `LabelTable`
           pose/      camera_…_domain_pose.json       `camera_k_matrix`, counted from pixel corners
 
-Licence: free for research, on request: http://buildingparser.stanford.edu/dataset.html
+License: free for research, on request: http://buildingparser.stanford.edu/dataset.html
 (`2D-3D-Semantics`, the `noXYZ` archives suffice).
 
 Citation: I. Armeni, S. Sax, A. R. Zamir, S. Savarese: "Joint 2D-3D-Semantic Data for Indoor Scene
@@ -36,8 +36,8 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.index import Split, draw_groups
 from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
-from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, list_pictures
-from datamodules.stanford2d3ds.reader import CLASSES, LabelTable, StanfordReader
+from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, GET_IT, list_pictures
+from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 

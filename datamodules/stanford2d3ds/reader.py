@@ -13,43 +13,24 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
+from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
 from tangent_train.errors import DataError, counted
 from tangent_train.files import parse_json, read_json
 from tangent_train.geometry import is_camera_matrix
-
-CLASSES: tuple[str, ...] = (
-    "beam",
-    "board",
-    "bookcase",
-    "ceiling",
-    "chair",
-    "clutter",
-    "column",
-    "door",
-    "floor",
-    "sofa",
-    "table",
-    "wall",
-    "window",
-)
-"""The 13 classes; the label of a class is its place here plus one."""
-
-_MISSING = 0x0D0D0D
 
 UNKNOWN = 0
 """The label of pixels without a class: ignored in training and evaluation."""
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_MISSING_DEPTH = 65535
-_MOST = 1e6  # metres, radians, pixels
+_MOST = 1e6  # meters, radians, pixels
 
 
 @dataclass(frozen=True, eq=False)
 class LabelTable:
     """Class of every instance of the data set.
 
-    A pixel of a `semantic` image holds the index of an instance as the colour
+    A pixel of a `semantic` image holds the index of an instance as the color
     R · 65536 + G · 256 + B. Missing labels are #0D0D0D = 855309, past the end of the table.
     (Without R they would be instance 3341, clutter.)
 
@@ -69,12 +50,12 @@ class LabelTable:
         Raises:
             DataError: It cannot be read or is no such list.
         """
-        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or <UNK>"
+        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or {UNKNOWN_CLASS}"
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
         names = read_json(path, expected, remedy)
         if not isinstance(names, list) or not names:
             raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
-        ids = {"<UNK>": UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
+        ids = {UNKNOWN_CLASS: UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
         classes = [str(name).partition("_")[0] for name in names]
         strange = sorted(set(classes) - set(ids))
         if strange:
@@ -103,13 +84,13 @@ class LabelTable:
         index = (red << 16) | (green << 8) | blue
         end = len(self.class_ids)
         past = index >= end
-        strange = past & (index != _MISSING)
+        strange = past & (index != MISSING_LABEL)
         if strange.any():
             count = int(np.count_nonzero(strange))
             raise DataError(
                 path,
                 found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
-                expected=f"0 to {end - 1}, the entries of the class table, or #{_MISSING:06X} "
+                expected=f"0 to {end - 1}, the entries of the class table, or #{MISSING_LABEL:06X} "
                 "where labels are missing",
                 remedy="Use the file and semantic_labels.json of one release.",
             )
@@ -162,7 +143,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
         DataError: The file is broken.
     """
     steps = read_pixels(path, indices=True)
-    steps[steps == _MISSING_DEPTH] = 0
+    steps[steps == MISSING_DEPTH] = 0
     return steps
 
 
@@ -173,7 +154,7 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
         path: ``camera_…_domain_pose.json``.
 
     Returns:
-        ``(3, 3)`` K for integer pixel centres (the file counts from pixel corners).
+        ``(3, 3)`` K for integer pixel centers (the file counts from pixel corners).
 
     Raises:
         DataError: The file is missing or broken, or holds no such matrix.

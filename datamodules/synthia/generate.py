@@ -1,7 +1,7 @@
 """Generating OmniSYNTHIA from SYNTHIA: the four views of a frame form one panorama.
 
 The front view is in the middle of the panorama, every pixel belongs to one view, and depth is the
-distance from the centre. The script that made the published panoramas (Zhang et al. 2019) has the
+distance from the center. The script that made the published panoramas (Zhang et al. 2019) has the
 left view in the middle, 90° away, keeps the z-depth of the views, and averages where views overlap,
 labels included.
 """
@@ -64,7 +64,7 @@ class ViewStitcher:
     """Stitches the four views of a frame to a panorama; its tables are computed once.
 
     Args:
-        camera_matrix: ``(3, 3)`` K of all views, integer pixel centres, without skew.
+        camera_matrix: ``(3, 3)`` K of all views, integer pixel centers, without skew.
         size: Rows and columns of all views.
         height: Rows of the panorama, which is twice as wide.
 
@@ -77,7 +77,7 @@ class ViewStitcher:
     ) -> None:
         rows, columns = size
         owner, x, y = _view_positions(camera_matrix, height)
-        # A view is seen up to the outer edges of its pixels. Beyond the outermost centres these are
+        # A view is seen up to the outer edges of its pixels. Beyond the outermost centers these are
         # repeated: in the stack of all views, the next rows are another view's.
         seen = (np.abs(x - (columns - 1) / 2) <= columns / 2) & (
             np.abs(y - (rows - 1) / 2) <= rows / 2
@@ -101,7 +101,7 @@ class ViewStitcher:
 
         Args:
             views: The images.
-            interpolation: Of colours; labels and distances are not to be mixed.
+            interpolation: Of colors; labels and distances are not to be mixed.
             elsewhere: Value outside the views.
         """
         return cv2.remap(
@@ -119,7 +119,7 @@ def _view_positions(
     """View that owns each column of a panorama, and the column's pixels in that view.
 
     All pixels of a column belong to the view whose optical axis is nearest, as the views are
-    upright: there they are nearest to the image centre.
+    upright: there they are nearest to the image center.
 
     Returns:
         ``(W,)`` place in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.

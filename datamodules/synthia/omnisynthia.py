@@ -5,7 +5,7 @@ four cameras: a band around the horizon, black and unknown above and below. Miss
 generated from the four views of SYNTHIA's sequences 01, 02, 04, 05 and 06 SUMMER, which are
 photos too. `reader` has the tree on disk.
 
-Licence: SYNTHIA is free for research: http://synthia-dataset.net.
+License: SYNTHIA is free for research: http://synthia-dataset.net.
 
 Citation: G. Ros, L. Sellart, J. Materzynska, D. Vazquez, A. M. Lopez: "The SYNTHIA Dataset",
 CVPR 2016. C. Zhang, S. Liwicki, W. Smith, R. Cipolla: "Orientation-aware Semantic Segmentation on
@@ -131,7 +131,7 @@ def divide(
 ) -> dict[Split, list[ImageFiles]]:
     """Assign frames to splits.
 
-    Neighbouring frames are nearly identical, so validation takes those at the end of each training
+    Neighboring frames are nearly identical, so validation takes those at the end of each training
     sequence.
 
     Args:

@@ -6,13 +6,13 @@ On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
       RGB/Stereo_Left/Omni_F/000000.png        760×1280, 8 bit; Omni_R, Omni_B, Omni_L likewise
       GT/LABELS/Stereo_Left/Omni_F/000000.png  16-bit RGB: R is the class, the others the instance
       Depth/Stereo_Left/Omni_F/000000.png      16 bit, z-depth in cm, in every channel there is
-      CameraParams/intrinsics.txt              focal length, centre x and y, baseline
+      CameraParams/intrinsics.txt              focal length, center x and y, baseline
       pano/                                    OmniSYNTHIA: 2096×4192
         RGB/000000.png                         8 bit, black outside the views
         GT/LABELS_Correct/000000.png           8 bit, 255 outside the views
         Depth/000000.png                       16 bit, cm
 
-The four views of a frame are upright and share their centre: F faces forward, and R, B and L are
+The four views of a frame are upright and share their center: F faces forward, and R, B and L are
 each rotated by a further 90° to the right.
 """
 
@@ -47,7 +47,7 @@ FRAMES = 500
 """About as many frames of each sequence became panoramas of OmniSYNTHIA."""
 
 _SIZE = (760, 1280)
-_CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, centre from pixel corners
+_CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, center from pixel corners
 _NAME = "[0-9]" * 6 + ".png"
 
 CLASSES: tuple[str, ...] = (
@@ -81,7 +81,7 @@ NORMALIZATIONS = (
 that of Stanford2D3DS, clipped alike."""
 
 Formats = dict[str, tuple[int, tuple[str, ...]]]
-"""Bits and colour types by part."""
+"""Bits and color types by part."""
 
 VIEW_FORMATS: Formats = {
     "rgb": (8, ("RGB", "RGBA")),
@@ -145,12 +145,12 @@ def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -
 
 
 def list_frames(folder: Path) -> list[str]:
-    """Frames of which a view has a colour image, as ``000000``, in order; none is no error."""
+    """Frames of which a view has a color image, as ``000000``, in order; none is no error."""
     return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
 
 
 def list_panoramas(folder: Path) -> list[str]:
-    """Frames that have the colour image of a panorama, in order; none is no error."""
+    """Frames that have the color image of a panorama, in order; none is no error."""
     return _names(folder / "pano" / "RGB")
 
 
@@ -179,7 +179,7 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
 def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
     """Camera matrix of all views of a sequence.
 
-    From ``CameraParams/intrinsics.txt``: the focal length, x and y of the centre, and perhaps the
+    From ``CameraParams/intrinsics.txt``: the focal length, x and y of the center, and perhaps the
     baseline. Without that file, the one camera of the release.
 
     Args:
@@ -187,7 +187,7 @@ def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
         size: Rows and columns of the views.
 
     Returns:
-        ``(3, 3)`` K for integer pixel centres; the file counts from pixel corners.
+        ``(3, 3)`` K for integer pixel centers; the file counts from pixel corners.
 
     Raises:
         DataError: The file holds something else, or is missing and the views have another size.

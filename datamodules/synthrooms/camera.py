@@ -1,6 +1,6 @@
 """Poses, panoramas and perspective views, and the rays of their pixels.
 
-Room coordinates are right-handed, in metres, z up. Camera axes are x right, y down, z forward, as
+Room coordinates are right-handed, in meters, z up. Camera axes are x right, y down, z forward, as
 in `tangent_train.geometry`. A pose (R, c) takes room to camera coordinates by
 ``x_cam = R (x − c)``; ``camera_rt_matrix`` in the pose file is ``[R | −R c]``.
 
@@ -8,7 +8,7 @@ A panorama's pose is that of an upright camera facing the middle of the panorama
 with sphere direction s (`tangent_train.geometry`: x to the middle, y right, z up) and distance d is
 the room's point ``c + d Rᵀ (s_y, −s_z, s_x)``, which is ``c + d Rz(ψ) FLIP_Y s`` with the heading ψ
 counterclockwise from the room's x axis. A perspective pixel (column j, row i) with z-depth d is
-``c + d Rᵀ K⁻¹ (j, i, 1)`` with K for integer pixel centres.
+``c + d Rᵀ K⁻¹ (j, i, 1)`` with K for integer pixel centers.
 
 Angles in pose files are Blender's XYZ Euler angles of a camera facing its −z with +y up:
 ``Rᵀ = Rz(c) Ry(b) Rx(a) diag(1, −1, −1)`` (as in the real set).
@@ -25,7 +25,8 @@ from numpy.typing import NDArray
 
 from tangent_train.geometry import (
     camera_matrix_from_fov,
-    equirect_to_lonlat,
+    equirect_latitudes,
+    equirect_longitudes,
     lonlat_to_xyz,
     perspective_directions,
     rotation_about,
@@ -41,13 +42,13 @@ CAMERA_FROM_SPHERE = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 
 
 def euler_rotation(angles_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``Rz(c) Ry(b) Rx(a)`` of XYZ Euler angles (a, b, c)."""
+    """Return ``Rz(c) Ry(b) Rx(a)`` of XYZ Euler angles (a, b, c)."""
     a, b, c = angles_rad
     return rotation_about(_Z, c) @ rotation_about(_Y, b) @ rotation_about(_X, a)
 
 
 def euler_angles(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """XYZ Euler angles in radians; inverse of `euler_rotation` with b in [−π/2, π/2]."""
+    """Return XYZ Euler angles in radians; inverse of `euler_rotation` with b in [−π/2, π/2]."""
     b = math.asin(np.clip(-rotation[2, 0], -1, 1))
     if abs(rotation[2, 0]) > 1 - 1e-12:  # a and c rotate about the same axis: give all to c
         return np.array([0, b, math.atan2(-rotation[0, 1], rotation[1, 1])])
@@ -60,7 +61,7 @@ class Pose:
     """Position and orientation of a camera.
 
     Attributes:
-        location: ``(3,)`` centre in metres.
+        location: ``(3,)`` center in meters.
         world_from_camera: ``(3, 3)`` Rᵀ: its columns are the camera's right, down and forward.
     """
 
@@ -71,12 +72,12 @@ class Pose:
     def looking(
         cls, location: NDArray[np.float64], heading: float, pitch: float = 0.0, roll: float = 0.0
     ) -> Pose:
-        """Pose by angles in radians.
+        """Return the pose of angles in radians.
 
         Args:
-            location: ``(3,)`` centre in metres.
+            location: ``(3,)`` center in meters.
             heading: Counterclockwise from the room's x axis, seen from above.
-            pitch: Upwards.
+            pitch: Upward tilt.
             roll: Clockwise as seen by the camera, which tilts the picture the other way.
         """
         upright = rotation_about(_Z, heading - math.pi / 2) @ rotation_about(
@@ -91,7 +92,7 @@ class Pose:
 
     @property
     def rt_matrix(self) -> NDArray[np.float64]:
-        """``(3, 4)`` from room to camera coordinates."""
+        """``(3, 4)`` matrix from room to camera coordinates."""
         rotation = self.world_from_camera.T
         return np.hstack([rotation, -(rotation @ self.location)[:, None]])
 
@@ -104,12 +105,9 @@ class PanoramaView:
     height: int
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
-        """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
-        shape = (self.height, 2 * self.height)
-        columns = np.stack([np.arange(shape[1]) + dx, np.zeros(shape[1])], axis=-1)
-        rows = np.stack([np.zeros(shape[0]), np.arange(shape[0]) + dy], axis=-1)
-        lon = equirect_to_lonlat(columns, shape)[:, 0]
-        lat = equirect_to_lonlat(rows, shape)[:, 1]
+        """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
+        lon = equirect_longitudes(2 * self.height, dx)
+        lat = equirect_latitudes(self.height, dy)
         # A direction is cos φ times its horizontal part plus the vertical: no trigonometry a pixel.
         turn = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
         level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ turn).astype(np.float32)
@@ -118,7 +116,7 @@ class PanoramaView:
         return spread + vertical.astype(np.float32)[:, None, :]
 
     def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth of distances along all rays, ``(h, w)``: the distance itself."""
+        """Return the depth ``(h, w)`` of distances along all rays: the distance itself."""
         return distance_m
 
 
@@ -138,18 +136,18 @@ class PerspectiveView:
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` K for integer pixel centres."""
+        """``(3, 3)`` K for integer pixel centers."""
         return camera_matrix_from_fov(math.degrees(self.fov_rad), (self.size, self.size))
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> NDArray[np.float32]:
-        """Directions in the room of all pixels, moved by (dx, dy) pixels: ``(h, w, 3)`` units."""
+        """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
         moved = self.camera_matrix
         moved[:2, 2] -= (dx, dy)
         directions = perspective_directions(moved, (self.size, self.size)).astype(np.float32)
         return directions @ self.pose.world_from_camera.T.astype(np.float32)
 
     def depth_m(self, distance_m: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Depth along the optical axis of distances along all rays, ``(h, w)``."""
+        """Return the depth ``(h, w)`` along the optical axis of distances along all rays."""
         return distance_m * (self.rays() @ self.pose.world_from_camera[:, 2].astype(np.float32))
 
 
@@ -164,8 +162,8 @@ def draw_view(
 
     Args:
         rng: Source of randomness.
-        kind: See `RoomSettings.views`. Both kinds have 45° to 75° of view.
-        location: ``(3,)`` centre in metres.
+        kind: See `RoomSettings.views`. Both kinds have fields of view of 45° to 75°.
+        location: ``(3,)`` center in meters.
         size: Side in pixels.
     """
     heading = rng.uniform(-math.pi, math.pi)

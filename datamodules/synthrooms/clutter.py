@@ -1,7 +1,7 @@
-"""Clutter on tables, floor and walls, and lamps; a few items are unlabelled.
+"""Clutter on tables, floor and walls, and lamps; a few items are unlabeled.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. What does not fit raises `NoPlaceError`.
+back at +y. Items that do not fit raise `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -10,19 +10,20 @@ import math
 
 import numpy as np
 
+from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.layout import Frame
 from datamodules.synthrooms.materials import Pattern
-from datamodules.synthrooms.room import UNKNOWN, Item, Light, Room
+from datamodules.synthrooms.room import Item, Light, Room
 
-_UNLABELLED = 0.12
+_UNLABELED = 0.12
 
 
 def _new(room: Room, frame: Frame) -> Item:
-    return room.item(UNKNOWN if room.chance(_UNLABELLED) else "clutter", frame)
+    return room.item(UNKNOWN_CLASS if room.chance(_UNLABELED) else "clutter", frame)
 
 
 def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) -> None:
-    """Put up to four items on a table top of ``(width, depth, height)`` metres."""
+    """Put up to four items on a table top of ``(width, depth, height)`` meters."""
     wide, deep, high = size
     number = room.count(0, 4)
     for k in range(number):
@@ -33,7 +34,7 @@ def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) 
 
 
 def _build_desk_thing(room: Room, thing: Item) -> None:
-    """A monitor, a pile of books, a vase, a box, or a desk lamp."""
+    """Build a monitor, a pile of books, a vase, a box, or a desk lamp."""
     rng = room.rng
     material = room.palette.material()
     kind = room.pick((0.4, 0.2, 0.15, 0.15, 0.1))
@@ -62,65 +63,46 @@ def _build_desk_thing(room: Room, thing: Item) -> None:
 
 
 def add_floor_clutter(room: Room) -> None:
-    """Add an item on the floor: boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
+    """Add an item on the floor."""
     rng = room.rng
     size = rng.uniform(0.4, 0.65)
     if room.chance(0.6):
         frame = room.plan.against_wall(rng, size + 0.1, size, "low").at(0, size / 2 + 0.02)
     else:
         frame = room.plan.in_the_open(rng, size, size)
-    build = _FLOOR_THINGS[room.pick(_FLOOR_SHARES)]
-    build(room, _new(room, frame), size)
+    kind = room.pick((0.25, 0.2, 0.1, 0.25, 0.1, 0.1))
+    _build_floor_thing(room, _new(room, frame), kind, size)
 
 
-def _build_boxes(room: Room, thing: Item, size: float) -> None:
-    for k in range(room.count(1, 3)):
-        side = size * (0.95 - 0.15 * k)
-        center = (0, 0, size * (0.35 + 0.7 * k))
-        yaw = room.rng.normal(0, 0.08)
-        thing.box(room.palette.material(), center, (side, side, size * 0.7), yaw)
-
-
-def _build_plant(room: Room, thing: Item, size: float) -> None:
-    thing.cylinder(room.palette.material(), (0, 0, 0.18), (size * 0.7, size * 0.7, 0.36))
-    leaves = room.palette.material(Pattern.SPECKLE, frequency=(3, 8))
-    for z, wide in ((0.6, 0.85), (0.95, 1.0), (1.25, 0.75)):
-        x, y = room.rng.uniform(-0.05, 0.05, 2)
-        thing.ball(leaves, (x, y, z), (size * wide, size * wide, 0.5))
-
-
-def _build_bin(room: Room, thing: Item, size: float) -> None:
-    thing.cylinder(room.palette.material(), (0, 0, size * 0.5), (size * 0.7, size * 0.7, size))
-
-
-def _build_cabinet(room: Room, thing: Item, size: float) -> None:
-    material = room.palette.material()
-    high = room.rng.uniform(0.6, 1.25)
-    thing.box(material, (0, 0, high / 2), (size, size, high))
-    for z in (0.25, 0.5, 0.75):
-        thing.box(material.shaded(0.6), (0, 0, high * z), (size + 0.01, size + 0.01, 0.02))
-
-
-def _build_standing_lamp(room: Room, thing: Item, size: float) -> None:
-    material, shade = room.palette.material(), room.palette.material(Pattern.PLAIN)
-    thing.cylinder(material, (0, 0, 0.03), (0.36, 0.36, 0.06))
-    thing.cylinder(material, (0, 0, 0.75), (0.05, 0.05, 1.5))
-    thing.cylinder(shade, (0, 0, 1.6), (size * 0.8, size * 0.8, 0.32))
-
-
-def _build_ball(room: Room, thing: Item, size: float) -> None:
-    thing.ball(room.palette.material(), (0, 0, size / 2), (size, size, size))
-
-
-_FLOOR_THINGS = (
-    _build_boxes,
-    _build_plant,
-    _build_bin,
-    _build_cabinet,
-    _build_standing_lamp,
-    _build_ball,
-)
-_FLOOR_SHARES = (0.25, 0.2, 0.1, 0.25, 0.1, 0.1)
+def _build_floor_thing(room: Room, thing: Item, kind: int, size: float) -> None:
+    """Build boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
+    rng, material = room.rng, room.palette.material
+    if kind == 0:
+        for k in range(room.count(1, 3)):
+            side = size * (0.95 - 0.15 * k)
+            center = (0, 0, size * (0.35 + 0.7 * k))
+            yaw = rng.normal(0, 0.08)
+            thing.box(material(), center, (side, side, size * 0.7), yaw)
+    elif kind == 1:
+        thing.cylinder(material(), (0, 0, 0.18), (size * 0.7, size * 0.7, 0.36))
+        leaves = material(Pattern.SPECKLE, frequency=(3, 8))
+        for z, wide in ((0.6, 0.85), (0.95, 1.0), (1.25, 0.75)):
+            x, y = rng.uniform(-0.05, 0.05, 2)
+            thing.ball(leaves, (x, y, z), (size * wide, size * wide, 0.5))
+    elif kind == 2:
+        thing.cylinder(material(), (0, 0, size * 0.5), (size * 0.7, size * 0.7, size))
+    elif kind == 3:
+        body, high = material(), rng.uniform(0.6, 1.25)
+        thing.box(body, (0, 0, high / 2), (size, size, high))
+        for z in (0.25, 0.5, 0.75):
+            thing.box(body.shaded(0.6), (0, 0, high * z), (size + 0.01, size + 0.01, 0.02))
+    elif kind == 4:
+        stand, shade = material(), material(Pattern.PLAIN)
+        thing.cylinder(stand, (0, 0, 0.03), (0.36, 0.36, 0.06))
+        thing.cylinder(stand, (0, 0, 0.75), (0.05, 0.05, 1.5))
+        thing.cylinder(shade, (0, 0, 1.6), (size * 0.8, size * 0.8, 0.32))
+    else:
+        thing.ball(material(), (0, 0, size / 2), (size, size, size))
 
 
 def add_wall_clutter(room: Room) -> None:

@@ -26,7 +26,7 @@ class SynthRoomsAreas(StanfordAreas):
         rooms: Rooms to generate; their areas are the areas used.
     """
 
-    is_made = True
+    is_generated = True
 
     areas: Sequence[str] = field(init=False, default=())
     rooms: RoomSettings | Mapping[str, int | str | Mapping[str, int]]
@@ -79,6 +79,8 @@ class SynthRoomsPairs(StanfordPairs):
     Raises:
         SettingError: A setting is invalid.
     """
+
+    is_generated = True
 
     def __init__(
         self,

@@ -60,7 +60,7 @@ def _build_chair(room: Room, frame: Frame) -> None:
 def _add_legs(
     item: Item, material: Material, spread: tuple[float, float], height: float, thick: float
 ) -> None:
-    """Four upright legs from the floor, ``±spread`` metres from the middle."""
+    """Four upright legs from the floor, ``±spread`` meters from the middle."""
     for x in (-spread[0], spread[0]):
         for y in (-spread[1], spread[1]):
             item.box(material, (x, y, height / 2), (thick, thick, height))
@@ -197,7 +197,7 @@ _BOARD = 0.035
 
 
 def add_board(room: Room) -> None:
-    """Add a board: white, black or coloured with writing, or a pin board with papers."""
+    """Add a board: white, black or colored with writing, or a pin board with papers."""
     rng = room.rng
     wide, high = rng.uniform(1.5, 3.2), rng.uniform(1.05, 1.45)
     bottom = min(rng.uniform(0.75, 0.95), room.plan.height - high - 0.15)

@@ -53,7 +53,7 @@ class RoomSettings:
             about N(0, 20°)), ``"uniform"`` in directions uniform on the sphere.
         views_per_camera: Perspective views per panorama.
         view_size: Side of the square perspective views in pixels.
-        supersample: Rays per pixel side for the colours (labels and depth: one ray at the centre).
+        supersample: Rays per pixel side for the colors (labels and depth: one ray at the center).
         least_cameras: Least number of panoramas per room; most rooms have one otherwise.
 
     Raises:

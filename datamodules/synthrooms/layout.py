@@ -1,6 +1,6 @@
 """Floor plans: rectangles and L-shapes, their walls, and free space.
 
-Room coordinates are right-handed, in metres, z up; the floor is z = 0.
+Room coordinates are right-handed, in meters, z up; the floor is z = 0.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Zone = Literal["low", "high", "full"]
-"""Part of a wall's height that an item occupies: up to about a metre, above it, or all of it."""
+"""Part of a wall's height that an item occupies: up to about a meter, above it, or all of it."""
 
 _TRIES = 24
 _GAP = 0.06
@@ -26,9 +26,9 @@ class Frame(NamedTuple):
     """A coordinate frame: an origin in the room and a rotation about the vertical.
 
     Attributes:
-        x: Origin in metres.
-        y: Origin in metres.
-        z: Origin in metres.
+        x: Origin in meters.
+        y: Origin in meters.
+        z: Origin in meters.
         yaw: Counterclockwise rotation seen from above, in radians.
     """
 
@@ -54,7 +54,7 @@ class Rectangle(NamedTuple):
     y1: float
 
     def meets(self, other: Rectangle, gap: float = 0.0) -> bool:
-        """Whether the two come closer than `gap` metres along both axes."""
+        """Whether the two come closer than `gap` meters along both axes."""
         return (
             self.x0 < other.x1 + gap
             and other.x0 < self.x1 + gap
@@ -76,7 +76,7 @@ class Wall:
 
     Attributes:
         frame: At the wall's start; x runs along it, y into the room.
-        length: In metres.
+        length: In meters.
         taken: Occupied stretches: start and end along the wall, and zone.
     """
 
@@ -96,7 +96,7 @@ class FloorPlan:
     """A rectangle, or an L: the rectangle without its corner of greatest x and y.
 
     Args:
-        size: Width (x), depth (y) and height (z) of the room in metres.
+        size: Width (x), depth (y) and height (z) of the room in meters.
         notch: Width and depth of the missing corner; None for a plain rectangle.
     """
 
@@ -129,11 +129,11 @@ class FloorPlan:
 
     @property
     def floor_area(self) -> float:
-        """Area of the floor in square metres."""
+        """Area of the floor in square meters."""
         return sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in self.floors)
 
     def contains(self, area: Rectangle, margin: float = 0.0) -> bool:
-        """Whether a rectangle lies inside, `margin` metres away from every wall."""
+        """Whether a rectangle lies inside, `margin` meters away from every wall."""
         inside = (
             area.x0 >= margin
             and area.y0 >= margin
@@ -147,8 +147,8 @@ class FloorPlan:
 
         Args:
             area: The rectangle.
-            margin: Metres from every wall.
-            gap: Metres from everything else.
+            margin: Meters from every wall.
+            gap: Meters from everything else.
         """
         free = not any(area.meets(other, gap) for other in self._taken)
         if not (free and self.contains(area, margin)):
@@ -163,8 +163,8 @@ class FloorPlan:
 
         Args:
             rng: Source of randomness.
-            width: Metres along the wall.
-            depth: Metres of floor in front of it that must be and stay free; 0 for what hangs.
+            width: Meters along the wall.
+            depth: Meters of floor in front of it that must be and stay free; 0 for what hangs.
             zone: Part of the wall's height.
 
         Returns:
@@ -190,7 +190,7 @@ class FloorPlan:
     def in_the_open(
         self, rng: np.random.Generator, width: float, depth: float, gap: float = 0.12
     ) -> Frame:
-        """Find and take a place away from the walls, ``width × depth`` metres, axis-aligned.
+        """Find and take a place away from the walls, ``width × depth`` meters, axis-aligned.
 
         Raises:
             NoPlaceError: No place was found.

@@ -1,14 +1,14 @@
-"""Colours, materials and procedural textures, drawn per object from one palette per room.
+"""Colors, materials and procedural textures, drawn per object from one palette per room.
 
-All classes share the palette and most patterns, so that colour alone does not give the class.
-Colours are display values in [0, 1]; light is computed with their squares (a gamma of 2).
+All classes share the palette and most patterns, so that color alone does not give the class.
+Colors are display values in [0, 1]; light is computed with their squares (a gamma of 2).
 """
 
 from __future__ import annotations
 
 import colorsys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any
 
@@ -17,10 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
+MaterialTable = dict[str, NDArray[Any]]
 
 
 class Pattern(IntEnum):
-    """Procedural textures; the last four belong to one kind of object."""
+    """Procedural textures; the last four are for one kind of object each."""
 
     PLAIN = 0
     STRIPES = 1
@@ -42,14 +43,14 @@ class Material:
     """Surface of one part of an object.
 
     Attributes:
-        color: Main colour, display values.
-        second: The pattern's other colour.
+        color: Main color, display values.
+        second: The pattern's other color.
         pattern: Procedural texture.
-        frequency: Repetitions per metre.
+        frequency: Repetitions per meter.
         contrast: Strength of the fine mottling that every surface has.
-        offset: Shift of the texture in metres.
-        emission: Light that the surface emits, relative to its colour; 0 for most.
-        unscanned: Whether depth cameras get no return from it, as from some window glass.
+        offset: Shift of the texture in meters.
+        emission: Light that the surface emits, relative to its color; 0 for most.
+        unscanned: True if depth cameras get no return from it, e.g. from some window glass.
     """
 
     color: NDArray[np.float64]
@@ -62,13 +63,13 @@ class Material:
     unscanned: bool = False
 
     def shaded(self, factor: float) -> Material:
-        """The same material in a lighter or darker colour, without its pattern."""
+        """Return the material in a lighter or darker color, without its pattern."""
         color = np.clip(self.color * factor, 0.02, 0.98)
         return replace(self, color=color, pattern=Pattern.PLAIN)
 
 
 class Palette:
-    """Ten colours of a room, and materials drawn from them.
+    """Ten colors of a room, and materials drawn from them.
 
     Args:
         rng: The room's source of randomness.
@@ -84,16 +85,16 @@ class Palette:
     def hsv(
         self, hue: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]
     ) -> NDArray[np.float64]:
-        """A colour drawn uniformly between the limits of hue, saturation and value."""
+        """Draw a color uniformly between the limits of hue, saturation and value."""
         drawn = [self._rng.uniform(*limits) for limits in (hue, saturation, value)]
         return np.array(colorsys.hsv_to_rgb(*drawn))
 
     def pale(self) -> NDArray[np.float64]:
-        """A light colour with little saturation, as walls often have."""
+        """Draw a light color with little saturation, common on walls."""
         return self.hsv((0, 1), (0, 0.14), (0.6, 0.97))
 
     def color(self) -> NDArray[np.float64]:
-        """One of the room's colours, slightly varied."""
+        """Draw one of the room's colors, slightly varied."""
         color = self._colors[self._rng.integers(len(self._colors))]
         varied = color * self._rng.uniform(0.75, 1.2) + self._rng.normal(0, 0.03, 3)
         return np.clip(varied, 0.04, 0.97)
@@ -111,9 +112,9 @@ class Palette:
 
         Args:
             *patterns: Patterns to choose from; the common ones by default.
-            color: Main colour; one of the room's by default.
-            second: The pattern's colour; a relative of the main one by default.
-            frequency: Limits of the pattern's repetitions per metre.
+            color: Main color; one of the room's by default.
+            second: The pattern's color; a relative of the main one by default.
+            frequency: Limits of the pattern's repetitions per meter.
             emission: See `Material`.
             unscanned: See `Material`.
         """
@@ -137,29 +138,23 @@ class Palette:
         return _COMMON[self._rng.choice(len(_COMMON), p=_COMMON_SHARES)]
 
 
-_FIELDS = np.dtype(
-    [
-        ("color", "f4", 3),
-        ("second", "f4", 3),
-        ("pattern", "i8"),
-        ("frequency", "f4"),
-        ("contrast", "f4"),
-        ("offset", "f4", 2),
-        ("emission", "f4"),
-        ("unscanned", "?"),
-    ]
-)
+_TYPES = {"pattern": np.int64, "unscanned": np.bool_}
 _NOISE: Floats = np.random.default_rng(0).random((256, 256), dtype=np.float32)
 _NOISE_ROW = 1024  # cv2.remap takes at most 32,767 columns
 
 
-def material_table(materials: Sequence[Material]) -> NDArray[np.void]:
-    """Materials as a structured array ``(n,)`` with a field for each attribute."""
-    return np.array([tuple(vars(material).values()) for material in materials], _FIELDS)
+def material_table(materials: Sequence[Material]) -> MaterialTable:
+    """Return an array ``(n, ...)`` for each attribute of materials."""
+    return {
+        field.name: np.array(
+            [getattr(m, field.name) for m in materials], _TYPES.get(field.name, np.float32)
+        )
+        for field in fields(Material)
+    }
 
 
 def _noise(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> Floats:
-    """Smooth noise in [0, 1] with one knot per unit, the same everywhere and always."""
+    """Return smooth noise in [0, 1] with one knot per unit, the same in all rooms."""
     size = -(-len(x) // _NOISE_ROW) * _NOISE_ROW
     xy = np.zeros((2, size), np.float32)
     xy[0, : len(x)], xy[1, : len(x)] = np.mod(x, 256), np.mod(y, 256)
@@ -169,7 +164,7 @@ def _noise(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> Floats
 
 
 def _hash(cell: Floats, salt: float) -> Floats:
-    """One value in [0, 1] per integer `cell`."""
+    """Return a value in [0, 1] for every integer `cell`."""
     return np.mod(np.abs(np.sin(cell * np.float32(12.9898 + salt)) * np.float32(437.5453)), 1)
 
 
@@ -185,7 +180,7 @@ def _papers(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
 
 
 def _outside(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
-    """Land below a ragged skyline, with the sky paling towards it."""
+    """Return land below a ragged skyline, with the sky paling towards it."""
     skyline = 1.1 + 0.7 * (_noise(np.floor(u * 4 * f), u * 0) - 0.5)
     return np.where(v < skyline, 0.75 + 0.25 * _noise(u * 3, v * 3), 0)
 
@@ -200,18 +195,18 @@ _WEIGHTS: dict[int, Callable[[Floats, Floats, Floats], NDArray[Any]]] = {
     Pattern.PAPERS: _papers,
     Pattern.OUTSIDE: _outside,
 }
-"""Weight of the second colour at positions u, v in metres, with f repetitions per metre."""
+"""Weight of the second color at positions u, v in meters, with f repetitions per meter."""
 
 
 def albedo(
-    materials: NDArray[np.void], rows: NDArray[np.int64], points: Floats, normals: Floats
+    materials: MaterialTable, rows: NDArray[np.int64], points: Floats, normals: Floats
 ) -> Floats:
-    """Albedo of surface points.
+    """Return the albedo of surface points.
 
     Args:
         materials: From `material_table`.
         rows: ``(n,)`` material of every point.
-        points: ``(n, 3)`` in metres; textures are laid over the dominant plane of the normal.
+        points: ``(n, 3)`` in meters; textures are projected along the main axis of the normal.
         normals: ``(n, 3)``.
 
     Returns:
@@ -220,15 +215,15 @@ def albedo(
     axis = np.abs(normals).argmax(axis=1)
     u = np.where(axis == 0, points[:, 1], points[:, 0])
     v = np.where(axis == 2, points[:, 1], points[:, 2])
-    surface = materials[rows]
+    surface = {name: values[rows] for name, values in materials.items()}
     pattern, frequency = surface["pattern"], surface["frequency"]
-    offset, color = surface["offset"], surface["color"].copy()
+    offset, color = surface["offset"], surface["color"]
     weight = np.zeros(len(rows), np.float32)
     for kind, weigh in _WEIGHTS.items():
         chosen = np.flatnonzero(pattern == kind)
         if len(chosen) == 0:
             continue
-        # The view outside keeps its horizon: everything else is shifted at random.
+        # The view outside keeps its horizon; other textures are shifted at random.
         shift = 0 if kind == Pattern.OUTSIDE else offset[chosen, 1]
         uc, vc, fc = u[chosen] + offset[chosen, 0], v[chosen] + shift, frequency[chosen]
         weight[chosen] = weigh(uc, vc, fc)

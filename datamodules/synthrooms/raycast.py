@@ -16,9 +16,9 @@ from datamodules.synthrooms.room import Light, Room
 Floats = NDArray[np.float32]
 
 
-_LIFT = 1e-3  # metres off the surface where secondary rays begin
-_REACH = 0.8  # metres within which surfaces occlude ambient light
-_NEAREST = 0.3  # square metres: lamps are not brighter closer than this
+_LIFT = 1e-3  # meters off the surface where secondary rays begin
+_REACH = 0.8  # meters within which surfaces occlude ambient light
+_NEAREST = 0.3  # square meters: lamps are not brighter closer than this
 
 
 class Hits(NamedTuple):
@@ -26,9 +26,9 @@ class Hits(NamedTuple):
 
     Attributes:
         found: ``(n,)`` whether the ray hit a surface; the other fields are undefined where not.
-        distance: ``(n,)`` metres along the unit direction.
+        distance: ``(n,)`` meters along the unit direction.
         part: ``(n,)`` position in `Room.parts`.
-        points: ``(n, 3)`` metres.
+        points: ``(n, 3)`` meters.
         normals: ``(n, 3)`` of the surface, towards the viewer.
         cosine: ``(n,)`` of the angle between the normal and the way back.
     """

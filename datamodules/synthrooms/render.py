@@ -24,8 +24,8 @@ _RAYS_AT_ONCE = 1 << 17  # keeps a 2048 × 4096 panorama within 200 MB, and the 
 _GRAZING = 0.04  # cosine below which a depth camera gets no return
 _WHITE = 9.0  # square of the light, in units of exposure, that becomes white
 _HEIGHTS = (1.3, 1.7)
-_CLEAR = 0.55  # metres around a camera that should be free
-_APART = 1.2  # metres between the cameras of a room
+_CLEAR = 0.55  # meters around a camera that should be free
+_APART = 1.2  # meters between the cameras of a room
 _PLACES = 60  # tried for every camera
 
 
@@ -47,8 +47,8 @@ class Holes(NamedTuple):
     """Balls in the room within which the scan has no surface.
 
     Attributes:
-        centers: ``(n, 3)`` metres.
-        radii: ``(n,)`` metres.
+        centers: ``(n, 3)`` meters.
+        radii: ``(n,)`` meters.
     """
 
     centers: NDArray[np.float64]
@@ -69,7 +69,7 @@ class Camera:
     """The place of a camera, and its sensor, the same in all of its pictures.
 
     Attributes:
-        location: ``(3,)`` metres.
+        location: ``(3,)`` meters.
         heading: Of the panorama, radians counterclockwise from the room's x axis.
         caps: Radians around the zenith and the nadir that were not photographed.
         gain: ``(3,)`` exposure times white balance.
@@ -137,8 +137,8 @@ def render(
 ) -> Picture:
     """Render a view.
 
-    Colours are the mean of ``supersample²`` rays per pixel, spread evenly over it, each through the
-    tone curve; labels and depth come from one ray through the pixel's centre.
+    Colors are the mean of ``supersample²`` rays per pixel, spread evenly over it, each through the
+    tone curve; labels and depth come from one ray through the pixel's center.
 
     Args:
         scene: The room.

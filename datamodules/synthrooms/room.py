@@ -15,9 +15,6 @@ from trimesh import creation
 from datamodules.synthrooms.layout import FloorPlan, Frame
 from datamodules.synthrooms.materials import Material, Palette
 
-UNKNOWN = "<UNK>"
-"""Class of unlabelled items."""
-
 _SHAPES = {
     "box": creation.box((1, 1, 1)),
     "cylinder": creation.cylinder(0.5, 1.0, sections=16),
@@ -35,7 +32,7 @@ class Part(NamedTuple):
     Attributes:
         item: Position in `Room.items`.
         material: Its surface.
-        triangles: ``(n, 3, 3)`` corners in metres.
+        triangles: ``(n, 3, 3)`` corners in meters.
     """
 
     item: int
@@ -47,8 +44,8 @@ class Light(NamedTuple):
     """A rectangular lamp that shines to one side.
 
     Attributes:
-        center: ``(3,)`` in metres.
-        half_sides: ``(2, 3)`` vectors from the centre to the middle of two sides.
+        center: ``(3,)`` in meters.
+        half_sides: ``(2, 3)`` vectors from the center to the middle of two sides.
         normal: ``(3,)`` unit vector it shines along.
         intensity: Along the normal; it falls with the cosine, as a Lambertian emitter's.
     """
@@ -95,7 +92,7 @@ class Room:
     Attributes:
         rng: Its source of randomness.
         plan: Floor plan, with what is taken.
-        palette: Its colours.
+        palette: Its colors.
         items: Class name of every item.
         parts: Parts of all items.
         lights: Lamps and windows that shine.

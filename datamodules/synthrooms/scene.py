@@ -17,26 +17,28 @@ _HEIGHTS = (2.5, 3.3)
 _L_SHAPED = 0.35
 
 
-class _RoomType(NamedTuple):
+class RoomType(NamedTuple):
+    """Share of rooms, and limits of the long and the short side in meters."""
+
     share: float
     long: tuple[float, float]
     short: tuple[float, float]
 
 
 ROOM_TYPES = {
-    "office": _RoomType(0.36, (4.0, 6.0), (3.4, 5.0)),
-    "hallway": _RoomType(0.1, (6.0, 8.5), (2.7, 3.4)),
-    "conferenceRoom": _RoomType(0.12, (5.0, 7.0), (4.0, 5.5)),
-    "lounge": _RoomType(0.09, (4.5, 6.5), (4.0, 5.5)),
-    "storage": _RoomType(0.06, (3.6, 5.0), (3.2, 4.2)),
-    "WC": _RoomType(0.04, (3.4, 4.6), (3.0, 3.8)),
-    "copyRoom": _RoomType(0.05, (3.8, 5.0), (3.2, 4.4)),
-    "lobby": _RoomType(0.06, (5.5, 7.5), (4.5, 6.0)),
-    "pantry": _RoomType(0.05, (3.8, 5.2), (3.2, 4.4)),
-    "openspace": _RoomType(0.04, (6.0, 8.0), (5.0, 6.5)),
-    "auditorium": _RoomType(0.03, (6.5, 8.5), (5.5, 7.0)),
+    "office": RoomType(0.36, (4.0, 6.0), (3.4, 5.0)),
+    "hallway": RoomType(0.1, (6.0, 8.5), (2.7, 3.4)),
+    "conferenceRoom": RoomType(0.12, (5.0, 7.0), (4.0, 5.5)),
+    "lounge": RoomType(0.09, (4.5, 6.5), (4.0, 5.5)),
+    "storage": RoomType(0.06, (3.6, 5.0), (3.2, 4.2)),
+    "WC": RoomType(0.04, (3.4, 4.6), (3.0, 3.8)),
+    "copyRoom": RoomType(0.05, (3.8, 5.0), (3.2, 4.4)),
+    "lobby": RoomType(0.06, (5.5, 7.5), (4.5, 6.0)),
+    "pantry": RoomType(0.05, (3.8, 5.2), (3.2, 4.4)),
+    "openspace": RoomType(0.04, (6.0, 8.0), (5.0, 6.5)),
+    "auditorium": RoomType(0.03, (6.5, 8.5), (5.5, 7.0)),
 }
-"""The real set's room types: share of rooms, limits of the long and the short side in metres."""
+"""Room types of Stanford2D3DS."""
 
 _PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
     (structure.add_column, 0.75, 1, 2),
@@ -88,7 +90,7 @@ def furnish(rng: np.random.Generator, room_type: str) -> Room:
     return room
 
 
-def _draw_plan(rng: np.random.Generator, kind: _RoomType) -> FloorPlan:
+def _draw_plan(rng: np.random.Generator, kind: RoomType) -> FloorPlan:
     long, short = rng.uniform(*kind.long), rng.uniform(*kind.short)
     size = (long, short, rng.uniform(*_HEIGHTS))
     if rng.random() >= _L_SHAPED or short < 3.2:

@@ -55,7 +55,7 @@ def _add_slab(item: Item, area: Rectangle, material: Material, z: float) -> None
 
 
 def add_walls(room: Room) -> Material:
-    """Add every wall as an item: plain, with a coloured lower part, or with a skirting board.
+    """Add every wall as an item: plain, with a colored lower part, or with a skirting board.
 
     Returns:
         The material that most walls share.
@@ -126,7 +126,7 @@ def add_beams(room: Room) -> None:
 
 
 def _clear_length(room: Room, place: float, wide: float, along_x: bool) -> float:
-    """Metres from the wall at 0 to the wall opposite, where a beam would run."""
+    """Meters from the wall at 0 to the wall opposite, where a beam would run."""
     plan = room.plan
     if plan.notch is None:
         return plan.width if along_x else plan.depth
@@ -136,7 +136,7 @@ def _clear_length(room: Room, place: float, wide: float, along_x: bool) -> float
 
 
 _SKY = ((0.5, 0.65), (0.05, 0.4), (0.8, 1.0))
-_LIT_SIDE = 0.16  # metres in front of the glass, past frame and sill
+_LIT_SIDE = 0.16  # meters in front of the glass, past frame and sill
 
 
 def _add_frame(item: Item, material: Material, wide: float, bottom: float, top: float) -> None:

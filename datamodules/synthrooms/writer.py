@@ -17,9 +17,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import PanoramaView, Pose, View, euler_angles
+from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
+from datamodules.synthrooms.camera import PerspectiveView, Pose, View, euler_angles
 from datamodules.synthrooms.render import MISSING, Picture
-from datamodules.synthrooms.room import UNKNOWN
 
 PANORAMA = "equirectangular"
 """Frame of panoramas in file names and poses."""
@@ -27,29 +27,13 @@ PANORAMA = "equirectangular"
 SUFFIXES = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
 """Files of every picture by kind."""
 
-INSTANCES = {
-    "beam": 8,
-    "board": 4,
-    "bookcase": 4,
-    "ceiling": 1,
-    "chair": 24,
-    "clutter": 40,
-    "column": 4,
-    "door": 4,
-    "floor": 1,
-    "sofa": 4,
-    "table": 8,
-    "wall": 8,
-    "window": 4,
-}
-"""The classes, and how many of each a room has in the label table whether it uses them or not.
+INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
+"""Number of entries for a class that each room has in the label table, used or not.
 
-So every room knows its indices without the other rooms. Further instances share the last number.
+The indices of a room thus do not depend on other rooms. Further instances share the last entry.
 """
 
-_MISSING_LABEL = 0x0D0D0D
-_MISSING_DEPTH = 65535
-_DEPTH_UNITS = 512  # per metre
+_DEPTH_UNITS = 512  # per meter
 _NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
 _PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
@@ -98,7 +82,7 @@ def camera_identifier(seed: int, area: str, room: str, number: int) -> str:
 
 def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
     """The label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
-    labels = [f"{UNKNOWN}_0_{UNKNOWN}_0_0"]
+    labels = [f"{UNKNOWN_CLASS}_0_{UNKNOWN_CLASS}_0_0"]
     for room in rooms:
         labels += [
             f"{name}_{instance}_{room.name}_{room.area[0]}"
@@ -115,7 +99,7 @@ def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
     seen = dict.fromkeys(INSTANCES, 0)
     indices = np.zeros(len(items), np.uint32)
     for k, name in enumerate(items):
-        if name != UNKNOWN:
+        if name != UNKNOWN_CLASS:
             indices[k] = starts[name] + min(seen[name], INSTANCES[name] - 1)
             seen[name] += 1
     return indices
@@ -133,12 +117,12 @@ def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, by
         ``semantic`` (24-bit index R·65536 + G·256 + B, #0D0D0D missing).
     """
     missing = picture.items == MISSING
-    index = np.where(missing, _MISSING_LABEL, labels[picture.items])
+    index = np.where(missing, MISSING_LABEL, labels[picture.items])
     blue_first = np.stack([index, index >> 8, index >> 16], axis=-1) & 0xFF
-    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=_MISSING_DEPTH)
+    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=MISSING_DEPTH)
     return {
         "rgb": _encode_png(picture.rgb[..., ::-1]),
-        "depth": _encode_png(np.clip(depth + 0.5, 0, _MISSING_DEPTH).astype(np.uint16)),
+        "depth": _encode_png(np.clip(depth + 0.5, 0, MISSING_DEPTH).astype(np.uint16)),
         "semantic": _encode_png(blue_first.astype(np.uint8)),
     }
 
@@ -164,15 +148,14 @@ def pose_record(
         original: Pose of the panorama of the same camera.
     """
     pose = view.pose
-    if isinstance(view, PanoramaView):
-        fov, size = math.pi / 2, view.height
-    else:
-        fov, size = view.fov_rad, view.size
-    focal = size / (2 * math.tan(fov / 2))
+    image = view
+    if not isinstance(image, PerspectiveView):
+        image = PerspectiveView(pose, image.height, math.pi / 2)
+    focal, center = image.size / (2 * math.tan(image.fov_rad / 2)), image.size / 2
     turn = pose.world_from_camera @ original.world_from_camera.T
     return {
-        "camera_k_matrix": [[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]],
-        "field_of_view_rads": fov,
+        "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
+        "field_of_view_rads": image.fov_rad,
         "camera_original_rotation": original.euler_angles.tolist(),
         "rotation_from_original_to_point": euler_angles(turn).tolist(),
         "point_uuid": camera,

@@ -23,7 +23,7 @@ class SynthShapes(ModelNet40):
         SettingError: A setting is invalid.
     """
 
-    is_made = True
+    is_generated = True
 
     shapes: ShapeSettings | Mapping[str, int] | None = None
 

@@ -1,6 +1,6 @@
 """Shapes composed of trimesh's primitives, like models of catalogues: open, overlapping, uneven.
 
-Everything is in metres, z up, and stands on z = 0; the front of an object faces +x.
+Everything is in meters, z up, and stands on z = 0; the front of an object faces +x.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Parts:
         return util.concatenate(self._pieces)
 
     def box(self, center: Point, size: Point, rotation: Any = None) -> None:
-        """A box, rotated (3×3) about its centre."""
+        """A box, rotated (3×3) about its center."""
         self._add(creation.box(size), center, rotation)
 
     def rod(self, start: Point, end: Point, radius: float) -> None:

@@ -3,7 +3,7 @@
 Read is its ``merger``: floors, in them complete rooms, in them the parts of rooms that annotators
 drew, in them panoramas. Lengths are in heights of the camera. A place x of a panorama is at
 ``scale · R(rotation) x + translation`` of its floor, in units of ``scale_meters_per_coordinate``
-metres; that is null where the length of a unit is not known.
+meters; that is null where the length of a unit is not known.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class HomePanorama:
         file: ``zind_data.json``.
         path: Names of floor, complete room, partial room and panorama.
         record: What the file says of it.
-        unit_m: Metres in a unit of the floor; None where unknown.
+        unit_m: Meters in a unit of the floor; None where unknown.
     """
 
     file: Path
@@ -115,7 +115,7 @@ class HomePanorama:
         return Layout(vertices, -camera, ceiling - camera, fixtures)
 
     def pose(self) -> tuple[PanoramaPose, float]:
-        """Place and orientation on its floor, whose height is 0, and metres in a camera height.
+        """Place and orientation on its floor, whose height is 0, and meters in a camera height.
 
         Raises:
             DataError: The file does not say.

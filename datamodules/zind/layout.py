@@ -3,7 +3,7 @@
 Walls stand upright on a polygon around the camera, floor and ceiling are level, and doors, windows
 and openings are rectangles on the walls. A column of a panorama is a vertical plane: it shows the
 nearest wall in its direction, and the height at which a row meets that wall decides between floor,
-wall and ceiling. Only the centres of pixels are rounded to.
+wall and ceiling. Only the centers of pixels are rounded to.
 
 The frame is ZInD's, as overlays on the pictures show: x to the left, y to the middle column, z up,
 the camera in the origin.

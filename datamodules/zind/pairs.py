@@ -20,7 +20,7 @@ from tangent_train.errors import DataError
 class ZindPairs(PanoramaPairs):
     """Any two panoramas of a complete room whose cameras are inside.
 
-    On floors whose unit is not known in metres there are no pairs. Distances are those of floor,
+    On floors whose unit is not known in meters there are no pairs. Distances are those of floor,
     walls and ceiling of the layout; through doors, windows and openings they are unknown.
 
     Args:

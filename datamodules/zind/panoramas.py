@@ -25,7 +25,7 @@ label  class   of the layout
 5      window  also what is seen through it
 ====== ======= ====================================================================================
 
-Licence: ZInD terms of use, for academic, non-commercial research:
+License: ZInD terms of use, for academic, non-commercial research:
 https://bridgedataoutput.com/zillowterms.
 
 Citation: S. Cruz, W. Hutchcroft, Y. Li, N. Khosravan, I. Boyadzhiev, S. B. Kang: "Zillow Indoor
@@ -80,7 +80,7 @@ class ZindReader(ImageReader):
         return read_image_size(path) if part == "rgb" else None
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours."""
+        """Colors."""
         return read_rgb(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:

@@ -30,7 +30,7 @@ class ValidationPictures(Callback):
     """
 
     def __init__(self, count: int = 4) -> None:
-        self.count = at_least("tensorboard_images", count, 0)
+        self.count = at_least("validation_images", count, 0)
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,

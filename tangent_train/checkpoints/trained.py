@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, replace
+from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -55,8 +56,7 @@ class TrainedNetwork:
     """A trained network with everything needed to use it.
 
     Attributes:
-        network: In evaluation mode; ``(B, C, h, w)`` float32, normalized, to the scores of K
-            classes ``(B, K, h, w)``, and perhaps of nothing, see `groups`.
+        inner: The network as it was trained or imported, in evaluation mode; see `network`.
         class_names: K + 1 names of the labels, the unknown class first; score k is that of label
             k + 1.
         inputs: Its inputs, see `datamodules.core.inputs.Input`.
@@ -67,15 +67,15 @@ class TrainedNetwork:
         size_multiple: Height and width of its images must be multiples of this.
         fixed_size: The only rows and columns it takes, into which larger images are divided; None
             where it takes others.
-        groups: Scores of a photo network that make up every class, and in a last group those that
-            mean nothing: where they win, the label is 0. None where every score is a class.
-        score_kind: Output of the network inside `network`.
+        groups: Scores of a photo network that make up every class, and in a last group those of no
+            class: where they win, the label is 0. None where every score is a class.
+        score_kind: Output of `inner`.
         settings: The section of the config that makes it, complete; None where only the computation
             is known (ONNX).
         source: The file that `representation` and `settings` come from.
     """
 
-    network: ClassScoreNetwork
+    inner: nn.Module
     class_names: tuple[str, ...]
     inputs: tuple[Input, ...]
     normalization: Normalization
@@ -89,13 +89,23 @@ class TrainedNetwork:
     settings: Mapping[str, Any] | None = None
     source: SettingsFile | None = None
 
+    @cached_property
+    def network(self) -> ClassScoreNetwork:
+        """Scores of K classes ``(B, K, h, w)``, and perhaps of none, see `groups`.
+
+        Images are ``(B, C, h, w)`` float32, normalized.
+        """
+        count = len(self.class_names) - 1
+        how = self.groups, self.fixed_size, self.score_kind
+        return ClassScoreNetwork(self.inner, count, *how).eval()
+
     @property
     def in_channels(self) -> int:
         """Channels of its images."""
         return len(channel_names(self.inputs))
 
     def labels(self, best: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
-        """Labels 1 … K of the best scores 0 … K - 1, and 0 where nothing won, or was certain."""
+        """Labels 1 … K of the best scores 0 … K - 1, and 0 where no class won, or was certain."""
         labels = best + best.dtype.type(1)
         labels[labels >= len(self.class_names)] = 0
         return labels
@@ -176,21 +186,11 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
         DataError: There is no such file, it holds something else, it names other code, its network
             cannot be made, or a package to read it is missing.
     """
-    source = SettingsFile(path, trust)
+    suffix, source = path.suffix.lower(), SettingsFile(path, trust)
     try:
-        if path.suffix.lower() == ".onnx":
-            network = OnnxNetwork(path)
-            described = _described(path, network.metadata.get(METADATA_KEY))
-            _check_tensors(path, network.metadata, network.checksum)
-            return _trained(described | {"settings": None}, network, source)
-        if path.suffix.lower() == ".safetensors":
-            with _safetensors(path) as file:
-                metadata = file.metadata() or {}
-                described = _described(path, metadata.get(METADATA_KEY))
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            _check_tensors(path, metadata, tensor_checksum(tensors))
-            return _trained(described, _network(described, tensors, source), source)
-        return _from_checkpoint(source)
+        if suffix == ".onnx":
+            return _from_onnx(source)
+        return _from_safetensors(source) if suffix == ".safetensors" else _from_checkpoint(source)
     except DataError:
         raise
     except SettingError as error:
@@ -208,10 +208,10 @@ def describe_network(path: Path) -> NetworkDescription | None:
     """
     if path.suffix.lower() == ".safetensors":
         with _safetensors(path) as file:
-            text = (file.metadata() or {}).get(METADATA_KEY)
-        if text is None:
+            metadata = file.metadata() or {}
+        if METADATA_KEY not in metadata:
             return None
-        content = _described(path, text)
+        content = _described(path, metadata)
     else:
         names = ("class_names", "config", "groups", "inputs", "normalization", "score_kind")
         plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True, whole=False)
@@ -241,37 +241,36 @@ def _for_any_data(section: Any) -> Any:
     }
 
 
-def metadata_json(trained: TrainedNetwork) -> str:
-    """Metadata of a network, as JSON.
+def metadata_of(trained: TrainedNetwork) -> dict[str, Any]:
+    """Metadata of a network, plain values.
 
-    The fields of `TrainedNetwork`, but ``network`` and ``source``, under their names;
+    The fields of `TrainedNetwork`, except for ``inner`` and ``source``, under their names;
     ``normalization`` with ``mean`` and ``std``; ``tangent_train_version``.
     """
-    content = {f.name: getattr(trained, f.name) for f in fields(trained) if f.name in _KINDS}
-    mean, std = trained.normalization.mean, trained.normalization.std
-    content["normalization"] = {"mean": mean, "std": std}
-    return json.dumps(content | {"tangent_train_version": version("tangent-train")})
+    content = {name: getattr(trained, name) for name in _KINDS}
+    content["normalization"] = asdict(trained.normalization)
+    return content | {"tangent_train_version": version("tangent-train")}
 
 
 def _check_tensors(path: Path, metadata: Mapping[str, str], checksum: str) -> None:
-    """Refuse other tensors than those that were written; other programs write no checksum."""
+    """Refuse other tensors than the written ones; other programs write no checksum."""
     check_sum(path, metadata.get(CHECKSUM_KEY, checksum) == checksum)
 
 
-def write_metadata(source: Path, path: Path, text: str) -> None:
-    """Write an ONNX file with our metadata among its own, and the checksum of its tensors.
+def write_metadata(source: Path, path: Path, trained: TrainedNetwork) -> None:
+    """Write an ONNX file with the metadata of a network, and the checksum of its tensors.
 
     Args:
         source: An ONNX file without external tensors.
         path: The file to write.
-        text: See `metadata_json`.
+        trained: The network that it computes.
     """
     import onnx
 
     graph = onnx.load(source, format="protobuf")
     entries = {entry.key: entry.value for entry in graph.metadata_props}
-    ours = {METADATA_KEY: text, CHECKSUM_KEY: graph_checksum(graph)}
-    onnx.helper.set_model_props(graph, entries | ours)  # in place of those that were there
+    entries |= {METADATA_KEY: json.dumps(metadata_of(trained)), CHECKSUM_KEY: graph_checksum(graph)}
+    onnx.helper.set_model_props(graph, entries)
     onnx.save(graph, path, format="protobuf")
 
 
@@ -281,8 +280,24 @@ def tensor_checksum(tensors: Mapping[str, Tensor]) -> str:
     return crc32_of(tensor.numpy().data for tensor in ordered)
 
 
+def _from_onnx(source: SettingsFile) -> TrainedNetwork:
+    network = OnnxNetwork(source.path)
+    described = _described(source.path, network.metadata) | {"settings": None}
+    _check_tensors(source.path, network.metadata, network.checksum)
+    return _trained(described, network, source)
+
+
+def _from_safetensors(source: SettingsFile) -> TrainedNetwork:
+    with _safetensors(source.path) as file:
+        metadata = file.metadata() or {}
+        described = _described(source.path, metadata)
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    _check_tensors(source.path, metadata, tensor_checksum(tensors))
+    return _trained(described, _network(described, tensors, source), source)
+
+
 def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
-    """A network with the sizes of images it takes, found by trying."""
+    """A network with the sizes of images it takes, found by trial."""
     path = source.path
     content = read_checkpoint(path)
     if content["predicts"] != PIXEL_CLASSES:
@@ -293,28 +308,21 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
             remedy=f"tangent-evaluate checkpoint={path} takes networks of all tasks.",
         )
     kinds = {"network": dict, "representation": dict, "level": int}
-    config = check_fields(path, content["config"], kinds, _TRAINED, "its config")
-    config["settings"] = config.pop("network")
-    names = ("class_names", "inputs", "normalization")
-    described = config | {name: content[name] or [] for name in names}
-    described |= {"groups": content["groups"], "score_kind": content["score_kind"] or "logits"}
+    described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
+    described["settings"] = described.pop("network")
+    names = ("class_names", "inputs", "normalization", "groups", "score_kind", "fixed_size")
+    described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
     tensors = {
         name.removeprefix(_PREFIX): tensor
         for name, tensor in content["state_dict"].items()
         if str(name).startswith(_PREFIX)
     }
-    size = build_from_config(config["representation"], "representation", source).image_size
-    network = _network(described, tensors, source)
-    kind = described["score_kind"]
-    scores = ClassScoreNetwork(
-        network, len(described["class_names"]) - 1, described["groups"], kind=kind
-    )
-    fixed, multiple = content["fixed_size"], None
-    if fixed is None:
-        multiple = size_multiple_of(scores, len(channel_names(described["inputs"])))
-        fixed = None if multiple else size
-    described |= {"image_size": size, "size_multiple": multiple or 1, "fixed_size": fixed}
-    return _trained(described, network, source)
+    trained = _trained(described, _network(described, tensors, source), source)
+    if trained.fixed_size is not None:
+        return trained
+    multiple = size_multiple_of(trained.network, trained.in_channels)
+    fixed = None if multiple else trained.image_size
+    return replace(trained, size_multiple=multiple or 1, fixed_size=fixed)
 
 
 def _network(
@@ -342,40 +350,35 @@ def _network(
 def _trained(
     described: Mapping[str, Any], network: nn.Module, source: SettingsFile
 ) -> TrainedNetwork:
-    build_from_config(
-        described["representation"], "representation", source
-    )  # refused now, not when it is used
-    normalization, fixed = described["normalization"], described["fixed_size"]
-    rows, columns = described["image_size"]
-    names, groups = tuple(described["class_names"]), described["groups"]
-    tile = None if fixed is None else (fixed[0], fixed[1])
-    if tile is not None and min(tile) < 1:
+    # An impossible representation is refused now, not when it is used.
+    representation = build_from_config(described["representation"], "representation", source)
+    rows, columns = described.get("image_size", representation.image_size)
+    normalization, fixed = described["normalization"], described.get("fixed_size")
+    if fixed is not None and min(fixed) < 1:
         raise ValueError(f"fixed_size={fixed}")
     known = {
-        "network": ClassScoreNetwork(
-            network, len(names) - 1, groups, tile, described["score_kind"]
-        ).eval(),
-        "class_names": names,
+        "inner": network,
+        "class_names": tuple(described["class_names"]),
         "inputs": tuple(described["inputs"]),
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),
         "image_size": (rows, columns),
-        "fixed_size": tile,
+        "fixed_size": None if fixed is None else (fixed[0], fixed[1]),
         "source": source,
     }
     return TrainedNetwork(**{**described, **known})
 
 
-def _described(path: Path, text: str | bytes | None) -> dict[str, Any]:
-    """The metadata of a file."""
+def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """The description of a network in the metadata of its file."""
     where = f"'{METADATA_KEY}' of its metadata"
     try:
-        content = parse_json(text or "")
+        content = parse_json(metadata.get(METADATA_KEY, ""))
     except ValueError as error:
         raise DataError(
             path,
             found=f"no JSON in {where} ({error})",
             expected=_EXPORTED,
-            remedy="It says which classes and normalization the network has. tangent-import writes "
+            remedy="It holds the classes and normalization of the network. tangent-import writes "
             "it for a network of another program.",
         ) from error
     return check_fields(path, check_plain(path, content, where), _KINDS, _EXPORTED, where)

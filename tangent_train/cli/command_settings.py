@@ -43,8 +43,8 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
     for prefix, section in (("", config), ("photos.", config.get("photos") or {})):
         data = section.get("data") or {}
         root, mask = Path(str(data.get("root"))), data.get("mask")
-        is_read = datamodules.is_read(str(data.get("_target_")))
-        if f"{prefix}data.root" in typed_names and is_read and not root.is_dir():
+        is_missing = f"{prefix}data.root" in typed_names and not root.is_dir()
+        if is_missing and datamodules.is_read(str(data.get("_target_"))):
             raise DataError(
                 root,
                 found="no such folder",
@@ -185,8 +185,8 @@ class ImportSettings:
 
 
 @dataclass(frozen=True)
-class KeypointsSettings:
-    """Settings of ``configs/keypoints.yaml`` that are neither in `Ways` nor data."""
+class KeypointSettings:
+    """Settings of ``configs/keypoints.yaml``, except for data and fields of `Comparer`."""
 
     output: Path
     left: Path | None = field(metadata=_EXISTS)
@@ -204,7 +204,7 @@ class RunSettings:
     seed: int
     level: int
     panels: int
-    tensorboard_images: int
+    validation_images: int
     checkpoint_every_n_steps: int | None
     ema: float | None
 
@@ -246,7 +246,7 @@ SETTINGS: Mapping[str, type[Any]] = {
     "evaluate": EvaluateSettings,
     "export": ExportSettings,
     "import": ImportSettings,
-    "keypoints": KeypointsSettings,
+    "keypoints": KeypointSettings,
     "predict": PredictSettings,
     "prepare": RunSettings,
     "render": RenderSettings,

@@ -14,7 +14,7 @@ from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
-from tangent_train.cli.command_settings import KeypointsSettings as Settings
+from tangent_train.cli.command_settings import KeypointSettings as Settings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
@@ -22,7 +22,7 @@ from tangent_train.files import read_json, write_bytes
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import colmap
 from tangent_train.registry import build_from_config, check_fields, resolve_target
-from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row, Ways
+from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
 _OF_IMAGES = ("left", "right", "input", "pairing")
@@ -38,22 +38,23 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or invalid.
         DataError: There are no pairs.
     """
-    given, comparer = parse_settings(Settings, config), Comparer(parse_settings(Ways, config))
+    given, comparer = parse_settings(Settings, config), parse_settings(Comparer, config)
     output = given.output
-    colmap()  # pycolmap is missed now rather than after minutes
+    colmap()  # a missing pycolmap is an error now rather than after minutes
     data, pairs = _pairs(config)
-    deciding = {"export": given.export} | {field.name: config[field.name] for field in fields(Ways)}
-    settings = {**deciding, "data": data}
+    names = ("export", *(field.name for field in fields(Comparer)))
+    settings = {name: config[name] for name in names} | {"data": data}
     done = earlier_results(output, settings)
     pairs.make_files()
-    names = pairs.names[: given.max_pairs]
+    pair_names = pairs.names[: given.max_pairs]
 
     def report() -> KeypointReport:
         rows = [row for name in pairs.names for row in done.get(name, ())]
-        return KeypointReport(rows, comparer.ways.representations, settings, pairs.published)
+        return KeypointReport(rows, comparer.representations, settings, pairs.published)
 
-    missing = [(k, name) for k, name in enumerate(names) if name not in done]
-    print_text(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
+    missing = [(k, name) for k, name in enumerate(pair_names) if name not in done]
+    count = len(pair_names)
+    print_text(f"{count - len(missing)} of {count} pairs are done already")
     for index, name in track(missing, "Comparing pairs", disable=not missing):
         try:
             pair = pairs.read(index)
@@ -74,9 +75,8 @@ def keypoints(config: Mapping[str, Any]) -> None:
     print_text(f"Results are in {output}." if done else "There are no results.")
     if given.export:
         print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
-    failed = len(set(names) - set(done))
-    if failed:
-        sys.exit(f"tangent-keypoints: {failed} of {len(names)} pairs could not be used, see above")
+    if failed := len(set(pair_names) - set(done)):
+        sys.exit(f"tangent-keypoints: {failed} of {count} pairs could not be used, see above")
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
@@ -131,20 +131,17 @@ def _export(
     Raises:
         DataError: A file is a part of a panorama.
     """
-    sides = (pair.left.file, pair.right.file)
-    shapes = (read_image_size(sides[0]), read_image_size(sides[1]))
-    for file, shape in zip(sides, shapes, strict=True):
+    images = []
+    for file in (pair.left.file, pair.right.file):
+        shape = read_image_size(file)
         if abs(shape[1] - 2 * shape[0]) > 1:
             found = f"{width_height(shape)}, a part of a panorama"
-            raise DataError(
-                file, found=found, expected="a whole panorama: COLMAP supports no partial ones"
-            )
-    root = _root(files)
-    names = tuple(file.absolute().relative_to(root).as_posix() for file in sides)
-    for name, found_ in comparison.found[AS_GIVEN].items():
+            raise DataError(file, found=found, expected="a whole panorama: COLMAP has no partial")
+        images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
+    for name, matched in comparison.found[AS_GIVEN].items():
         path = folder / file_name(name) / "database.db"
-        both = (found_.left, found_.right)
-        add_pair(path, (names[0], names[1]), shapes, both, found_.matches, found_.geometry)
+        keypoints = (matched.left, matched.right)
+        add_pair(path, images, keypoints, matched.matches, matched.geometry)
 
 
 def _root(files: Sequence[Path]) -> Path:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,22 +12,19 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.command_settings import ClassMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
+from tangent_train.cli.trainer import build_trainer
 from tangent_train.cli.trials import try_network, try_training
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
@@ -106,32 +102,15 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        kept = {"config": self.settings, **inputs_and_classes(self.data)}
-        common = [
-            CheckpointContents({"predicts": self.task.predicts, **kept}),
-            ProgressBar(),
-            ClassScores(),
-            PredictionPanels(self.folder / "panels", self.settings["panels"]),
-            ValidationPictures(self.settings["tensorboard_images"]),
-        ]
-        section = self.settings["trainer"]
-        # Devices found, advertisements, what the settings say anyway.
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
-        if epochs not in (None, -1):
-            at_least("trainer.max_epochs", epochs, 1)
-        return build_from_config(
-            section,
-            "trainer",
-            self.source,
-            # A run shorter than that is validated at its end.
-            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
-            default_root_dir=str(self.folder),
-            callbacks=[*callbacks, *common],
-            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
-            plugins=[AtomicCheckpointIO()],
-            # The data module's samplers count every image once on any number of processes.
-            use_distributed_sampler=False,
+        # Checkpoints are passed on; settings of a logger may hold the address of a server.
+        config = {name: value for name, value in self.settings.items() if name != "logger"}
+        contents = {
+            "predicts": self.task.predicts,
+            "config": config,
+            **inputs_and_classes(self.data),
+        }
+        return build_trainer(
+            self.settings, self.folder, self.task, contents, callbacks, self.source
         )
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
@@ -161,7 +140,7 @@ class Run:
         data = self.data
         network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
         return TrainedNetwork(
-            network=network,
+            inner=self.task.network,
             class_names=data.class_names,
             inputs=data.inputs,
             normalization=data.normalization,

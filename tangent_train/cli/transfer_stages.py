@@ -140,7 +140,7 @@ class _Planner:
             tuned["scheduler"] = tuned["fine_tuning"]["scheduler"]
             tuned["trainer"]["max_epochs"] = epochs
             # Other crops than those of P's first epochs.
-            tuned["photos"]["data"]["stream"] = 1
+            tuned["photos"]["data"]["sampling_seed"] = 1
             for on in "PS":
                 yield self._stage(f"{on}-FT-{epochs}", tuned, "train")
 

@@ -3,13 +3,13 @@
 Convention, stated here once and used everywhere:
 
 * **Directions** are unit vectors ``x = cos φ cos λ, y = cos φ sin λ, z = sin φ`` with latitude φ
-  growing upwards and longitude λ growing to the right, as seen from the centre: x looks at the
-  middle of the panorama, y to the right, z up. Seen as a place in a room this frame is mirrored (a
-  right-handed room has y to the left): `FLIP_Y` changes between the two.
-* **Equirectangular (ERP) pixels** have integer centres ``(u, v)``, u to the right, v down:
+  growing upwards and longitude λ growing to the right, as seen from the center: x points to the
+  middle of the panorama, y to the right, z up. In a right-handed room this frame is mirrored (y is
+  to the left there): `FLIP_Y` changes between the two.
+* **Equirectangular (ERP) pixels** have integer centers ``(u, v)``, u to the right, v down:
   ``λ = (u + ½) / W · 2π − π``, ``φ = π/2 − (v + ½) / H · π``. Longitude wraps for every
   interpolation, nearest included; beyond a pole the row reflects with a half-turn in longitude.
-* **Camera axes** are x right, y down, z forward. **Image pixels** have integer centres, so that a
+* **Camera axes** are x right, y down, z forward. **Image pixels** have integer centers, so that a
   camera matrix maps the pixel in row i, column j to (j, i).
 * Angles are in radians unless a name says ``deg``.
 """
@@ -17,7 +17,6 @@ Convention, stated here once and used everywhere:
 from tangent_train.geometry.camera import (
     camera_matrix_from_fov,
     is_camera_matrix,
-    normalize_camera,
     perspective_directions,
     shift_range,
 )
@@ -26,6 +25,7 @@ from tangent_train.geometry.equirect import (
     equirect_directions,
     equirect_elevations,
     equirect_latitudes,
+    equirect_longitudes,
     equirect_shape,
     equirect_solid_angles,
     equirect_to_lonlat,
@@ -57,6 +57,7 @@ __all__ = [
     "equirect_directions",
     "equirect_elevations",
     "equirect_latitudes",
+    "equirect_longitudes",
     "equirect_shape",
     "equirect_solid_angles",
     "equirect_to_lonlat",
@@ -65,7 +66,6 @@ __all__ = [
     "lonlat_to_equirect",
     "lonlat_to_xyz",
     "nearest_level",
-    "normalize_camera",
     "perspective_directions",
     "random_rotation",
     "rotation_about",

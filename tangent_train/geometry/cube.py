@@ -1,4 +1,4 @@
-"""The six images of a cube map, a baseline beside tangent images."""
+"""Cube maps: six images, a baseline beside tangent images."""
 
 from __future__ import annotations
 
@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import at_least
 from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import checked_rotation
 
 _X, _Y, _Z = np.eye(3)
 
@@ -33,18 +32,19 @@ _NEIGHBORS.setflags(write=False)
 
 @dataclass(frozen=True, eq=False, init=False)
 class CubeGrid(PinholeGrid):
-    """The six faces of a cube around the centre, pinhole images of 90°, or more with a margin.
+    """The six faces of a cube around the center, pinhole images of 90°, or more with a margin.
 
-    In this order: front (+x, the middle of the panorama), right (+y), back (−x), left (−y), up (+z)
-    and down (−z). The first four stand upright. Up and down are the front camera tilted up and
-    down: columns grow to +y in both, rows towards the front (+x) in up and towards the back (−x) in
-    down, so that up fits above and down below the front, as in a cross of unfolded faces.
+    The faces are in this order: front (+x, the middle of the panorama), right (+y), back (−x),
+    left (−y), up (+z) and down (−z). The first four stand upright. Up and down are the front
+    camera tilted up and down: columns grow to +y in both, rows towards the front (+x) in up and
+    towards the back (−x) in down, so that up fits above and down below the front, as in a cross of
+    unfolded faces.
 
-    The outer *edges* of the outermost pixels meet those of the neighbours: d pixels span the 90°,
-    the pitch is ``p = 2/d`` and the outermost pixel centres are half a pixel inside. The images do
-    not overlap; what a face owns reaches half a pixel beyond its outermost pixel centres. With a
+    The outer *edges* of neighboring images meet: d pixels span the 90°, the pitch is ``p = 2/d``
+    and the outermost pixel centers are half a pixel inside. The images do not overlap; the
+    directions that a face owns reach half a pixel beyond its outermost pixel centers. With a
     margin m on every side, d − 2m pixels span the 90°, and the images overlap.
-    `fov_deg`, between pixel centres as everywhere, is a little less than the 70.5° between adjacent
+    `fov_deg`, between pixel centers as everywhere, is a little less than the 70.5° between adjacent
     corners of the cube.
 
     Args:
@@ -53,7 +53,7 @@ class CubeGrid(PinholeGrid):
         margin: Pixels beyond the 90° on every side.
 
     Raises:
-        SettingError: The side is too small or no whole number, or the rotation is none.
+        SettingError: The side is too small or not an integer, or the rotation is not a rotation.
 
     >>> grid = CubeGrid(dim=32)
     >>> grid.num_images, grid.pitch, grid.half_extent
@@ -64,29 +64,18 @@ class CubeGrid(PinholeGrid):
     rotation: NDArray[np.float64] | None
 
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
-        across = _whole("dim", dim, 2 + 2 * _whole("margin", margin, 0)) - 2 * margin
-        turn = None if rotation is None else checked_rotation(rotation)
-        for name, value in {"dim": int(dim), "pitch": 2 / across, "rotation": turn}.items():
-            object.__setattr__(self, name, value)
+        across = at_least("dim", dim, 2 + 2 * at_least("margin", margin, 0)) - 2 * margin
+        self._set(rotation, dim=dim, pitch=2 / across)
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one.
-
-        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
-        """
+        """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one."""
         return _NEIGHBORS
 
     @property
     def overlapping(self) -> bool:
-        """Whether there is a margin; else neighbours meet at their outer edges."""
+        """True if there is a margin; else neighbors meet at their outer edges."""
         return self.dim * self.pitch > 2
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _AXES
-
-
-def _whole(name: str, value: int, least: int) -> int:
-    if not isinstance(value, int | np.integer) or value < least:
-        raise SettingError(name, found=value, expected=f"a whole number, {least} or more")
-    return int(value)

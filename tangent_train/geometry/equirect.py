@@ -12,7 +12,7 @@ from tangent_train.geometry.sphere import lonlat_to_xyz
 
 
 def equirect_shape(level: int) -> tuple[int, int]:
-    """Rows and columns of the panorama that matches a level-s icosahedron.
+    """Return rows and columns of the panorama that matches a level-s icosahedron.
 
     Args:
         level: Level s, 0 or more.
@@ -32,9 +32,9 @@ def equirect_shape(level: int) -> tuple[int, int]:
 
 
 def nearest_level(height: int) -> int:
-    """The level s whose panoramas, of 2^(s+1) rows, are nearest in size.
+    """Return the level s whose panoramas, of 2^(s+1) rows, are nearest in size.
 
-    Nearest in ratio: 724 rows are nearer to 512 than to 1024, 725 nearer to 1024.
+    Sizes are compared by their ratio: 724 rows are nearer to 512 than to 1024, 725 to 1024.
 
     Args:
         height: Rows of the panorama, 2 or more.
@@ -51,10 +51,10 @@ def nearest_level(height: int) -> int:
 
 
 def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Longitude and latitude of ERP pixel positions.
+    """Return longitude and latitude of ERP pixel positions.
 
     Args:
-        pixels_xy: ``(..., 2)`` column u and row v; pixel centres are integers.
+        pixels_xy: ``(..., 2)`` column u and row v; pixel centers are integers.
         shape: ``(H, W)`` of the panorama.
 
     Returns:
@@ -67,7 +67,7 @@ def equirect_to_lonlat(pixels_xy: ArrayLike, shape: tuple[int, int]) -> NDArray[
 
 
 def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """ERP pixel positions of longitudes and latitudes; inverse of `equirect_to_lonlat`.
+    """Return ERP pixel positions of longitudes and latitudes; inverse of `equirect_to_lonlat`.
 
     Args:
         lonlat_rad: ``(..., 2)`` radians, longitude in [−π, π].
@@ -82,20 +82,34 @@ def lonlat_to_equirect(lonlat_rad: ArrayLike, shape: tuple[int, int]) -> NDArray
     return np.stack([u, (np.pi / 2 - lat) / np.pi * height - 0.5], axis=-1)
 
 
-def equirect_latitudes(height: int) -> NDArray[np.float64]:
-    """Latitude of every row's centre.
+def equirect_latitudes(height: int, shift: float = 0.0) -> NDArray[np.float64]:
+    """Return the latitude of every row, from north to south.
 
     Args:
         height: Rows H.
+        shift: Pixels down from the center of a row.
 
     Returns:
-        ``(H,)`` radians, from north to south.
+        ``(H,)`` radians.
     """
-    return np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    return np.pi / 2 - (np.arange(height) + shift + 0.5) / height * np.pi
+
+
+def equirect_longitudes(width: int, shift: float = 0.0) -> NDArray[np.float64]:
+    """Return the longitude of every column, from west to east.
+
+    Args:
+        width: Columns W.
+        shift: Pixels to the right from the center of a column.
+
+    Returns:
+        ``(W,)`` radians.
+    """
+    return (np.arange(width) + shift + 0.5) / width * 2 * np.pi - np.pi
 
 
 def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Direction of every ERP pixel centre.
+    """Return the direction of every ERP pixel center.
 
     Args:
         shape: ``(H, W)``.
@@ -103,19 +117,18 @@ def equirect_directions(shape: tuple[int, int]) -> NDArray[np.float64]:
     Returns:
         ``(H, W, 3)`` unit vectors.
     """
-    height, width = shape
-    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    return lonlat_to_xyz(np.stack(np.meshgrid(lon, equirect_latitudes(height)), axis=-1))
+    angles = np.meshgrid(equirect_longitudes(shape[1]), equirect_latitudes(shape[0]))
+    return lonlat_to_xyz(np.stack(angles, axis=-1))
 
 
 def equirect_elevations(
     shape: tuple[int, int], up_xyz: ArrayLike = (0.0, 0.0, 1.0)
 ) -> NDArray[np.float32]:
-    """Sine of the elevation angle of every ERP pixel.
+    """Return the sine of the elevation angle of every ERP pixel.
 
     Args:
         shape: ``(H, W)``.
-        up_xyz: ``(3,)`` the direction of the zenith, a unit vector.
+        up_xyz: ``(3,)`` direction of the zenith, a unit vector.
 
     Returns:
         ``(H, W)`` from −1, straight down, to 1.
@@ -123,10 +136,8 @@ def equirect_elevations(
     >>> np.degrees(np.arcsin(equirect_elevations((2, 4))[:, 0])).round().tolist()
     [45.0, -45.0]
     """
-    height, width = shape
     up = np.asarray(up_xyz, np.float64)
-    latitudes = equirect_latitudes(height)
-    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
+    latitudes, lon = equirect_latitudes(shape[0]), equirect_longitudes(shape[1])
     across = (np.cos(lon) * up[0] + np.sin(lon) * up[1]).astype(np.float32)
     elevations = np.outer(np.cos(latitudes).astype(np.float32), across)
     elevations += (np.sin(latitudes) * up[2]).astype(np.float32)[:, None]
@@ -134,7 +145,7 @@ def equirect_elevations(
 
 
 def equirect_solid_angles(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Exact solid angle of one pixel of every row: ``2π/W · (sin φ_top − sin φ_bottom)``.
+    """Return the exact solid angle of a pixel of every row: ``2π/W · (sin φ_top − sin φ_bottom)``.
 
     Args:
         shape: ``(H, W)``.

@@ -13,19 +13,18 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
 from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import checked_rotation
 
-_MOST_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take for ever to compute
+_MAX_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take too long to compute
 
 
 class _FaceTable:
-    """Data that depend on the base level alone: centres, axes, neighbours, extent of the cells."""
+    """Data that depend on the base level alone: centers, axes, neighbors, extent of the cells."""
 
     def __init__(self, base_level: int) -> None:
         vertices, self.faces = icosphere(base_level)
         centers = vertices[self.faces].mean(axis=1)
         self.centers_xyz = centers / np.linalg.norm(centers, axis=1, keepdims=True)
-        # No face centre of the unrotated icosahedron is a pole: east is well defined.
+        # No face center of the unrotated icosahedron is a pole: east is well defined.
         east = np.cross([0.0, 0.0, 1.0], self.centers_xyz)
         east /= np.linalg.norm(east, axis=1, keepdims=True)
         south = np.cross(east, self.centers_xyz)
@@ -34,19 +33,19 @@ class _FaceTable:
 
     @cached_property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself."""
+        """See `TangentGrid.neighbors`."""
         around = np.sort(self.faces_of_vertex[self.faces].reshape(len(self.faces), -1), axis=1)
-        own = np.arange(len(self.faces))[:, None]
+        itself = np.arange(len(self.faces))[:, None]
         repeated = np.pad(around[:, 1:] == around[:, :-1], ((0, 0), (1, 0)))
-        around = np.where(repeated, own, around)
-        order = np.argsort(around == own, axis=1, kind="stable")[:, :12]
+        around = np.where(repeated, itself, around)
+        order = np.argsort(around == itself, axis=1, kind="stable")[:, :12]
         return np.take_along_axis(around, order, axis=1).astype(np.int32)
 
     @cached_property
     def owned_extent(self) -> float:
-        """Largest |x| or |y| on its tangent plane of any point a face owns.
+        """Largest |x| or |y| on its tangent plane of the points that a face owns.
 
-        The corners of the owned cells are the points with three nearest face centres; those three
+        The corners of the owned cells are the points with three nearest face centers; these faces
         meet at a vertex of the icosahedron.
         """
         stars = self.faces_of_vertex
@@ -68,7 +67,7 @@ class _FaceTable:
 
 
 def _group(faces: NDArray[np.int64], num_vertices: int) -> NDArray[np.int64]:
-    """``(V, 6)`` faces around every vertex; where there are five, the first stands twice."""
+    """Return the faces around every vertex, ``(V, 6)``; of five, the first one is repeated."""
     corner = np.argsort(faces.ravel(), kind="stable")
     valence = np.bincount(faces.ravel(), minlength=num_vertices)
     start = np.cumsum(valence) - valence
@@ -86,9 +85,9 @@ class TangentGrid(PinholeGrid):
     """N = 20·4^b pinhole images tangent to the faces of a level-b icosahedron.
 
     Pixel (row i, column j) of an image sits on its tangent plane at ``x = (j − (d−1)/2)·p`` to the
-    east and ``y = −(i − (d−1)/2)·p`` to the north of the face's centre, with the pitch
+    east and ``y = −(i − (d−1)/2)·p`` to the north of the face's center, with the pitch
     ``p = R_v(b−1) / 2^(s−b)`` (paper, equations for d and for the tangent bounds): planar gnomonic
-    coordinates. Every direction is *owned* by the face with the nearest centre.
+    coordinates. Every direction is *owned* by the face with the nearest center.
 
     Args:
         base_level: Base level b.
@@ -99,8 +98,8 @@ class TangentGrid(PinholeGrid):
             R·d.
 
     Raises:
-        SettingError: A level is out of range, the rotation is none, or `dim` would leave part of
-            an owned cell uncovered.
+        SettingError: A level is out of range, the rotation is not a rotation, or `dim` would leave
+            part of an owned cell uncovered.
 
     >>> grid = TangentGrid(base_level=1, level=10)
     >>> grid.num_images, grid.dim, round(grid.fov_deg, 4)
@@ -121,45 +120,36 @@ class TangentGrid(PinholeGrid):
     ) -> None:
         if not 0 <= base_level <= level:
             raise SettingError("base_level", found=base_level, expected=f"0 to level = {level}")
-        if level > _MOST_LEVEL:
-            raise SettingError("level", found=level, expected=f"at most {_MOST_LEVEL}")
-        if dim is not None and dim > 2**_MOST_LEVEL:
-            raise SettingError("dim", found=dim, expected=f"at most {2**_MOST_LEVEL}")
-        values = {
-            "base_level": base_level,
-            "level": level,
-            "dim": 2 ** (level - base_level) if dim is None else dim,
-            "pitch": _pitch(base_level, level),
-            "rotation": None if rotation is None else checked_rotation(rotation),
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        if level > _MAX_LEVEL:
+            raise SettingError("level", found=level, expected=f"at most {_MAX_LEVEL}")
+        dim = 2 ** (level - base_level) if dim is None else dim
+        if dim > 2**_MAX_LEVEL:
+            raise SettingError("dim", found=dim, expected=f"at most {2**_MAX_LEVEL}")
+        pitch = _pitch(base_level, level)
+        self._set(rotation, base_level=base_level, level=level, dim=dim, pitch=pitch)
         least = self.least_dim(base_level, level)
-        if self.dim < least:
+        if dim < least:
             raise SettingError(
                 "dim",
-                found=self.dim,
+                found=dim,
                 expected=f"at least {least} at base level {base_level} and level {level}",
                 remedy="Smaller images would leave parts of the sphere uncovered.",
             )
 
     @staticmethod
     def least_dim(base_level: int, level: int) -> int:
-        """The least `dim` whose images cover every owned cell."""
+        """Return the smallest `dim` whose images cover every owned cell."""
         extent = _face_table(base_level).owned_extent
         return math.ceil(2 * extent / _pitch(base_level, level) - 1e-9) + 1
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself.
-
-        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
-        """
+        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself."""
         return _face_table(self.base_level).neighbors
 
     @property
     def overlapping(self) -> bool:
-        """True: even the least images reach half a pixel beyond the owned cells."""
+        """True: even the smallest images reach half a pixel beyond the owned cells."""
         return True
 
     def _resting_axes(self) -> NDArray[np.float64]:

@@ -1,4 +1,4 @@
-"""The icosahedron with vertices at both poles and its Loop subdivisions."""
+"""Icosahedron with vertices at both poles, and its Loop subdivisions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ class Icosphere(NamedTuple):
     """A triangle mesh.
 
     Attributes:
-        vertices: ``(V, 3)`` float64, not normalised: only their directions are meant.
+        vertices: ``(V, 3)`` float64, not normalized: only their directions matter.
         faces: ``(F, 3)`` int64 vertex indices, all of one winding.
     """
 
@@ -26,7 +26,7 @@ class Icosphere(NamedTuple):
 
 
 def _icosahedron() -> Icosphere:
-    """Two poles and two rings of five at latitudes ±atan ½."""
+    """Return two poles and two rings of five vertices at latitudes ±atan ½."""
     lat = np.arctan(0.5)
     lon = 2 * np.pi / 5 * (np.arange(10) % 5 + np.repeat([0.0, 0.5], 5))
     z = np.repeat([np.sin(lat), -np.sin(lat)], 5)
@@ -46,7 +46,7 @@ def _icosahedron() -> Icosphere:
 
 
 def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Undirected edges ``(E, 2)`` and, per face, the edge opposite to each corner ``(F, 3)``."""
+    """Return edges ``(E, 2)`` and, for each face, the edges opposite to its corners ``(F, 3)``."""
     corners = faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)
     edges, inverse = np.unique(np.sort(corners, axis=1), axis=0, return_inverse=True)
     return edges, inverse.reshape(-1, 3)
@@ -76,7 +76,7 @@ def _subdivide(mesh: Icosphere) -> Icosphere:
 
 @lru_cache(maxsize=MAX_LEVEL + 1)
 def icosphere(level: int) -> Icosphere:
-    """The icosahedron after `level` Loop subdivisions, vertices not normalised in between.
+    """Return the icosahedron after `level` Loop subdivisions, not normalized in between.
 
     Args:
         level: Number of subdivisions, 0 to 8.
@@ -100,7 +100,7 @@ def icosphere(level: int) -> Icosphere:
 
 @lru_cache(maxsize=MAX_LEVEL + 2)
 def vertex_resolution(base_level: int) -> float:
-    """Mean over vertices of the mean angle to their neighbours, R_v (paper, section 3.2).
+    """Return R_v: the mean over vertices of the mean angle to their neighbors (section 3.2).
 
     Args:
         base_level: Level b, −1 to 8; R_v(−1) is defined as 2 R_v(0).

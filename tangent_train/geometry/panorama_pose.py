@@ -1,4 +1,4 @@
-"""Pose of a panorama: its position and orientation."""
+"""Poses of panoramas: position and orientation."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from tangent_train.geometry.sphere import checked_rotation
 
 @dataclass(frozen=True, eq=False, init=False)
 class PanoramaPose:
-    """Pose of a panorama in a world of metres.
+    """Pose of a panorama in a world of meters.
 
     The point seen at distance d in direction s of the panorama (`tangent_train.geometry`: x to the
-    middle of the image, y to the right of it, z up) is
+    middle of the image, y to its right, z up) is
     ``location_m + d · world_from_panorama @ s``.
 
     In a right-handed world the matrix reflects, as `FLIP_Y` does: its determinant is −1.
 
     Args:
         world_from_panorama: ``(3, 3)`` orthogonal, of determinant 1 or −1.
-        location_m: ``(3,)`` centre.
+        location_m: ``(3,)`` center.
 
     Raises:
-        SettingError: The matrix is not orthogonal, or the centre is no place.
+        SettingError: The matrix is not orthogonal, or the center is not three finite numbers.
     """
 
     world_from_panorama: NDArray[np.float64]
@@ -41,31 +41,30 @@ class PanoramaPose:
         checked_rotation(-matrix if mirrored else matrix)
         for array in (matrix, location):
             array.setflags(write=False)
-        object.__setattr__(self, "world_from_panorama", matrix)
-        object.__setattr__(self, "location_m", location)
+        vars(self).update(world_from_panorama=matrix, location_m=location)
 
     def points_m(self, directions_xyz: ArrayLike, distance_m: ArrayLike) -> NDArray[np.float64]:
-        """World points ``(…, 3)`` seen in directions ``(…, 3)`` at distances ``(…)``."""
+        """Return world points ``(…, 3)`` in directions ``(…, 3)`` at distances ``(…)``."""
         ahead = np.asarray(directions_xyz, np.float64) @ self.world_from_panorama.T
         return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
 
     def seen(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Project world points ``(…, 3)``: directions ``(…, 3)`` and distances ``(…)`` in metres.
+        """Project world points ``(…, 3)``: directions ``(…, 3)`` and distances ``(…)`` in meters.
 
-        A point at the centre itself has the direction 0.
+        A point at the center itself has the direction 0.
         """
         way = (np.asarray(points_m, np.float64) - self.location_m) @ self.world_from_panorama
         distance = np.linalg.norm(way, axis=-1)
         return way / np.where(distance > 0, distance, 1.0)[..., None], distance
 
     def relative_to(self, other: PanoramaPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Rotation and shift from another panorama to this one: ``x_this = R x_other + t``.
+        """Return rotation and shift from another panorama to this: ``x_this = R x_other + t``.
 
         Args:
             other: Pose in the same world.
 
         Returns:
-            R ``(3, 3)``, a rotation, and t ``(3,)`` in metres: where the other's centre is.
+            R ``(3, 3)``, a rotation, and t ``(3,)`` in meters: the position of the other's center.
 
         Raises:
             SettingError: One of the two mirrors the world and the other does not.
@@ -77,18 +76,4 @@ class PanoramaPose:
                 found="one in a right-handed world and one in a left-handed world",
                 expected="both in the same world",
             )
-        shift_m = (other.location_m - self.location_m) @ self.world_from_panorama
-        return rotation, shift_m
-
-    def moved(self, rotation: ArrayLike, translation_m: ArrayLike) -> PanoramaPose:
-        """The pose whose `relative_to` this one is ``(rotation, translation_m)``.
-
-        Args:
-            rotation: ``(3, 3)`` rotation R from this panorama's coordinates to the new one's.
-            translation_m: ``(3,)`` t of ``x_new = R x_this + t``.
-
-        Raises:
-            SettingError: The matrix is no rotation.
-        """
-        turned = self.world_from_panorama @ checked_rotation(rotation).T
-        return PanoramaPose(turned, self.location_m - turned @ np.asarray(translation_m, float))
+        return rotation, (other.location_m - self.location_m) @ self.world_from_panorama

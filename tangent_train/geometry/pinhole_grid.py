@@ -1,4 +1,4 @@
-"""Square pinhole images around a common centre: the base of tangent images and cube faces."""
+"""Square pinhole images around a common center: the base of tangent images and cube faces."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Faces = Sequence[int] | NDArray[np.integer]
 
 
 class PinholeGrid(ABC):
-    """N square pinhole images of one pitch, which together see every direction.
+    """N square pinhole images of one pitch, which together cover all directions.
 
     Pixel (row i, column j) of an image sits on the plane at distance 1 in front of the camera, at
     ``(j − (d−1)/2)·p`` to the right and ``(i − (d−1)/2)·p`` down. Every direction is *owned* by the
-    image with the nearest centre, which sees it at most half a pixel off its outermost pixel
-    centres.
+    image with the nearest center, where it is at most half a pixel off the outermost pixel
+    centers.
 
     Attributes:
         dim: Side d in pixels.
-        pitch: Distance p of neighbouring pixels on the image plane, in focal lengths.
+        pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
     """
 
@@ -39,39 +39,44 @@ class PinholeGrid(ABC):
     @property
     @abstractmethod
     def neighbors(self) -> NDArray[np.int32]:
-        """``(N, k)`` neighbours of every image, padded with the image itself.
+        """``(N, k)`` neighbors of every image, padded with the image itself.
 
-        Stepping to the neighbour with the nearest centre, again and again, ends at the owner.
+        Repeated steps to the neighbor with the nearest center end at the owner.
         """
 
     @property
     @abstractmethod
     def overlapping(self) -> bool:
-        """Whether every direction is inside an image, not only on its outer edge."""
+        """True if every direction is inside an image, not only on its outer edge."""
 
     @abstractmethod
     def _resting_axes(self) -> NDArray[np.float64]:
         """``(N, 3, 3)`` camera axes before the rotation."""
 
+    def _set(self, rotation: ArrayLike | None, **values: Any) -> None:
+        """Set the attributes of a new grid."""
+        checked = None if rotation is None else checked_rotation(rotation)
+        vars(self).update(values, rotation=checked)
+
     @property
     def num_images(self) -> int:
-        """N."""
+        """Number N of images."""
         return len(self._resting_axes())
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
-        """The same images, rotated by this instead of their own.
+        """Return the same images under another rotation.
 
         Raises:
-            SettingError: The rotation is none.
+            SettingError: The rotation is not a rotation.
         """
-        return self._changed(rotation=None if rotation is None else checked_rotation(rotation))
+        return self._changed(rotation)
 
     def widened(self, margin: int) -> Self:
-        """The same images with more pixels on every side, at the same pitch."""
-        return self._changed(dim=self.dim + 2 * margin)
+        """Return the same images with more pixels on every side, at the same pitch."""
+        return self._changed(self.rotation, dim=self.dim + 2 * margin)
 
     def resized(self, dim: int) -> Self:
-        """The same images at another resolution: their outer edges agree.
+        """Return the same images at another resolution: their outer edges agree.
 
         The output of a network that downsamples or upsamples tangent images lies on such a grid.
 
@@ -83,19 +88,22 @@ class PinholeGrid(ABC):
         """
         if dim < 2:
             raise SettingError("dim", found=dim, expected="2 or more")
-        return self._changed(dim=dim, pitch=self.pitch * self.dim / dim)
+        return self._changed(self.rotation, dim=dim, pitch=self.pitch * self.dim / dim)
 
-    def _changed(self, **values: Any) -> Self:
-        """This grid with other values, and nothing that was computed from its own."""
+    def _changed(self, rotation: ArrayLike | None, **values: Any) -> Self:
+        """Return this grid with other values, without its cached properties."""
         other = object.__new__(type(self))
-        for name, value in (vars(self) | values).items():
-            if not isinstance(getattr(type(self), name, None), cached_property):
-                vars(other)[name] = value
+        kept = {
+            name: value
+            for name, value in vars(self).items()
+            if not isinstance(getattr(type(self), name, None), cached_property)
+        }
+        other._set(**{**kept, "rotation": rotation, **values})
         return other
 
     @property
     def half_extent(self) -> float:
-        """Half extent h = (d−1)/2·p: where the outermost pixel centres are on the image plane."""
+        """Half extent h = (d−1)/2·p: position of the outermost pixel centers on the image plane."""
         return (self.dim - 1) / 2 * self.pitch
 
     @property
@@ -105,13 +113,13 @@ class PinholeGrid(ABC):
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, centre (d−1)/2."""
+        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, center (d−1)/2."""
         center = (self.dim - 1) / 2
         return np.array([[1 / self.pitch, 0, center], [0, 1 / self.pitch, center], [0, 0, 1]])
 
     @cached_property
     def centers_xyz(self) -> NDArray[np.float64]:
-        """``(N, 3)`` directions of the images' centres."""
+        """``(N, 3)`` directions of the images' centers."""
         return self.world_from_camera[..., 2]
 
     @cached_property
@@ -129,10 +137,10 @@ class PinholeGrid(ABC):
         return axes
 
     def directions(self, faces: Faces | None = None) -> NDArray[np.float64]:
-        """Directions of the pixel centres.
+        """Return directions of the pixel centers.
 
         Args:
-            faces: Images to return, default all.
+            faces: Images to return, by default all.
 
         Returns:
             ``(n, d, d, 3)`` unit vectors.
@@ -148,10 +156,10 @@ class PinholeGrid(ABC):
         return np.einsum("nwc,ijc->nijw", axes, rays)
 
     def face_indices(self, faces: Faces | None = None) -> NDArray[np.int64]:
-        """Checked indices of images, default all.
+        """Return checked indices of images, by default of all.
 
         Raises:
-            SettingError: A face is out of range or no whole number.
+            SettingError: A face is out of range or not an integer.
         """
         if faces is None:
             return np.arange(self.num_images)
@@ -163,7 +171,7 @@ class PinholeGrid(ABC):
         return indices.astype(np.int64)
 
     def owners(self, directions_xyz: ArrayLike) -> NDArray[np.int64]:
-        """The face that owns each direction: the one with the nearest centre.
+        """Return the face that owns each direction: the face with the nearest center.
 
         Args:
             directions_xyz: ``(..., 3)`` vectors of any length.
@@ -181,7 +189,7 @@ class PinholeGrid(ABC):
         return owner.reshape(directions.shape[:-1])
 
     def project(self, directions_xyz: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
-        """Pixel positions of directions in given images.
+        """Return pixel positions of directions in given images.
 
         Args:
             directions_xyz: ``(..., 3)`` vectors of any length.

@@ -13,7 +13,7 @@ FLIP_Y.setflags(write=False)
 
 
 def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
-    """Unit vectors of longitudes and latitudes.
+    """Return unit vectors of longitudes and latitudes.
 
     Args:
         lonlat_rad: ``(..., 2)`` longitude λ and latitude φ in radians.
@@ -29,10 +29,10 @@ def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
 
 
 def xyz_to_lonlat(directions_xyz: ArrayLike) -> NDArray[np.float64]:
-    """Longitude in [−π, π] and latitude of directions of any length; inverse of `lonlat_to_xyz`.
+    """Return longitude in [−π, π] and latitude of directions; inverse of `lonlat_to_xyz`.
 
     Args:
-        directions_xyz: ``(..., 3)`` non-zero vectors.
+        directions_xyz: ``(..., 3)`` non-zero vectors of any length.
 
     Returns:
         ``(..., 2)`` radians.
@@ -42,7 +42,7 @@ def xyz_to_lonlat(directions_xyz: ArrayLike) -> NDArray[np.float64]:
 
 
 def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> NDArray[np.float64]:
-    """Rotation by an angle about an axis (Rodrigues' formula).
+    """Return the rotation by an angle about an axis (Rodrigues' formula).
 
     Args:
         axis_xyz: ``(3,)`` axis of any length. About ``(0, 0, 1)`` a positive angle adds to λ.
@@ -57,7 +57,7 @@ def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> NDArray[np.float64]
 
 
 def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation drawn uniformly from SO(3) (a uniform unit quaternion).
+    """Draw a rotation uniformly from SO(3) (a uniform unit quaternion).
 
     Args:
         rng: Source of randomness.
@@ -77,13 +77,13 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 
 
 def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
-    """A read-only copy of a rotation matrix.
+    """Return a read-only copy of a rotation matrix.
 
     Args:
         rotation: ``(3, 3)``.
 
     Raises:
-        SettingError: It is no proper rotation.
+        SettingError: It is not a proper rotation.
     """
     matrix = np.array(rotation, np.float64)
     proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Literal
 
 from datamodules.images.image_files import composed
-from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
@@ -162,16 +161,13 @@ def map_classes(
             expected="unknown: there is no second best class",
         )
     scores = [[k for place in group for k in groups[place]] for group in places.values()]
-    nothing = [k for group in groups[len(own) :] for k in group]
+    unknown = [k for group in groups[len(own) :] for k in group]
     if unmapped == "unknown":
-        nothing += [k for place in left for k in groups[place]]
-    scores += [nothing] if nothing else []
-    how = scores, trained.fixed_size, trained.score_kind
-    network = ClassScoreNetwork(trained.network.network, len(targets), *how).eval()
-    names = ("unknown", *targets)
+        unknown += [k for place in left for k in groups[place]]
+    scores += [unknown] if unknown else []
     found = {str(target): [own[k] for k in group] for target, group in places.items()}
     return MappedNetwork(
-        trained=replace(trained, network=network, class_names=names, groups=scores),
+        trained=replace(trained, class_names=("unknown", *targets), groups=scores),
         classes=found,
         unmapped=[own[k] for k in left],
         unmapped_wins=unmapped == "unknown",

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,11 +17,11 @@ from tangent_train.checkpoints.trained import (
     METADATA_KEY,
     TrainedNetwork,
     load_trained,
-    metadata_json,
+    metadata_of,
     tensor_checksum,
     write_metadata,
 )
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.inference.library_output import hide_output
 
@@ -78,14 +79,13 @@ def export_network(
         sizes.append(trained.image_size)
     failure: Exception | None = None
     for size in sizes:
-        planned = replace(trained, fixed_size=size)
         try:
             with atomic_path(path) as temporary:
                 if suffix == ".onnx":
-                    _write_onnx(planned, temporary, opset)
+                    _write_onnx(trained, size, temporary, opset)
                 else:
-                    _write_safetensors(planned, temporary)
-                return _verified(planned, temporary)
+                    _write_safetensors(trained, temporary)
+                return _verified(trained, size, temporary)
         except (SettingError, OSError):
             raise
         except Exception as error:  # whatever the exporter cannot do with dynamic sizes
@@ -119,16 +119,14 @@ def _check(
         )
 
 
-def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
-    missing = [name for name in ("onnx", "onnxruntime", "onnxscript") if not find_spec(name)]
-    if missing:
-        raise SettingError(
-            f"output={path.suffix}",
-            found=f"no package {missing[0]}",
-            expected="the packages for ONNX",
-            remedy="Run: pip install 'tangent-train[export]'",
-        )
-    step, size = trained.size_multiple, trained.fixed_size
+def _write_onnx(
+    trained: TrainedNetwork, size: tuple[int, int] | None, path: Path, opset: int | None
+) -> None:
+    with of_extra("export", f"output={path.suffix}"):
+        for package in ("onnx", "onnxruntime", "onnxscript"):
+            import_module(package)
+    written_as = replace(trained, fixed_size=size, settings=None)
+    step = trained.size_multiple
     shape: dict[int, Any] = {0: torch.export.Dim("batch")}
     if size is None:
         shape |= {2: step * torch.export.Dim("h"), 3: step * torch.export.Dim("w")}
@@ -137,7 +135,7 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     returns_labels = trained.score_kind == "labels"
     with hide_output():
         program: Any = torch.onnx.export(
-            trained.network.network if returns_labels else trained.network,
+            trained.inner if returns_labels else trained.network,
             (_random_images(trained, 2, size),),
             dynamo=True,
             input_names=["images"],
@@ -149,25 +147,25 @@ def _write_onnx(trained: TrainedNetwork, path: Path, opset: int | None) -> None:
     written = program.model.opset_imports[""]
     if opset not in (None, written):
         raise SettingError("opset", found=opset, expected=f"{written} for this network")
-    written_as = replace(trained, settings=None)  # of labels, which have no probabilities
     if not returns_labels:  # the graph computes the logits and adds them up
         groups = [[k] for k in range(trained.network.num_scores)] if trained.groups else None
         written_as = replace(written_as, groups=groups, score_kind="logits")
     program.save(path, external_data=False)
-    write_metadata(path, path, metadata_json(written_as))
+    write_metadata(path, path, written_as)
 
 
 def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
     # Copies: the format knows neither tensors that share memory nor other memory formats.
-    tensors = trained.network.network.state_dict()
+    tensors = trained.inner.state_dict()
     tensors = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
-    described = {METADATA_KEY: metadata_json(trained), CHECKSUM_KEY: tensor_checksum(tensors)}
-    save_file(tensors, path, metadata={"format": "pt", **described})
+    described = {METADATA_KEY: json.dumps(metadata_of(trained))}
+    described |= {CHECKSUM_KEY: tensor_checksum(tensors), "format": "pt"}
+    save_file(tensors, path, metadata=described)
     path.chmod(0o644)  # it was replaced by one that only its owner may read
 
 
 @torch.no_grad()
-def _verified(trained: TrainedNetwork, path: Path) -> Export:
+def _verified(trained: TrainedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
     """Read the file as a user would and compare."""
     exported = load_trained(path, trained.source.trust if trained.source else ())
     rows, columns = trained.image_size
@@ -175,7 +173,7 @@ def _verified(trained: TrainedNetwork, path: Path) -> Export:
     rows, columns = (max(step, side // step * step) for side in (rows, columns))
     sizes = [(rows, columns), (rows + step, columns + 2 * step)]
     largest = 0.0
-    for size in sizes if trained.fixed_size is None else [trained.fixed_size]:
+    for size in sizes if fixed_size is None else [fixed_size]:
         for count in _BATCHES:
             images = _random_images(trained, count, size)
             expected, found = trained.network(images), exported.network(images)

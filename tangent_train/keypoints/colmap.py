@@ -15,6 +15,7 @@ from tangent_train.geometry import FLIP_Y, PanoramaPose
 from tangent_train.keypoints.two_view import colmap, rigid_matrix
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
     from numpy.typing import NDArray
@@ -26,8 +27,7 @@ if TYPE_CHECKING:
 
 def add_pair(
     path: Path,
-    names: tuple[str, str],
-    shapes: tuple[tuple[int, int], tuple[int, int]],
+    images: Sequence[tuple[str, tuple[int, int]]],
     keypoints: tuple[SphericalKeypoints, SphericalKeypoints],
     matches: NDArray[np.integer],
     geometry: TwoView,
@@ -36,8 +36,8 @@ def add_pair(
 
     Args:
         path: The database; created if it is missing.
-        names: Of the left and the right image, relative to COLMAP's image folder.
-        shapes: ``(H, W)`` of their files.
+        images: Name of the left and of the right image, relative to COLMAP's image folder, and
+            ``(H, W)`` of its file.
         keypoints: Their keypoints, with SIFT's descriptors.
         matches: ``(m, 2)`` indices of keypoints.
         geometry: The geometry of the m matches.
@@ -49,7 +49,7 @@ def add_pair(
     path.parent.mkdir(parents=True, exist_ok=True)
     with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
         left, right = (
-            _image_id(database, *image) for image in zip(names, shapes, keypoints, strict=True)
+            _image_id(database, *image, one) for image, one in zip(images, keypoints, strict=True)
         )
         if database.exists_matches(left, right):
             return

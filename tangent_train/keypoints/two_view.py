@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import of_extra
 from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors, prefers_rotation
 from tangent_train.keypoints.spherical import angles_between
 
@@ -220,15 +220,8 @@ def colmap() -> Any:
     Raises:
         SettingError: It is not installed.
     """
-    try:
+    with of_extra("keypoints", "keypoints"):
         import pycolmap
-    except ImportError as error:
-        raise SettingError(
-            "keypoints",
-            found="no pycolmap",
-            expected="the packages of the extra keypoints",
-            remedy="Run: pip install 'tangent-train[keypoints]'",
-        ) from error
     return pycolmap
 
 

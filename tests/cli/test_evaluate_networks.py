@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.stanford2d3ds.reader import CLASSES
+from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import read_settings
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import ERP, TANGENT, write_checkpoint

@@ -68,7 +68,7 @@ def test_the_stages_in_their_order(rooms: DictConfig) -> None:
         assert config["data"]["_target_"].endswith("Perspective") == photos
         assert config["representation"]["_target_"].endswith("PerspectiveRepresentation") == photos
         assert config["data"]["root"] == "data/rooms_transfer"
-        assert config["data"].get("stream", 0) == ("P-FT" in stage.name), "other crops"
+        assert config["data"].get("sampling_seed", 0) == ("P-FT" in stage.name), "other crops"
 
 
 def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:

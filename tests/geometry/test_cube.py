@@ -79,5 +79,5 @@ def test_a_rotation_replaces_the_grids_own(grid: CubeGrid | TangentGrid) -> None
 
 @pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])
 def test_impossible_sides_are_refused(dim: int) -> None:
-    with pytest.raises(SettingError, match=r"dim: found .*; expected a whole number, 2 or more"):
+    with pytest.raises(SettingError, match=r"dim: found .*; expected an integer of 2 or more"):
         CubeGrid(dim)

@@ -23,7 +23,7 @@ def test_only_the_pixels_are_others(original: PinholeGrid, dim: int) -> None:
     assert grid.dim * grid.pitch == pytest.approx(original.dim * original.pitch, rel=1e-15)
     assert grid.num_images == original.num_images
     assert grid.overlapping is original.overlapping
-    assert grid.rotation is original.rotation
+    np.testing.assert_array_equal(grid.rotation, original.rotation)
     np.testing.assert_array_equal(grid.neighbors, original.neighbors)
     np.testing.assert_array_equal(grid.world_from_camera, original.world_from_camera)
     assert grid.with_rotation(OTHER) == original.with_rotation(OTHER).resized(dim)

@@ -15,10 +15,10 @@ from torch import nn
 from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
-from datamodules.stanford2d3ds.reader import CLASSES as STANFORD
+from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
-from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups
+from tangent_train.checkpoints.scores import Groups
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.class_maps import ClassMap, Unmapped, load_class_map, map_classes
@@ -41,8 +41,8 @@ SHIPPED = {
 
 def _trained(names: Sequence[str], groups: Groups | None = None) -> TrainedNetwork:
     """A network whose scores are its images."""
-    network = ClassScoreNetwork(nn.Identity(), len(names), groups)
-    return trained_network(TANGENT, network=network, class_names=("unknown", *names), groups=groups)
+    class_names = ("unknown", *names)
+    return trained_network(TANGENT, inner=nn.Identity(), class_names=class_names, groups=groups)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

@@ -71,7 +71,7 @@ def test_everything_known_of_a_network_comes_back(
     known = ("class_names", "inputs", "normalization", "level", "representation", "image_size")
     for name in (*known, "size_multiple", "fixed_size"):
         assert getattr(again, name) == getattr(trained, name)
-    assert isinstance(again.network.network, OnnxNetwork) == (suffix == ".onnx")
+    assert isinstance(again.inner, OnnxNetwork) == (suffix == ".onnx")
     assert not again.network.training
     assert path.stat().st_mode & 0o777 == 0o644
     assert _metadata(path) == {
@@ -95,8 +95,8 @@ def test_tensors_keep_their_names_for_other_programs(tmp_path: Path) -> None:
     trained.network.to(memory_format=torch.channels_last)
     path = tmp_path / "net.safetensors"
     export_network(trained, path)
-    assert isinstance(trained.network.network, UNet)
-    own = trained.network.network.state_dict()
+    assert isinstance(trained.inner, UNet)
+    own = trained.inner.state_dict()
     written = load_file(path)
     assert written.keys() == own.keys()
     for name, tensor in own.items():

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import InputImage
@@ -46,7 +45,11 @@ class WholeSky(Sky):
 
 
 def _judge(network: Sky | None = None, **changes: Any) -> NetworkJudge:
-    changes |= {"network": ClassScoreNetwork(network or Sky(), 2), "normalization": PLAIN}
+    changes |= {
+        "inner": network or Sky(),
+        "class_names": ("unknown", "up", "down"),
+        "normalization": PLAIN,
+    }
     return NetworkJudge(trained_network(TANGENT | {"level": 5}, **changes))
 
 

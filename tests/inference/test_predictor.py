@@ -18,7 +18,6 @@ from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
@@ -131,7 +130,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     network = small_context().eval()
     awake(network)
     image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
-    trained = trained_network(TANGENT, network=ClassScoreNetwork(network, 3))
+    trained = trained_network(TANGENT, inner=network)
     labels = _labels(trained, image, per_forward, blend="nearest")
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()
     whole = made.whole()
@@ -151,9 +150,7 @@ def test_elevation_follows_the_zenith() -> None:
         network.weight.zero_()
         network.weight[0, 3], network.weight[2, 3] = -1, 1
         network.bias.copy_(torch.tensor([0.0, -9, 0]))  # type: ignore[union-attr]
-    trained = trained_network(
-        TANGENT, network=ClassScoreNetwork(network, 3), inputs=("rgb", "elevation")
-    )
+    trained = trained_network(TANGENT, inner=network, inputs=("rgb", "elevation"))
     labels = _labels(trained, InputImage(sphere(32)))
     assert (labels[:15] == 2).all()
     assert (labels[17:] == 0).all()
@@ -195,9 +192,8 @@ def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
 
 def test_unsure_is_unknown_of_networks_that_know_nothing_too() -> None:
     groups = [[0], [1], [2]]  # of which the last means nothing
-    network = ClassScoreNetwork(color_network(), 2, groups)
     names = ("unknown", "dark", "green")
-    trained = trained_network(TANGENT, network=network, class_names=names, groups=groups)
+    trained = trained_network(TANGENT, class_names=names, groups=groups)
     predictor = Predictor(trained, PanoramaViews(trained), min_confidence=0.6)
     scores = predictor.predict(InputImage(sphere(32)))
     probabilities = scores.probabilities(slice(None))
@@ -250,7 +246,7 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
 ) -> None:
     """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""
     network = color_network(channels, kernel=1)
-    trained = trained_network(PERSPECTIVE, channels, network=ClassScoreNetwork(network, 3))
+    trained = trained_network(PERSPECTIVE, channels, inner=network)
     pixel = 2 * math.tan(math.radians(22.5)) / 24
     image = _photo(_blocks(*size), 2 * math.degrees(math.atan(pixel * size[1] / 2)))
     inputs = [torch.from_numpy(image.rgb)[None]]
@@ -284,7 +280,7 @@ def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> Non
 
 def test_a_photo_of_a_telescope_needs_little_memory() -> None:
     """Far smaller than a crop: mirrored at full resolution it would have 14,000² pixels."""
-    trained = trained_network(PERSPECTIVE, network=ClassScoreNetwork(color_network(kernel=1), 3))
+    trained = trained_network(PERSPECTIVE, inner=color_network(kernel=1))
     rgb = np.zeros((600, 800, 3), np.uint8)
     rgb[:, 400:] = 255
     (views,) = PhotoViews(trained)(_photo(rgb, 2.5))

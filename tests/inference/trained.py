@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
-from tangent_train.checkpoints.scores import ClassScoreNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.run import inputs_and_classes
 from tangent_train.geometry import equirect_directions
@@ -52,7 +51,7 @@ def trained_network(
 ) -> TrainedNetwork:
     """A network that has been trained with this representation."""
     settings = {
-        "network": ClassScoreNetwork(color_network(channels), len(CLASS_NAMES) - 1),
+        "inner": color_network(channels),
         "class_names": CLASS_NAMES,
         "inputs": ("rgb", "depth")[: channels - 2],
         "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,

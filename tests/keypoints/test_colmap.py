@@ -34,10 +34,10 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
             both = found[left], found[right]
             rays = (side.directions_xyz[k] for side, k in zip(both, matches.T, strict=True))
             pairs[left, right] = matches, estimate_two_view(*rays)
-            names = f"room a/{left}.png", f"room a/{right}.png"
+            images_of_pair = [(f"room a/{k}.png", SHAPE) for k in (left, right)]
             for _ in range(2):  # added again it changes nothing
                 path = tmp_path / "a" / "rooms.db"
-                add_pair(path, names, (SHAPE, SHAPE), both, *pairs[left, right])
+                add_pair(path, images_of_pair, both, *pairs[left, right])
     axes = CAMERA_FROM_PANORAMA
     with pycolmap.Database.open(tmp_path / "a" / "rooms.db") as database:
         images = {image.name: image for image in database.read_all_images()}
@@ -71,7 +71,8 @@ def test_pairs_without_translation(tmp_path: Path, kind: str) -> None:
     matches = np.stack([np.arange(9), np.arange(9)], axis=1)
     points = keypoints_at(random_directions(9))
     path = tmp_path / "pair.db"
-    add_pair(path, ("a", "b"), ((50, 100), (60, 120)), (points, points), matches, two_view)
+    images_of_pair = [("a", (50, 100)), ("b", (60, 120))]
+    add_pair(path, images_of_pair, (points, points), matches, two_view)
     with pycolmap.Database.open(path) as database:
         assert database.num_cameras() == 2
         geometry = database.read_two_view_geometry(1, 2)

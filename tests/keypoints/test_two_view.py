@@ -120,7 +120,8 @@ def test_pose_errors_are_angles() -> None:
     rotation = rotation_about((1, 1, 0), np.radians(12))
     t = np.array([0, 0, -1.0])
     found = TwoView(np.ones(9, np.bool_), rotation, t)
-    right = HERE.moved(np.eye(3), 3 * rotation_about((1, 0, 0), np.radians(5)) @ t)
+    seen_m = 3 * rotation_about((1, 0, 0), np.radians(5)) @ t
+    right = PanoramaPose(HERE.world_from_panorama, HERE.points_m(-seen_m, 1))
     np.testing.assert_allclose(found.pose_error_deg(HERE, right), (12, 5), atol=1e-9)
     rotation_error, translation_error = found.pose_error_deg(HERE, HERE)
     assert rotation_error == pytest.approx(12)

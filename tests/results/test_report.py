@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from datamodules.modelnet40.shape_files import MODELNET40
-from datamodules.stanford2d3ds.reader import CLASSES
+from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import published, runs_report, transfer_report
 from tangent_train.results.record import Record

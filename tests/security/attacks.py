@@ -22,7 +22,7 @@ _NAMES = (
     "torch.utils.collect_env.run",
     "torch.load",
     "builtins.eval",
-    "models.fine_tuning",
+    "models.initialization",
     "models.fcn_resnet.torch.hub.load",
     "tangent_train.files.write_text",
     "datamodules.__builtins__",

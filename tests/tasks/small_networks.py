@@ -37,14 +37,12 @@ def small_trained(
 ) -> TrainedNetwork:
     """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
-    scores = ClassScoreNetwork(
-        with_statistics(build_from_config(settings, "network")), len(NAMES) - 1
-    ).eval()
-    multiple = size_multiple_of(scores, 4)
+    network = with_statistics(build_from_config(settings, "network")).eval()
+    multiple = size_multiple_of(ClassScoreNetwork(network, len(NAMES) - 1), 4)
     return trained_network(
         TANGENT | {"level": 5},
         channels=4,
-        network=scores,
+        inner=network,
         class_names=NAMES,
         normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
         image_size=image_size,

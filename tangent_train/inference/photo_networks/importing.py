@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +12,13 @@ import torch
 
 from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
+from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.checkpoints.trained import (
     TrainedNetwork,
     load_trained,
-    metadata_json,
+    metadata_of,
     write_metadata,
 )
 from tangent_train.errors import SettingError, width_height
@@ -78,10 +78,9 @@ def import_network(
     names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
     scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
-    fixed = None if multiple else network.image_size
     seen = representation_of(network.image_size, fov_deg, level, base_level, is_fixed=not multiple)
     described = TrainedNetwork(
-        network=ClassScoreNetwork(network.network, len(names) - 1, groups, fixed, kind),
+        inner=network.network,
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
@@ -89,14 +88,17 @@ def import_network(
         representation=seen,
         image_size=(seen["dim"], seen["dim"]),
         size_multiple=multiple or 1,
-        fixed_size=fixed,
+        fixed_size=None if multiple else network.image_size,
         groups=groups,
         score_kind=kind,
         settings=network.settings,
     )
     check_size(described, described.image_size)
     with atomic_path(path) as temporary:
-        (_write_onnx if network.settings is None else _write_checkpoint)(described, temporary)
+        if isinstance(network.network, OnnxNetwork):
+            write_metadata(network.network.path, temporary, described)
+        else:
+            _write_checkpoint(described, temporary)
         trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
@@ -203,29 +205,15 @@ def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[in
 
 
 def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
-    config = {
-        "network": described.settings,
-        "representation": dict(described.representation),
-        "level": described.level,
-    }
-    mean, std = described.normalization.mean, described.normalization.std
-    tensors = described.network.state_dict()
-    content = {
-        "config": config,
+    content = metadata_of(described)
+    names = ("settings", "representation", "level")
+    network, representation, level = (content.pop(name) for name in names)
+    content |= {
+        "config": {"network": network, "representation": representation, "level": level},
         "predicts": PIXEL_CLASSES,
-        "class_names": list(described.class_names),
-        "fixed_size": described.fixed_size and list(described.fixed_size),
-        "groups": described.groups,
-        "inputs": ["rgb"],
-        "normalization": {"mean": list(mean), "std": list(std)},
-        "score_kind": described.score_kind,
-        "state_dict": {name: t.contiguous().float() if t.is_floating_point() else t
-                       for name, t in tensors.items()},
-        "tangent_train_version": version("tangent-train"),
-    }  # fmt: skip
+        "state_dict": {
+            name: t.contiguous().float() if t.is_floating_point() else t
+            for name, t in described.network.state_dict().items()
+        },
+    }
     torch.save(content, path)
-
-
-def _write_onnx(described: TrainedNetwork, path: Path) -> None:
-    inner: Any = described.network.network
-    write_metadata(inner.path, path, metadata_json(described))

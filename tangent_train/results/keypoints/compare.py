@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -44,6 +44,9 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 """Figures of one pair, condition and representation, see `Comparer.compare`."""
 
+_Keypoints = dict[tuple[str, int], dict[str, SphericalKeypoints]]
+"""Keypoints by representation, of a panorama by name and level."""
+
 AS_GIVEN, ROTATED = "as_given", "rotated"
 """Conditions: both panoramas as they are; the right one randomly rotated."""
 
@@ -80,9 +83,9 @@ class Comparison(NamedTuple):
     images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
-@dataclass(frozen=True)
-class Ways:
-    """Settings of detection and matching.
+@dataclass
+class Comparer:
+    """Compares representations on pairs.
 
     Attributes:
         base_level: Base levels of the tangent images.
@@ -91,8 +94,8 @@ class Ways:
         ratio: See `match`.
         mutual: See `match`.
         max_error_deg: See `estimate_two_view`, at most 20.
-        seed: Of random samples and of the random rotations.
-        controls: Whether to compare the downsampled panorama, a cube and the rotated one too.
+        seed: Seed of random samples and of the random rotations.
+        controls: True to compare the downsampled panorama, a cube and the rotated panorama too.
 
     Raises:
         SettingError: A number is out of range.
@@ -110,23 +113,16 @@ class Ways:
     def __post_init__(self) -> None:
         ranges = {"margin": (0, math.inf), "ratio": (1e-9, 1), "max_error_deg": (1e-9, 20)}
         for name, (least, most) in ranges.items():
-            found = getattr(self, name)
-            if not least <= found <= most:
-                raise SettingError(name, found=found, expected=f"{least:g} to {most:g}")
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise SettingError(name, found=value, expected=f"{least:g} to {most:g}")
+        self._cache: _Keypoints = {}
 
     @property
     def representations(self) -> list[str]:
         """``ERP``, the shrunk one and the cube with controls, ``L0``, ``L1`` … of base levels."""
         controls = [SHRUNK, CUBE] if self.controls else []
         return ["ERP", *controls, *(f"L{b}" for b in self.base_level)]
-
-
-@dataclass
-class Comparer:
-    """Compares representations on pairs."""
-
-    ways: Ways
-    _kept: dict[tuple[str, int], dict[str, SphericalKeypoints]] = field(default_factory=dict)
 
     def compare(self, pair: PanoramaPair) -> Comparison:
         """Compare all representations on one pair.
@@ -147,16 +143,17 @@ class Comparer:
         level = self._level(pair)
         sides = (pair.left, pair.right)
         images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
-        # A panorama of the pair before is not searched again.
-        self._kept = {
-            (side.name, level): self._kept.get((side.name, level)) or self._detect(image, level)
+        # A panorama of the previous pair is not searched again.
+        self._cache = {
+            (side.name, level): self._cache.get((side.name, level)) or self._detect(image, level)
             for side, image in zip(sides, images, strict=True)
         }
-        left, right = (self._kept[side.name, level] for side in sides)
+        left, right = (self._cache[side.name, level] for side in sides)
         conditions = {AS_GIVEN: (np.eye(3), images[1], right)}
-        if self.ways.controls:
-            rng = np.random.default_rng([self.ways.seed, zlib.crc32(pair.name.encode())])
-            rotation = random_rotation(rng)
+        if self.controls:
+            rotation = random_rotation(
+                np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
+            )
             image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level)
         views = [_depth_view(side) for side in sides]
@@ -174,36 +171,36 @@ class Comparer:
         for condition, (rotation, image, right) in conditions.items():
             found = {name: self._matched(left[name], right[name]) for name in left}
             comparison.images[condition], comparison.found[condition] = (images[0], image), found
-            for name, one in found.items():
+            for name, matched in found.items():
                 row = known | {"condition": condition, "representation": name}
-                comparison.rows.append(row | self._figures(one, rotation, *views))
+                comparison.rows.append(row | self._figures(matched, rotation, *views))
         return comparison
 
     def _level(self, pair: PanoramaPair) -> int:
         rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
-        own = nearest_level(rows)
-        if self.ways.level is not None and self.ways.level > own:
-            expected = f"at most {own}, that of pair {pair.name} with {rows} rows"
-            raise SettingError("level", found=self.ways.level, expected=expected)
-        return own if self.ways.level is None else self.ways.level
+        nearest = nearest_level(rows)
+        level = nearest if self.level is None else self.level
+        if level > nearest:
+            expected = f"at most {nearest}, that of pair {pair.name} with {rows} rows"
+            raise SettingError("level", found=level, expected=expected)
+        return level
 
     def _detect(self, rgb: NDArray[np.uint8], level: int) -> dict[str, SphericalKeypoints]:
-        """Keypoints of a panorama by representation, in the order of `Ways.representations`."""
+        """Keypoints of a panorama by representation, in the order of `representations`."""
         found = {"ERP": detect_on_equirect(rgb)}
         grids: dict[str, TangentGrid | CubeGrid] = {}
-        if self.ways.controls:
+        if self.controls:
             found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)))
             grids[CUBE] = CubeGrid(2**level)
-        grids |= {f"L{b}": TangentGrid(b, level) for b in self.ways.base_level}
-        for name, grid in grids.items():
-            found[name] = detect_on_tangent_images(rgb, grid, self.ways.margin)
-        return found
+        grids |= {f"L{b}": TangentGrid(b, level) for b in self.base_level}
+        return found | {
+            name: detect_on_tangent_images(rgb, grid, self.margin) for name, grid in grids.items()
+        }
 
     def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
-        ways = self.ways
-        matches = match(left.descriptors, right.descriptors, ways.ratio, mutual=ways.mutual)
+        matches = match(left.descriptors, right.descriptors, self.ratio, mutual=self.mutual)
         rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
-        geometry = estimate_two_view(*rays, ways.max_error_deg, seed=ways.seed)
+        geometry = estimate_two_view(*rays, self.max_error_deg, seed=self.seed)
         return MatchedPair(left, right, matches, geometry)
 
     def _figures(
@@ -213,11 +210,12 @@ class Comparer:
         left: DepthView | None,
         right: DepthView | None,
     ) -> Row:
-        visible = keypoints = (len(found.left), len(found.right))
+        visible = keypoints = len(found.left), len(found.right)
         truth: Row = dict.fromkeys(_TRUTH)
         if left is not None and right is not None:
-            visible, truth = _truth(found, rotation, left, right, self.ways.max_error_deg)
+            visible, truth = _truth(found, rotation, left, right, self.max_error_deg)
         putative, inliers = len(found.matches), int(found.geometry.inliers.sum())
+        share = sum(1 / n for n in visible) / 2 if all(visible) else None
         return {
             "keypoints_left": keypoints[0],
             "keypoints_right": keypoints[1],
@@ -225,8 +223,8 @@ class Comparer:
             "visible_right": visible[1],
             "putative": putative,
             "inliers": inliers,
-            "pmr": putative * sum(1 / n for n in visible) / 2 if all(visible) else None,
-            "ms": inliers * sum(1 / n for n in visible) / 2 if all(visible) else None,
+            "pmr": share and putative * share,
+            "ms": share and inliers * share,
             "p": inliers / putative if putative else None,
             "geometry": found.geometry.kind,
             **truth,
@@ -248,7 +246,7 @@ def _truth(
 ) -> tuple[tuple[int, int], Row]:
     """Visible keypoints on either side, and the scores that need depth and pose."""
     left_xyz = found.left.directions_xyz
-    # Back to the right panorama as it is, whose depth needs no resampling.
+    # In the right panorama as it is, whose depth needs no resampling.
     right_xyz = found.right.directions_xyz @ rotation
     visible = visible_from(left_xyz, left, right), visible_from(right_xyz, right, left)
     first, second = found.matches.T
@@ -256,7 +254,7 @@ def _truth(
     rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
     errors = found.geometry.pose_error_deg(left.pose, rotated)
     known, correct = int(judged.known.sum()), int(judged.correct.sum())
-    # Of a pair the area under the step from 0 to 1 at its error; without an estimate it stays 0.
+    # The recall of one pair is a step from 0 to 1 at its error; without an estimate it stays 0.
     worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
     moved = not np.array_equal(left.pose.location_m, right.pose.location_m)
     areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)

@@ -180,7 +180,7 @@ def test_every_sample_and_epoch_has_its_own_randomness() -> None:
 
 
 def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:
-    sampler, again = EpochSampler(20, 7, shuffle=True), EpochSampler(20, 7, shuffle=True)
+    sampler, again = EpochSampler(20, 7), EpochSampler(20, 7)
     first = _indices(sampler)
     sampler.set_epoch(3)
     again.set_epoch(3)
@@ -188,17 +188,16 @@ def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:
     assert {epoch for epoch, _ in sampler} == {3}
     assert sorted(first) == sorted(_indices(sampler)) == list(range(20))
     assert first != _indices(sampler) != list(range(20))
-    assert _indices(EpochSampler(20, 8, shuffle=True)) != first
+    assert _indices(EpochSampler(20, 8)) != first
 
 
 def test_impossible_processes() -> None:
-    for shuffle in (True, False):
-        with pytest.raises(SettingError, match="2 processes for 1 samples"):
-            EpochSampler(1, 0, shuffle, rank=0, world_size=2)
+    with pytest.raises(SettingError, match="2 processes for 1 samples"):
+        EpochSampler(1, 0, rank=0, world_size=2)
 
 
 def test_a_resumed_epoch_goes_on_behind_what_was_had() -> None:
-    whole, resumed = EpochSampler(9, 3, True, 1, 2), EpochSampler(9, 3, True, 1, 2, start=(4, 3))
+    whole, resumed = EpochSampler(9, 3, 1, 2), EpochSampler(9, 3, 1, 2, start=(4, 3))
     for epoch in (4, 5):
         whole.set_epoch(epoch)
         if epoch > 4:  # the first time its epoch is known from the start

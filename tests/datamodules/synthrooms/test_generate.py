@@ -8,11 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
 from datamodules.synthrooms.generate import RoomSettings, plan_rooms
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
-from datamodules.synthrooms.room import UNKNOWN, Room
+from datamodules.synthrooms.room import Room
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import (
     INSTANCES,
@@ -88,7 +89,7 @@ def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> 
     total = missing + pixels.total()
     assert min(pixels[name] / total for name in INSTANCES) > 0.01, pixels
     assert min(present[name] / len(rooms) for name in INSTANCES) > 0.45, present
-    assert pixels[UNKNOWN] > 0
+    assert pixels[UNKNOWN_CLASS] > 0
     assert 0.02 < missing / total < 0.15
 
 

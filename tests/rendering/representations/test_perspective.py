@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import normalize_camera
 from tangent_train.rendering import PerspectiveRepresentation
+from tests.geometry.paper_camera import normalizing_homography
 
 SIZE = (90, 140)
 K = np.array([[150.0, 0, 66.3], [0, 145.0, 47.1], [0, 0, 1]])
@@ -55,7 +55,7 @@ def test_crops_against_the_slow_reference(dim: int, fov_deg: float) -> None:
     assert rendered.dtype == np.uint8
     for box, image in zip(crops.boxes, rendered, strict=True):
         shift = (box[:2] + box[2:]) / 2 - K[:2, 2] - 0.5
-        homography = normalize_camera(K, SIZE, fov_deg, dim, shift).homography
+        homography = normalizing_homography(K, fov_deg, (dim, dim), shift)
         assert np.abs(image - _triangle(photo, homography, dim)).max() < 1.01
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datamodules.core.panorama_pairs import PanoramaPair
-from tangent_train.results.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer, Ways
+from tangent_train.results.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer
 from tests.results.keypoints.ball_room import ball_pair
 
 pytest.importorskip("pycolmap")
@@ -18,7 +18,7 @@ def pair() -> PanoramaPair:
 
 
 def test_figures_are_those_of_the_counts_and_of_the_truth(pair: PanoramaPair) -> None:
-    comparison = Comparer(Ways((1,), margin=16, seed=3)).compare(pair)
+    comparison = Comparer((1,), margin=16, seed=3).compare(pair)
     assert [(row["condition"], row["representation"]) for row in comparison.rows] == [
         (condition, name)
         for condition in (AS_GIVEN, ROTATED)
@@ -57,7 +57,7 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
     pair: PanoramaPair,
 ) -> None:
     blank = pair.left._replace(rgb=np.full((64, 128, 3), 90, np.uint8), distance_m=None)
-    comparer = Comparer(Ways((0,), controls=False))
+    comparer = Comparer((0,), controls=False)
     for other in (pair.right, blank):
         for row in comparer.compare(PanoramaPair("x", None, other, blank)).rows:
             assert (row["fov_overlap"], row["visible_by"]) == (None, "all keypoints")
