@@ -129,6 +129,15 @@ class Task(lightning.LightningModule, ABC):
         self._step_norm: Any = None
         self._trained_length: Mapping[str, int] | None = None
 
+    @staticmethod
+    def num_outputs(num_classes: int) -> int:
+        """Outputs of a network whose ``num_classes`` is null; by default one for each class.
+
+        Args:
+            num_classes: Classes of the data.
+        """
+        return num_classes
+
     @abstractmethod
     def example(self, channels: int) -> Tensor:
         """An empty input of the network, of the size of the run."""
