@@ -25,6 +25,7 @@ from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError, width_height
+from tangent_train.geometry import PanoramaPose
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -122,6 +123,11 @@ class ImageReader(ABC):
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
         raise NotImplementedError(files.name)
+
+    def pose(self, files: ImageFiles) -> PanoramaPose | None:
+        """Pose in a world of metres, see `LabeledImage`; None if it is unknown."""
+        del files
+        return None
 
 
 class PngReader(ImageReader):
@@ -243,8 +249,9 @@ def mask_black(
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in metres, float32, of depth in steps of 1/512 m."""
-    return steps.astype(np.float32) / np.float32(STEPS_PER_M)
+    """Depth in metres, float32, NaN where missing, of depth in steps of 1/512 m."""
+    meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
+    return np.where(steps == 0, np.float32(np.nan), meters)
 
 
 def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:

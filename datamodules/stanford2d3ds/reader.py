@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +15,21 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
-from tangent_train.errors import DataError, counted
+from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
+from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import parse_json, read_json
-from tangent_train.geometry import is_camera_matrix
+from tangent_train.geometry import PanoramaPose, is_camera_matrix
 
 UNKNOWN = 0
 """The label of pixels without a class: ignored in training and evaluation."""
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+_PANORAMA_KEYS = {
+    "camera_rt_matrix": (3, 4),
+    "camera_original_rotation": (3,),
+    "camera_location": (3,),
+}
 _MOST = 1e6  # meters, radians, pixels
 
 
@@ -131,6 +138,14 @@ class StanfordReader(PngReader):
         """Depth in steps of 1/512 m, as in the files."""
         return read_depth(files.parts["depth"])
 
+    def pose(self, files: ImageFiles) -> PanoramaPose | None:
+        """The pose in the pose file; None without a file."""
+        pose = files.rgb.name.removesuffix("rgb.png") + "pose.json"
+        path = files.rgb.parents[1] / "pose" / pose
+        if not path.is_file():
+            return None
+        return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
+
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """The camera matrix in the pose file."""
         return read_camera_matrix(files.parts["camera"])
@@ -166,6 +181,41 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     return _CENTERS_FROM_CORNERS @ matrix
 
 
+def read_panorama_pose(path: Path) -> PanoramaPose:
+    """Read the pose file of a panorama.
+
+    Args:
+        path: ``…_domain_pose.json``.
+
+    Raises:
+        DataError: It cannot be read, or holds no pose.
+    """
+    rt, angles, location = read_pose_numbers(path, _PANORAMA_KEYS)
+    if np.abs(angles).max() > 2 * math.pi:
+        angles = np.radians(angles)
+    original = euler_rotation(angles)
+    return _checked_pose(path, original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
+
+
+def read_photo_pose(path: Path) -> PanoramaPose:
+    """Read the pose of a photo, in the axes of `LabeledImage`.
+
+    The camera matrix [R | t] of the file takes points of the world to the camera: x right, y down,
+    z forward. This was tested with SynthRooms.
+
+    Args:
+        path: ``camera_…_domain_pose.json``.
+
+    Raises:
+        DataError: It cannot be read, or holds no pose.
+    """
+    (rt,) = read_pose_numbers(path, {"camera_rt_matrix": (3, 4)})
+    world_from_camera = rt[:, :3].T
+    return _checked_pose(
+        path, world_from_camera @ CAMERA_FROM_SPHERE, -world_from_camera @ rt[:, 3]
+    )
+
+
 def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
     """Numbers in a pose file.
 
@@ -186,6 +236,15 @@ def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[N
             expected=f"a pose as JSON, with {', '.join(keys)}",
             remedy="Copy or extract the file again.",
         ) from error
+
+
+def _checked_pose(
+    path: Path, world_from_panorama: NDArray[np.float64], location_m: NDArray[np.float64]
+) -> PanoramaPose:
+    try:
+        return PanoramaPose(world_from_panorama, location_m)
+    except SettingError as error:
+        raise DataError(path, found=error.found, expected="a rotation") from error
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -32,7 +32,7 @@ from tangent_train.files import no_room
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.views import check_size
-from tangent_train.registry import SettingsFile, build_from_config, resolve_target
+from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
     headline,
@@ -41,6 +41,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -96,7 +97,7 @@ class Run:
         else:
             data, task, notes = build_trained(settings, trained, source)
         kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
-        kept = {"choices": _choices(settings, source), **kept}
+        kept = {"choices": _choices(settings, source), **named_arguments(kept)}
         write_settings(folder / "config.yaml", kept)
         return Run(folder, kept, source, data, task, trained, notes)
 
@@ -298,11 +299,12 @@ def _build_task(
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
-        optimizer = dict(settings["optimizer"])
-        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+        section = dict(settings["scheduler"])
+        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        scheduler = build_from_config(section, "scheduler", source)
+        parts["scheduler"] = Schedule(scheduler, **stepped)
     return build_from_config(
         settings["task"],
         "task",

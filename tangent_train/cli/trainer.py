@@ -8,16 +8,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
 import lightning
-from hydra.errors import InstantiationException
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.pictures import ValidationPictures
 from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
-from tangent_train.cli.compose import without_interpolation
 from tangent_train.errors import SettingError, at_least
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.setting_rules import flat_settings
@@ -86,7 +83,6 @@ def build_trainer(
             *_build_named(settings, "callbacks", known),
             CheckpointContents(contents),
             ProgressBar(),
-            ClassScores(),
             PredictionPanels(folder / "panels", settings["panels"]),
             ValidationPictures(settings["validation_images"]),
             *[LearningRateMonitor()] * bool(loggers),
@@ -109,20 +105,16 @@ def _build_named(settings: Mapping[str, Any], group: str, known: Mapping[str, An
             if entry is not None:
                 raise SettingError(place, found=entry, expected="a section with a _target_")
             continue
-        filled = _fill(entry, known)
         try:
-            built.append(
-                hydra.utils.instantiate({"_convert_": "all"} | without_interpolation(filled))
-            )
-        except InstantiationException as error:
-            cause = error.__cause__ or error
+            built.append(build_from_config(_fill(entry, known), place))
+        except SettingError as error:
+            if group != "logger" or not isinstance(error.__cause__, ModuleNotFoundError):
+                raise
             package = entry["_target_"].rpartition(".")[2].removesuffix("Logger").lower()
-            is_extra = isinstance(cause, ModuleNotFoundError) and group == "logger"
+            remedy = f"pip install 'tangent-train[{package}]'"
+            expected = "an installed package"
             raise SettingError(
-                place,
-                found=f"{entry['_target_']}, which cannot be built ({cause})",
-                expected="a class and its arguments",
-                remedy=f"pip install 'tangent-train[{package}]'" if is_extra else "",
+                place, found=error.found, expected=expected, remedy=remedy
             ) from error
     return built
 

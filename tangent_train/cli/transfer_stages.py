@@ -27,11 +27,11 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.cli.compose import without_interpolation
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
+from tangent_train.registry import without_interpolation
 from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]

@@ -99,7 +99,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     np.testing.assert_array_equal(panorama.labels, classes)
     known = classes > 0
     np.testing.assert_array_equal(
-        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, 0)
+        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, np.nan)
     )
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
