@@ -116,6 +116,11 @@ class ImageReader(ABC):
             DataError: The file is broken, or holds a value without a class.
         """
 
+    def label_warning(self, files: ImageFiles) -> str:
+        """Return a finding about labels that can be used; empty without one."""
+        del files
+        return ""
+
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
         raise NotImplementedError(files.name)
@@ -361,18 +366,21 @@ class _Reading:
         return labels
 
     def parts(
-        self, label_counts: dict[str, NDArray[np.int64]], files: ImageFiles
+        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str], files: ImageFiles
     ) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately.
 
         Args:
             label_counts: The pixels of each label are added under the name of the image.
+            warnings: Warnings of labels are added.
             files: Files of the image.
         """
 
         def count_labels(files: ImageFiles) -> None:
             labels = replace(self, shape=None).labels(files)
             label_counts[files.name] = np.bincount(labels.ravel(), minlength=self.num_classes)
+            if warning := self.reader.label_warning(files):
+                warnings.append(warning)
 
         read = {"labels": count_labels}
         return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]

@@ -69,40 +69,40 @@ class LabelTable:
             raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
         return cls(np.array([ids[name] for name in classes], np.uint8))
 
-    def decode(self, colors: NDArray[np.uint8], path: object = "labels") -> NDArray[np.uint8]:
-        """Labels of a `semantic` image.
+    def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the labels of a `semantic` image; instances past the end of the table are unknown.
 
         Args:
             colors: ``(H, W, 3)`` uint8 in RGB order.
-            path: Their file, for messages.
 
         Returns:
             ``(H, W)`` uint8 labels.
 
-        Raises:
-            DataError: There are instances past the end of the table, other than the mark of missing
-                labels.
-
         >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
-        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13]]], np.uint8)).tolist()
-        [[12, 0]]
+        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13], [0, 0, 3]]], np.uint8)).tolist()
+        [[12, 0, 0]]
         """
-        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
-        index = (red << 16) | (green << 8) | blue
-        end = len(self.class_ids)
-        past = index >= end
-        strange = past & (index != MISSING_LABEL)
-        if strange.any():
-            count = int(np.count_nonzero(strange))
-            raise DataError(
-                path,
-                found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
-                expected=f"0 to {end - 1}, the entries of the class table, or #{MISSING_LABEL:06X} "
-                "where labels are missing",
-                remedy="Use the file and semantic_labels.json of one release.",
-            )
-        index[past] = 0
-        return np.where(past, np.uint8(UNKNOWN), self.class_ids[index])
+        instances = _instances(colors)
+        past = instances >= len(self.class_ids)
+        instances[past] = 0
+        return np.where(past, np.uint8(UNKNOWN), self.class_ids[instances])
+
+    def past_end(self, colors: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Return the instances past the end of the table, without the mark of missing labels.
+
+        Args:
+            colors: See `decode`.
+
+        Returns:
+            ``(n,)``, one for each of n pixels.
+        """
+        instances = _instances(colors)
+        return instances[(instances >= len(self.class_ids)) & (instances != MISSING_LABEL)]
+
+
+def _instances(colors: NDArray[np.uint8]) -> NDArray[np.int32]:
+    red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+    return (red << 16) | (green << 8) | blue
 
 
 @dataclass(frozen=True)
@@ -129,10 +129,21 @@ class StanfordReader(PngReader):
         """Classes by the class table, 0 where black pixels are masked."""
         colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
-        labels = self.table.decode(resize_nearest(colors, shape), files.labels)
+        labels = self.table.decode(resize_nearest(colors, shape))
         if self.unknown == "labels":
             return labels
         return mask_black(labels, resize_nearest(self.rgb(files), shape), self.unknown)
+
+    def label_warning(self, files: ImageFiles) -> str:
+        """See `ImageReader`: instances past the end of the class table."""
+        past = self.table.past_end(read_rgb(files.labels))
+        if not past.size:
+            return ""
+        return (
+            f"{files.labels}: {counted(past.size, 'pixels')} of instance {past.min()} or higher, "
+            f"past the end of the class table ({len(self.table.class_ids) - 1}), are unknown: use "
+            "the file and semantic_labels.json of one release."
+        )
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth in steps of 1/512 m, as in the files."""

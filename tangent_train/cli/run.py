@@ -167,19 +167,19 @@ class Run:
         own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
-        notes = [f"Checkpoint: {name}", *self.notes]
+        notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
-            tables=[*result_tables(record), confusion_table(record)],
+            tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
             class_names=self.task.class_names,
             notes=[headline(record), *notes],
         )
         for line in (*self.notes, headline(record)):
             print_text(line)
-        result_tables(record)[0].print()
+        tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
@@ -205,9 +205,9 @@ def build(
     """
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
-    section = completed_settings(
-        settings["network"], data.in_channels, data.num_classes, restored=restored
-    )
+    count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
+    outputs = count_outputs(data.num_classes)
+    section = completed_settings(settings["network"], data.in_channels, outputs, restored=restored)
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
     try_network(task, data.in_channels)

@@ -18,8 +18,9 @@ from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
+from tangent_train.results.evaluation import plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
-from tangent_train.results.record import Record
+from tangent_train.results.record import Heading, Record
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
@@ -60,6 +61,7 @@ class Task(lightning.LightningModule, ABC):
         monitor: The score on the validation split that selects the best epoch.
         monitor_mode: ``max`` or ``min``: the better value of that score.
         takes: Input and output of a network for this task, for messages.
+        headings: Headings of the scores over a split, in the order of the tables.
         metric: The metric of a split, see `build_metric`.
         result: What `metric` computed in the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
@@ -75,6 +77,7 @@ class Task(lightning.LightningModule, ABC):
     monitor: ClassVar[str]
     monitor_mode: ClassVar[Literal["max", "min"]] = "max"
     takes: ClassVar[str]
+    headings: ClassVar[Mapping[str, Heading]]
     result: Any
     evaluated: int
 
@@ -125,6 +128,15 @@ class Task(lightning.LightningModule, ABC):
         self._step_norm: Any = None
         self._trained_length: Mapping[str, int] | None = None
 
+    @staticmethod
+    def num_outputs(num_classes: int) -> int:
+        """Outputs of a network whose ``num_classes`` is null; by default one for each class.
+
+        Args:
+            num_classes: Classes of the data.
+        """
+        return num_classes
+
     @abstractmethod
     def example(self, channels: int) -> Tensor:
         """An empty input of the network, of the size of the run."""
@@ -151,7 +163,9 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def logged_scores(self, result: Any) -> dict[str, float]:
-        """Scores over the whole split by name, such as ``miou``; logged as ``val/miou``.
+        """Scores over the whole split by name, the main one first.
+
+        A score ``miou`` is logged as ``val/miou`` and ``test/miou``.
 
         Args:
             result: A result of `metric`.
@@ -165,14 +179,16 @@ class Task(lightning.LightningModule, ABC):
         """
         return {}
 
-    @abstractmethod
     def record(self, result: Any, noun: str) -> Record:
-        """The record of an evaluation.
+        """The record of the last evaluation, with the `logged_scores` under their `headings`.
 
         Args:
             result: A result of `metric`.
             noun: Plural name of the images: panoramas, photos, shapes.
         """
+        scores = plain_scores(self.logged_scores(result))
+        means = scores | {name: None for name in self.headings if name not in scores}
+        return Record(noun, self.evaluated, self.headings, means)
 
     def targets(self, batch: Any) -> Tensor:
         """The true labels of an evaluated batch, as many as there are predictions."""
