@@ -170,7 +170,9 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
         at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
         targets = {at: inner["_target_"] for inner, at in _sections(section, place)}
         _refuse(error.__cause__ or error, targets[at], at, None)
-    return partial(make, **given) if section.get("_partial_") else make(**given)
+    if section.get("_partial_"):  # as it is, where it is complete: its arguments stay visible
+        return partial(make, **given) if given else make
+    return make(**given)
 
 
 def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:
