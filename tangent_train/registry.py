@@ -364,8 +364,11 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
 def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
     """The class or function that a section names, with the kinds of its arguments in a file."""
     target = settings.get("_target_") if isinstance(settings, Mapping) else None
-    if file is not None and not isinstance(target, str):
-        raise file.refused(place, settings, "a section with a _target_")
+    if not isinstance(target, str):
+        expected = "a section with a _target_"
+        if file is not None:
+            raise file.refused(place, settings, expected)
+        raise SettingError(place, found=f"{settings}", expected=expected)
     found = _find(str(target))
     if found is not None:
         return found

@@ -74,7 +74,7 @@ def test_text_is_not_interpreted_again(text: str) -> None:
         ({"_target_": f"{ME}.Absent"}, r"^network\._target_: .*Absent, which cannot be imported"),
         ({"_target_": "os.unlink", "path": "x"}, r"^network: found os\.unlink cannot be made"),
         ({"_target_": f"{ME}.Kept", "_args_": 3}, r"^network: .*InstantiationException"),
-        (None, r"^network\._target_: found None"),
+        (None, r"^network: found None; expected a section"),
     ],
 )
 def test_errors_in_one_line(section: Any, message: str) -> None:

@@ -205,7 +205,7 @@ def build(
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     section = completed_settings(
-        settings["network"], data.in_channels, data.num_classes, restored=restored
+        settings.get("network"), data.in_channels, data.num_classes, restored=restored
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
