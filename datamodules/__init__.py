@@ -42,14 +42,16 @@ _CLASSES = {
 }
 _MODULES = {name: f"{__name__}.{file}" for file, names in _CLASSES.items() for name in names}
 
+_GENERATED = ("synthrooms", "synthshapes")
+
 __all__ = list(_MODULES)
 
 
 def is_read(target: str) -> bool:
     """True for a data set of this package that does not generate its files: its root exists."""
     package, _, name = target.rpartition(".")
-    is_known = package == __name__ and name in _MODULES
-    return is_known and not getattr(__getattr__(name), "is_generated", False)
+    file = _MODULES.get(name, "") if package == __name__ else ""
+    return bool(file) and file.split(".")[1] not in _GENERATED
 
 
 def __getattr__(name: str) -> Any:

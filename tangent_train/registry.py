@@ -26,7 +26,7 @@ from types import NoneType, UnionType
 from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
-from tangent_train.offline import offline
+from tangent_train.imports import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
@@ -170,7 +170,8 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
         at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
         targets = {at: inner["_target_"] for inner, at in _sections(section, place)}
         _refuse(error.__cause__ or error, targets[at], at, None)
-    return partial(make, **given) if section.get("_partial_") else make(**given)
+    make = partial(make.func, *make.args, **make.keywords | given)
+    return make if section.get("_partial_") else make()
 
 
 def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:

@@ -22,6 +22,7 @@ from datamodules.core.inputs import (
     normalize,
     ordered_inputs,
 )
+from datamodules.core.labeled_images import LabeledImages
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
@@ -126,6 +127,11 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         seed = self.seed, self.sampling_seed
         return TrainingImages(source, self.representation, seed, inputs, self.color_jitter)
 
+    def images(self, split: Split) -> LabeledImages:
+        """Return the whole images of a split as arrays, see `LabeledImage`."""
+        reading: Any = self.index().read
+        return LabeledImages(self.source(split), reading.reader)
+
     @property
     def in_channels(self) -> int:
         """Total channels of all inputs."""
@@ -229,6 +235,10 @@ class PanoramaDataModule(ImageDataModule):
             transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
         return SplitReader(index, split, Panorama, transforms)
 
+    def panoramas(self, split: Split) -> LabeledImages:
+        """Return the whole panoramas of a split as arrays: masked and rotated if set."""
+        return self.images(split)
+
     def estimate_up(self, judge: PanoramaJudge) -> None:
         """Let a network help to estimate the up directions of the test panoramas.
 
@@ -296,6 +306,10 @@ class PhotoDataModule(ImageDataModule):
     ) -> SplitReader[ImageFiles, Photo]:
         """Photos from files or store."""
         return SplitReader(index, split, Photo)
+
+    def photos(self, split: Split) -> LabeledImages:
+        """Return the whole photos of a split as arrays."""
+        return self.images(split)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; crops must fit into the photo, too."""

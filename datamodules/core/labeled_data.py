@@ -61,7 +61,6 @@ class LabeledData(ABC, Generic[_Item]):
         class_names: Name of every label; the first of pixel classes is unknown, not a class.
         labels: Labels that its items have, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
-        is_generated: True if `make_files` generates the whole data set.
         label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
 
     Raises:
@@ -70,7 +69,6 @@ class LabeledData(ABC, Generic[_Item]):
 
     labels: ClassVar[str] = PIXEL_CLASSES
     noun: ClassVar[str]
-    is_generated: ClassVar[bool] = False
 
     root: Path = field(kw_only=False)
     representation: Any = field(kw_only=False, default=None)
@@ -231,13 +229,6 @@ class LabeledData(ABC, Generic[_Item]):
         problems, count = Problems(), 0
         counts: dict[str, NDArray[np.int64]] = {}
         with problems.noted():
-            if self.is_generated and not self.root.is_dir():
-                raise DataError(
-                    self.root,
-                    found="no such folder",
-                    expected="the data set",
-                    remedy="Run tangent-prepare with the same settings.",
-                )
             index = self._find_all(problems)
             count = index.check(problems, counts)
             for split in SPLITS:

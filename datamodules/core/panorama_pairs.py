@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,11 +79,9 @@ class PanoramaPairs(ABC):
     """Pairs to read one by one.
 
     Attributes:
-        is_generated: True if `make_files` generates the whole data set.
         published: The paper's scores by the name of a pair, for the paper's pairs.
     """
 
-    is_generated: ClassVar[bool] = False
     published: Mapping[str, PublishedPair] = MappingProxyType({})
 
     def make_files(self) -> None:  # noqa: B027, most have all their files

@@ -41,6 +41,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -166,19 +167,19 @@ class Run:
         own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
-        notes = [f"Checkpoint: {name}", *self.notes]
+        notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
-            tables=[*result_tables(record), confusion_table(record)],
+            tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
             class_names=self.task.class_names,
             notes=[headline(record), *notes],
         )
         for line in (*self.notes, headline(record)):
             print_text(line)
-        result_tables(record)[0].print()
+        tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
@@ -204,8 +205,10 @@ def build(
     """
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
+    count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
+    outputs = count_outputs(data.num_classes)
     section = completed_settings(
-        settings.get("network"), data.in_channels, data.num_classes, restored=restored
+        settings.get("network"), data.in_channels, outputs, restored=restored
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
@@ -298,11 +301,12 @@ def _build_task(
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
-        optimizer = dict(settings["optimizer"])
-        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+        section = dict(settings["scheduler"])
+        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        scheduler = build_from_config(section, "scheduler", source)
+        parts["scheduler"] = Schedule(scheduler, **stepped)
     return build_from_config(
         settings["task"],
         "task",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -15,18 +16,20 @@ from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
 from tangent_train.inference.predictor import sees_rays, view_scores
 from tangent_train.metrics.segmentation import (
+    BAND_EDGES_DEG,
     AbsentClass,
-    ConfusionMatrices,
-    ConfusionMatrix,
+    SegmentationCounts,
+    SegmentationMetric,
+    bootstrap_intervals,
     segmentation_scores,
 )
 from tangent_train.registry import registered
 from tangent_train.rendering import Assembler, EquirectRepresentation
 from tangent_train.rendering.representations.views import Representation
-from tangent_train.results.evaluation import segmentation_record
+from tangent_train.results.evaluation import class_entries, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
-from tangent_train.results.record import Record
+from tangent_train.results.record import SOLID_ANGLE, Heading, Record, with_solid_angle
 from tangent_train.results.tables import percent
 from tangent_train.tasks.base import RGB, Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
@@ -58,6 +61,12 @@ class SegmentationTask(Task):
     """
 
     predicts: ClassVar[str] = PIXEL_CLASSES
+    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+        {
+            "macc": Heading("mAcc", "%", "accuracy", "accuracy"),
+            "miou": Heading("mIoU", "%", "iou", "IoU"),
+        }
+    )
     monitor: ClassVar[str] = "val/miou"
     takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
     class_weights: Tensor
@@ -236,27 +245,52 @@ class SegmentationTask(Task):
             self.metric.update(predictions[-1], target)
         return torch.stack(predictions)
 
-    def build_metric(self) -> ConfusionMatrix:
+    def build_metric(self) -> SegmentationMetric:
         """Confusion matrices of pixels, latitude bands and solid angles."""
-        return ConfusionMatrix(len(self.class_names))
+        return SegmentationMetric(len(self.class_names))
 
-    def logged_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+    def logged_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Means over classes, of panoramas also weighted by solid angle."""
         pixels = segmentation_scores(result.pixels, self.absent_class)
         scores = {"miou": pixels.miou, "macc": pixels.macc}
         if result.solid_angle.any():
             angles = segmentation_scores(result.solid_angle, self.absent_class)
-            scores |= {"miou_solid_angle": angles.miou, "macc_solid_angle": angles.macc}
+            scores |= {f"miou{SOLID_ANGLE}": angles.miou, f"macc{SOLID_ANGLE}": angles.macc}
         return scores
 
-    def class_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+    def class_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Intersection over union of each class."""
         scores = segmentation_scores(result.pixels, self.absent_class).iou.tolist()
         return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
 
-    def record(self, result: ConfusionMatrices, noun: str) -> Record:
-        """The record with scores of classes, latitude bands and solid angles."""
-        return segmentation_record(result, self.class_names, self.absent_class, noun)
+    def record(self, result: SegmentationCounts, noun: str) -> Record:
+        """The record, with scores of classes and latitude bands, and intervals over the images."""
+        on_sphere, absent = bool(result.solid_angle.any()), self.absent_class
+        pixels = segmentation_scores(result.pixels, absent)
+        angles = segmentation_scores(result.solid_angle, absent if on_sphere else "skip")
+        of_class = {"iou": pixels.iou, "accuracy": pixels.accuracy}
+        of_class |= {f"iou{SOLID_ANGLE}": angles.iou, f"accuracy{SOLID_ANGLE}": angles.accuracy}
+        bands = [segmentation_scores(band, absent) for band in result.bands if on_sphere]
+        by_pixels, by_angle = result.of_images.swapaxes(0, 1)
+        intervals = bootstrap_intervals(by_pixels, absent)
+        if on_sphere:
+            by_name = bootstrap_intervals(by_angle, absent).items()
+            intervals |= {name + SOLID_ANGLE: ends for name, ends in by_name}
+        return replace(
+            super().record(result, noun),
+            classes=class_entries(
+                {**of_class, "share": pixels.share}, result.pixels, self.class_names
+            ),
+            latitude_bands=[
+                {"latitude_deg": [south, north]}
+                | plain_scores({"miou": band.miou, "macc": band.macc})
+                for north, south, band in zip(
+                    BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False
+                )
+            ],
+            confusion=result.pixels.tolist(),
+            intervals=intervals,
+        )
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None

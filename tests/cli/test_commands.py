@@ -297,7 +297,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["optimizer.lr=abc"], "optimizer: found .*; expected settings that torch.optim"),
         (["trainer.max_epochs=0"], "trainer.max_epochs: found 0"),
         (["trainer.precision=fp16"], "trainer: found .*Precision 'fp16' is invalid"),
-        (["optimizer.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
+        (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
         (
             ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.images_per_chunk=1"],

@@ -174,7 +174,7 @@ def test_aliases_in_settings_are_not_followed(tmp_path: Path) -> None:
     lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]" for k in range(1, 12)]
     (tmp_path / "config.yaml").write_text("\n".join(lines))
-    with pytest.raises(DataError, match=r"config\.yaml: found an alias"):
+    with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: an alias"):
         read_settings(tmp_path / "config.yaml")
     (tmp_path / "config.yaml").write_text("x: " + "[" * 1500 + "]" * 1500)
     with pytest.raises(DataError, match=r"config\.yaml: found RecursionError"):

@@ -83,7 +83,7 @@ def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
     task = _task(SignNetwork(), images_per_forward=7)
     trainer = quiet_trainer()
     (figures,) = trainer.test(task, datamodule=Data(), verbose=False)
-    assert task.result.images == 3
+    assert task.evaluated == 3
     assert task.result.pixels[0].sum() == 0, "unknown truth counts for nothing"
     assert task.result.pixels[:, 0].sum() == 0, "unknown is never predicted"
     assert task.result.pixels.sum() == 3 * 30 * 64
