@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, of_extra
 from tangent_train.files import crc32_of
 
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
@@ -40,8 +40,8 @@ class OnnxNetwork(nn.Module):
         image_size: The only rows and columns it takes; None where it takes others.
 
     Raises:
-        DataError: There is no such file, it is no network of this kind, it needs other files, or
-            onnxruntime is missing.
+        DataError: There is no such file, it is not a network of this kind, or it needs other files.
+        SettingError: onnxruntime is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,23 +49,15 @@ class OnnxNetwork(nn.Module):
         self.path = path
         if not path.is_file():
             raise DataError(path, found="no such file", expected="an ONNX file")
-        try:
+        with of_extra("export", path):
             import onnx
             import onnxruntime
-        except ImportError as error:
-            raise DataError(
-                path,
-                found="an ONNX file",
-                expected="the packages onnx and onnxruntime, to run it",
-                remedy="Run: pip install 'tangent-train[export]'",
-            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = _ERRORS_ONLY
         # Threads that wait for work by spinning take the cores from what is done with the scores.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        usable = {"CPUExecutionProvider"}
-        usable |= {"CUDAExecutionProvider"} if torch.cuda.is_available() else set()
+        usable = ["CPUExecutionProvider", *["CUDAExecutionProvider"] * torch.cuda.is_available()]
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]
         try:
             # Both read the file alike, whatever its name and its first bytes are.
@@ -92,9 +84,8 @@ class OnnxNetwork(nn.Module):
                 expected="images (B, C, h, w) as the only input, scores as the only output",
             )
         self._input = inputs[0]
-        if self._input.type not in _TYPES:
-            found, expected = f"images as {self._input.type}", " or ".join(_TYPES)
-            raise DataError(path, found=found, expected=expected)
+        if (kind := self._input.type) not in _TYPES:
+            raise DataError(path, found=f"images as {kind}", expected=" or ".join(_TYPES))
         shape = self._input.shape
         self._channels_last = shape[3] == _COLORS and shape[1] != _COLORS
         self._batch = shape[0] if isinstance(shape[0], int) else None

@@ -60,7 +60,7 @@ class Masks:
             self._path = Path(mask)
             self.of_each = self._path.is_dir()
             self._files = NamedFiles(self._path) if self.of_each else None
-            self._of_all = None if self.of_each else self._read(self._path)
+            self._of_all = None if self.of_each else counts(self._checked(self._path))
         elif isinstance(mask, np.ndarray) and mask.ndim == 2:
             self._path, self._of_all = Path(setting), mask != 0
         elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
@@ -101,7 +101,7 @@ class Masks:
         path, own = self._path, self._of_all
         if self.of_each:
             path = self._file(name)
-            own = self._read(path)
+            own = self._counts(self._checked(path))
         counts = area.place(np.full(area.image_shape, 255, np.uint8))
         rows = area.full_shape[0]
         counts[90 - (np.arange(rows) + 0.5) * 180 / rows < self._lowest_deg] = 0
@@ -116,9 +116,6 @@ class Masks:
 
     def _file(self, name: str) -> Path:
         return self._path if self._files is None else self._files.path(f"{name}.png")
-
-    def _read(self, path: Path) -> NDArray[np.bool_]:
-        return self._counts(self._checked(path))
 
     def _checked(self, path: Path) -> Path:
         there = path.is_file()

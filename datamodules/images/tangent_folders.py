@@ -98,12 +98,11 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
     height, width = equirect_shape(level)
     if image.shape[0] <= height or image.dtype not in _RESIZABLE:
         return image
-    channels = np.atleast_3d(image)
-    small = np.empty((height, width, channels.shape[2]), image.dtype)
-    for k in range(channels.shape[2]):  # OpenCV takes four channels at most
-        one = np.ascontiguousarray(channels[..., k])
-        small[..., k] = cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
-    return small.reshape(height, width, *image.shape[2:])
+    small = [  # OpenCV takes four channels at most
+        cv2.resize(np.ascontiguousarray(channel), (width, height), interpolation=cv2.INTER_AREA)
+        for channel in np.moveaxis(np.atleast_3d(image), -1, 0)
+    ]
+    return np.stack(small, axis=-1).reshape(height, width, *image.shape[2:])
 
 
 def write_tangent_folder(

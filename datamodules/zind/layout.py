@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.geometry import equirect_latitudes, equirect_to_lonlat
+from tangent_train.geometry import equirect_latitudes, equirect_longitudes
 
 CLASSES: tuple[str, ...] = ("ceiling", "floor", "wall", "door", "window")
 """The classes as labels 1 to 5; 0 is unknown."""
@@ -111,8 +111,7 @@ class Layout:
         return np.where(known, distances, np.nan)
 
     def _columns(self, width: int) -> _Columns:
-        columns = np.stack([np.arange(width), np.zeros(width)], axis=-1)
-        longitudes = equirect_to_lonlat(columns, (1, width))[:, 0]
+        longitudes = equirect_longitudes(width)
         ahead = np.stack([-np.sin(longitudes), np.cos(longitudes)], axis=-1)
         walls = np.roll(self.vertices, -1, axis=0) - self.vertices
         with np.errstate(divide="ignore", invalid="ignore"):  # walls seen from their end
