@@ -26,7 +26,7 @@ from tangent_train.rendering import Blend, tangent_to_equirect
 from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
 
-Kind = Literal["color", "labels", "depth", "features"]
+ResultKind = Literal["color", "labels", "depth", "features"]
 """Meaning of pixels: colors and features are interpolated, labels and depth never."""
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
@@ -89,11 +89,11 @@ class TangentResults:
 
     arrays: Sequence[NDArray[Any]]
     grid: PinholeGrid
-    kind: Kind
+    kind: ResultKind
 
     @classmethod
     def read(
-        cls, files: Sequence[Path], grid: PinholeGrid, kind: Kind | Literal["auto"]
+        cls, files: Sequence[Path], grid: PinholeGrid, kind: ResultKind | Literal["auto"]
     ) -> TangentResults:
         """Read and check them.
 
@@ -127,8 +127,8 @@ class TangentResults:
                 files[0],
                 found=f"{first.dtype} of shape {first.shape}",
                 expected=f"{decided}",
-                remedy=f"Say what they are with kind={', '.join(get_args(Kind))}: labels and depth "
-                "have one channel, colours one or three.",
+                remedy=f"Choose kind={', '.join(get_args(ResultKind))}: labels and depth have one "
+                "channel, colours one or three.",
             )
         return cls(arrays, grid, decided)
 
@@ -200,7 +200,7 @@ class TangentResults:
             out[part] = tangent_to_equirect(group, grid, shape, blend)
 
 
-def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
+def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
     is_array, kind = file.suffix.lower() == ".npy", array.dtype.kind
     if is_array and kind == "f":
         return "features"

@@ -20,7 +20,6 @@ from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, rende
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import (
     PANORAMA,
-    SUFFIXES,
     RoomPlan,
     camera_identifier,
     encode_picture,
@@ -132,14 +131,7 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
         write_text(labels, json.dumps(label_strings(plans)))
     frames = (PANORAMA, *map(str, range(settings.views_per_camera)))
     unfinished = [
-        plan
-        for plan in plans
-        if not all(
-            (root / plan.file(camera, frame, kind)).exists()
-            for camera in plan.cameras
-            for frame in frames
-            for kind in SUFFIXES
-        )
+        plan for plan in plans if not all((root / file).exists() for file in plan.files(frames))
     ]
     making = in_processes(make_room, [(root, settings, plan) for plan in unfinished], workers)
     before = len(plans) - len(unfinished)

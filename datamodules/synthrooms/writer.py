@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Sequence
+from itertools import product
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -62,8 +63,13 @@ class RoomPlan(NamedTuple):
         """Room type and number, as in file names."""
         return f"{self.kind}_{self.number}"
 
+    def files(self, frames: Sequence[str]) -> list[PurePosixPath]:
+        """Return the paths of all files of some frames of all cameras, see `file`."""
+        every = product(self.cameras, frames, SUFFIXES)
+        return [self.file(camera, frame, kind) for camera, frame, kind in every]
+
     def file(self, camera: str, frame: str, kind: str) -> PurePosixPath:
-        """Path of a file, relative to the data set's folder.
+        """Return the path of a file, relative to the data set's folder.
 
         Args:
             camera: One of `cameras`.
