@@ -31,7 +31,7 @@ class Origins(NamedTuple):
     share: float
 
     def __str__(self) -> str:
-        """Lines for the terminal."""
+        """Return lines for the terminal."""
         lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
         for kind, reasons in (
             ("adapted", self.adapted),

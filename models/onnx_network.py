@@ -35,7 +35,7 @@ class OnnxNetwork(nn.Module):
 
     Attributes:
         path: The file.
-        metadata: The file's own, text by key.
+        metadata: Metadata of the file, text by key.
         checksum: Checksum of its tensors.
         image_size: The only rows and columns it takes; None where it takes others.
 
@@ -95,7 +95,7 @@ class OnnxNetwork(nn.Module):
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
+        """Return scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
 
         Raises:
             SettingError: The file was made for images of another shape, or gives something else.
@@ -107,7 +107,7 @@ class OnnxNetwork(nn.Module):
         return (parts[0] if len(parts) == 1 else torch.cat(parts)).to(images.device)
 
     def _run(self, part: Tensor, images: Tensor) -> Tensor:
-        """Scores or labels of some images, of the size of the images."""
+        """Return scores or labels of some images, of the size of the images."""
         missing = 0 if self._batch is None else self._batch - len(part)
         if missing:
             part = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)])
@@ -146,19 +146,19 @@ class OnnxNetwork(nn.Module):
 
 
 def graph_checksum(graph: Any) -> str:
-    """CRC-32 of all tensors in an ONNX graph, in their order."""
+    """Return the CRC-32 of all tensors in an ONNX graph, in their order."""
     return crc32_of(tensor.SerializeToString(deterministic=True) for tensor in _tensors(graph))
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
-    """The output of a network as ``(B, K, h, w)``, maps with K = 1; None for anything else.
+    """Return an output as ``(B, K, h, w)``, maps with K = 1; None for other shapes.
 
     The axis of the classes is the one without which rows and columns have one stride.
 
     Args:
         returned: By the network.
         size: Rows and columns of the images.
-        last: Whether the channels of the images are last, to decide where both axes could be.
+        last: True if the channels of the images are last; decides if both axes are possible.
     """
     if returned.ndim == _LABEL_MAP:
         returned = returned[:, None]
@@ -173,7 +173,7 @@ def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tens
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """All tensors in a message and in those inside it."""
+    """Return all tensors in a message and in those inside it."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in value if hasattr(value, "__len__") else [value]:

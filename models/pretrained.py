@@ -81,7 +81,7 @@ def _equal(one: Tensor | None, other: Tensor | None) -> bool:
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
-    """The mappings with tensors in a file, by their place, such as ``state_dict``; the whole is "".
+    """Read the mappings with tensors in a file, by place, e.g. ``state_dict``; the whole is "".
 
     Names of tensors in mappings inside them are joined by dots. Those of ``state_dict`` are the
     ones under ``network.`` if there are any, as in checkpoints of this package.
@@ -113,7 +113,7 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
 def _mappings(
     content: Mapping[Any, Any], seen: set[int], depth: int = 0
 ) -> dict[str, dict[str, Tensor]]:
-    """The mappings with tensors in one, each once, itself as ""; see `read_tensors`."""
+    """Return the mappings with tensors in a mapping, each once, itself as ""."""
     seen.add(id(content))
     tensors: dict[str, Tensor] = {}
     inside: dict[str, dict[str, Tensor]] = {}
@@ -130,7 +130,7 @@ def _mappings(
 
 
 def _inner(name: str) -> str:
-    """The name without the attributes by which modules of this package hold a network."""
+    """Return a name without the attributes by which modules of this package hold a network."""
     return ".".join(part for part in name.split(".") if part != "network")
 
 
@@ -174,19 +174,19 @@ def load_tensors(
     Args:
         network: The network, changed in place.
         tensors: Names and values.
-        source: Their source, for the message.
+        source: Source of the tensors, for the message.
         fresh: Prefix of the names of tensors that are not loaded; None where all are.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape.
     """
-    own = {
+    kept = {
         name: tensor
         for name, tensor in network.state_dict().items()
         if _COUNTER in name or (fresh is not None and name.startswith(fresh))
     }
     try:
-        network.load_state_dict({**own, **tensors})
+        network.load_state_dict({**kept, **tensors})
     except RuntimeError as error:
         raise DataError(
             source,

@@ -1,4 +1,4 @@
-"""Training, validation and test splits of a user's own data set."""
+"""Training, validation and test splits of a user-defined data set."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FolderSplits:
         validation_fraction: Share of the training scenes for validation, if drawn: at least one,
             never all, so none of a single image; 0 for no validation, whether there is a list or
             not.
-        seed: Of the drawing.
+        seed: Seed of the drawing.
     """
 
     root: Path
@@ -43,7 +43,7 @@ class FolderSplits:
     def divide(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, list[ImageFiles]]:
-        """The images of every split, each in the order given.
+        """Return the images of every split, in the order given.
 
         Args:
             images: All of the data set.
@@ -71,7 +71,7 @@ class FolderSplits:
     def _read_lists(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
-        """Names in each existing list."""
+        """Read the names in each existing list."""
         # Lists may name images with or without their suffix.
         names = {f.name + suffix: f.name for f in images for suffix in ("", f.rgb.suffix)}
         listed: dict[Split, set[str]] = {}
@@ -111,7 +111,7 @@ class FolderSplits:
         return {name for name, group in groups.items() if group in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:
-        """The names, if there are any."""
+        """Return the names if there are any."""
         if not names:
             raise DataError(
                 self.root,
@@ -124,7 +124,7 @@ class FolderSplits:
 
 
 def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
-    """The image that a line of a list names, which is then that list's own."""
+    """Return the image that a line of a list names, and assign it to that list."""
     if line not in names:
         raise DataError(
             path,
@@ -143,7 +143,7 @@ def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str,
 
 
 def _lines(path: Path) -> list[str]:
-    """The names in a list, without empty lines and those that begin with #."""
+    """Read the names in a list, without empty lines and comments (#)."""
     try:
         lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:

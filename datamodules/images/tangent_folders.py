@@ -35,12 +35,12 @@ _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 def panorama_area(
     path: Path, size: tuple[int, int], crop: Sequence[float] | None = None
 ) -> PanoramaArea:
-    """The part of the sphere that a file shows.
+    """Return the part of the sphere that a file shows.
 
     Args:
         path: An image, or an array or video, which have no GPano tags.
-        size: Its rows and columns, of a video those of a frame.
-        crop: That part, see `area_of_crop`; None for that of its GPano tags.
+        size: Rows and columns of the image or of a frame of the video.
+        crop: The part, see `area_of_crop`; None for the part in the GPano tags.
 
     Raises:
         DataError: It is neither a whole panorama nor tagged as a part of one.
@@ -118,7 +118,7 @@ def write_tangent_folder(
         folder: A new one, or one with tangent images of an earlier run, which it replaces.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
         cameras: Content of its ``cameras.json``.
-        interpolation: As of `equirect_to_tangent`.
+        interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
     Raises:
@@ -137,7 +137,7 @@ def write_tangent_folder(
 
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[Path]:
-    """A folder to be filled by the block; it appears once that has succeeded.
+    """Open a folder to be filled by the block; it appears once the block has succeeded.
 
     Args:
         folder: A new one, or one that holds only what an earlier run wrote.

@@ -40,10 +40,10 @@ _NO_DEPTH = 65535
 
 
 def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
-    """The results for all images of a grid: files with the images' names and any suffix.
+    """List the results for all images of a grid: files with the images' names.
 
     Args:
-        folder: Their folder.
+        folder: Folder of the results.
         cameras: The images.
 
     Returns:
@@ -149,7 +149,7 @@ class TangentResults:
                 32-bit and labels the smallest integers that hold them.
             shape: ``(H, W)`` of the panorama.
             blend: Blending of overlapping images, for colors and features.
-            z_depth: Whether depth is along the axes of the images' cameras, to be converted to
+            z_depth: True if depth is along the axes of the images' cameras, to be converted to
                 distance from the center.
 
         Raises:
@@ -210,7 +210,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
-    """Distances from the center, of depth ``(d, d)`` along the axis of an image's camera."""
+    """Convert depth ``(d, d)`` along the axis of an image's camera to distances."""
     lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)

@@ -201,7 +201,7 @@ def _check_end(path: Path) -> None:
 
 
 def _is_shown(packet: Any) -> bool:
-    """False for packets that an edit list hides, and reference frames of VP8 (RFC 6386, 9.1)."""
+    """False for packets hidden by an edit list, and for reference frames of VP8 (RFC 6386, 9.1)."""
     hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
     return not (packet.is_discard or hidden)
 
@@ -259,7 +259,7 @@ def write_video(
     Args:
         path: The file, which appears once complete.
         source: The other video.
-        size: Its number of frames, rows and columns by `read_video_size`.
+        size: Number of frames, rows and columns of the other video by `read_video_size`.
         paint: Returns a frame ``(H, W, 3)`` of the new one for the number of a frame and the
             upright frame of the other one. Called in threads.
         every: Take the first and then every n-th frame.

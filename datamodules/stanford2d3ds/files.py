@@ -95,9 +95,9 @@ class PictureFiles(NamedTuple):
 
     Attributes:
         area: One of `AREAS`.
-        name: Its name.
-        image: Its files, named ``area_3/office_2/<32 hex>``; of photos with the frame.
-        pose: Its camera and pose.
+        name: Parts of the file name.
+        image: Files of the image, named ``area_3/office_2/<32 hex>``; photos with the frame.
+        pose: File of camera and pose.
     """
 
     area: str

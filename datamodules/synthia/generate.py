@@ -67,7 +67,7 @@ class ViewStitcher:
         height: Rows of the panorama, which is twice as wide.
 
     Attributes:
-        camera_matrix: As given.
+        camera_matrix: ``(3, 3)`` K of all views.
     """
 
     def __init__(
@@ -95,11 +95,11 @@ class ViewStitcher:
         interpolation: Literal["bilinear", "nearest"],
         elsewhere: int = 0,
     ) -> NDArray[Any]:
-        """Panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
+        """Return panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
 
         Args:
             views: The images.
-            interpolation: Of colors; labels and distances are not to be mixed.
+            interpolation: `bilinear` for colors, `nearest` for labels and distances.
             elsewhere: Value outside the views.
         """
         return cv2.remap(
@@ -114,7 +114,7 @@ class ViewStitcher:
 def _view_positions(
     camera_matrix: NDArray[np.float64], height: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """View that owns each column of a panorama, and the column's pixels in that view.
+    """Return the view that owns each column of a panorama, and its pixels in that view.
 
     All pixels of a column belong to the view whose optical axis is nearest, as the views are
     upright: there they are nearest to the image center.
@@ -178,7 +178,7 @@ def make_panoramas(
 
 
 def _claim(folder: Path, frames: int, height: int) -> bool:
-    """Whether there are panoramas to generate; if so, mark their folder."""
+    """Mark a folder in which panoramas are to be generated; False if there are none."""
     pano = folder / "pano"
     is_ours, has_files = (pano / MANIFEST).exists(), any(pano.glob("**/[!.]*.png"))
     if not list_frames(folder):
@@ -196,7 +196,7 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
 def _unfinished(
     root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
 ) -> list[Callable[[], None]]:
-    """Panoramas to generate, after a check of all their sources."""
+    """Return the panoramas to generate, after a check of all their sources."""
     size: tuple[int, int] | None = None
     whole = []
     for frame in frames:

@@ -72,7 +72,7 @@ class RoomSettings:
 
     @classmethod
     def of(cls, given: RoomSettings | Mapping[str, Any]) -> RoomSettings:
-        """Settings from a config."""
+        """Return settings from a config."""
         return given if isinstance(given, RoomSettings) else cls(**given)
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class RoomSettings:
 
 
 def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
-    """All rooms of a data set, in the order of the label table."""
+    """Return all rooms of a data set, in the order of the label table."""
     plans: list[RoomPlan] = []
     numbers = {area[0]: 0 for area in AREAS}
     for area in (area for area, count in settings.rooms.items() for _ in range(count)):
