@@ -94,8 +94,8 @@ def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
     """A block that imports packages of an extra of tangent-train.
 
     Args:
-        extra: Its name.
-        subject: What needs them.
+        extra: Name of the extra.
+        subject: Setting or file that needs these packages.
         remedy: Another remedy.
 
     Raises:

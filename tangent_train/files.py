@@ -85,10 +85,10 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _sync(path.parent)
     except Exception as error:
         known = isinstance(error, OSError) and error.errno is not None
-        told = no_room(path, error if known else _refused(temporary))
-        if told is None:
+        full = no_room(path, error if known else _refused(temporary))
+        if full is None:
             raise
-        raise told from error
+        raise full from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -101,7 +101,7 @@ def reserve(file: IO[bytes], size: int) -> None:
 
     Args:
         file: Open for reading and writing.
-        size: Its final size in bytes.
+        size: Final size of the file in bytes.
 
     Raises:
         OSError: There is too little room.
@@ -129,7 +129,7 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 def write_text(path: Path, content: str) -> None:
     """Write `content` to `path` atomically, UTF-8."""
-    # Names of files may hold bytes that are no text.
+    # Names of files may contain bytes that are not text.
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
@@ -256,7 +256,7 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence
     files are untrusted.
 
     Args:
-        columns: Their names.
+        columns: Names of the columns.
         rows: Values in that order, or by column; None, or a missing one, is an empty cell.
 
     >>> csv_text(["class", "iou"], [{"class": "=1+1", "iou": -0.5}])

@@ -1,12 +1,16 @@
-"""Importing libraries that search the working directory for their own files."""
+"""Imports and calls of other libraries: without local files, downloads and output."""
 
 from __future__ import annotations
 
+import io
+import logging
 import multiprocessing  # noqa: F401 - notes the working directory, where its processes start
 import os
+import warnings
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager
+from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
@@ -25,6 +29,40 @@ def elsewhere() -> Iterator[None]:
             entries = os.environ.pop("LD_LIBRARY_PATH", "").split(os.pathsep)
             if entries := [entry for entry in entries if entry]:
                 os.environ["LD_LIBRARY_PATH"] = os.pathsep.join(entries)
+
+
+@contextmanager
+def offline() -> Iterator[None]:
+    """Keep huggingface_hub, and all libraries that fetch through it, off the network in a block.
+
+    What the block would fetch is an error of these libraries, unless it is in their local cache.
+    """
+    try:
+        from huggingface_hub import constants
+    except ImportError:  # nor is any library that fetches through it
+        yield
+        return
+    hub: Any = constants
+    before = hub.HF_HUB_OFFLINE
+    hub.HF_HUB_OFFLINE = True  # the value of the environment variable, which is read at import
+    try:
+        yield
+    finally:
+        hub.HF_HUB_OFFLINE = before
+
+
+@contextmanager
+def hide_output() -> Iterator[None]:
+    """Hide log records, warnings and printed lines of a library whose results are verified."""
+    disabled = logging.root.manager.disable
+    logging.disable()
+    try:
+        silent = io.StringIO()
+        with warnings.catch_warnings(), redirect_stdout(silent), redirect_stderr(silent):
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(disabled)
 
 
 def is_private(folder: Path) -> bool:

@@ -1,10 +1,10 @@
 """Building objects from settings, and the registry of those that files may name.
 
 ``_target_`` of a config section names the object to build. Config folders and the command line are
-the user's own and may name any class or function. Files are untrusted plain data: they may name
-registered classes and give their arguments, as far as the argument types allow, and are never
-interpreted: no interpolations, no positional arguments, no paths, no URLs. `build_from_config` is
-the only code that builds objects from settings.
+the user's own: Hydra builds their sections, and they may name any class or function. Files are
+untrusted plain data: they may name registered classes and give their arguments, as far as the
+argument types allow, and are never interpreted: no interpolations, no positional arguments, no
+paths, no URLs. `build_from_config` is the only code that builds objects from settings.
 
 This module imports nothing heavy: networks and data sets import it.
 """
@@ -14,18 +14,19 @@ from __future__ import annotations
 import inspect
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, fields, is_dataclass
+from difflib import get_close_matches
 from functools import partial
 from importlib import import_module
 from pathlib import Path
 from pkgutil import resolve_name
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tangent_train.errors import DataError, SettingError, printable
-from tangent_train.offline import offline
+from tangent_train.imports import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
 """Packages whose public names files may give, where they are registered."""
@@ -35,6 +36,15 @@ _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]{0,99})?", re.ASCII)
 
 _DEEPEST = 12
 _PLAIN = (bool, int, float, str, NoneType)
+_HYDRA = {
+    "_target_": str,
+    "_args_": None,
+    "_convert_": Literal["none", "partial", "object", "all"],
+    "_partial_": None,
+    "_recursive_": bool,
+}
+"""Names in a section that are not arguments, with the kinds of value that any file may give."""
+
 _CALLED_LATER = ("mixer", "optimizer", "scheduler")
 """Sections of a file that may be ``_partial_``: functions that still take an argument."""
 
@@ -97,44 +107,132 @@ def build_from_config(
 ) -> Any:
     """Build the object that a section of a config describes.
 
+    The user's own sections are built by `hydra.utils.instantiate` with all of its conventions, and
+    ``_convert_: all`` as the default. A section that comes from a file, even in part, is built here
+    and never interpreted.
+
     Args:
-        settings: ``_target_``, its arguments by name, which may be such sections themselves, and
-            perhaps ``_partial_: true`` for a function that still takes further ones.
-        place: Of the section, for messages.
+        settings: ``_target_``, and its arguments by name, which may be such sections themselves.
+            ``_partial_: true`` returns a function that takes further arguments.
+        place: Place of the section, for messages.
         file: File of the settings; None for the user's own, which may name anything.
         **given: Further arguments, handed on as they are.
 
     Raises:
         SettingError: The class or function cannot be imported, gets text for a number, or does not
-            take what it gets; of a class of the user's own other errors are its own.
+            take its arguments; other errors of a user's own class are raised as they are.
         DataError: The file gives forbidden or invalid settings.
     """
     maker, kinds = _maker(settings, place, file)
-    restored = [name for name, kind in kinds.items() if kind is Weights and file is not None]
-    arguments = dict.fromkeys(restored) | {
-        name: _argument(value, f"{place}.{name}", file, kinds.get(name, kinds.get("**")), kinds)
-        for name, value in settings.items()
-        if name != "_target_"
-    }
-    is_partial = arguments.pop("_partial_", False)
-    _check_taken(maker, settings["_target_"], arguments, place, file)
-    if is_partial:
-        return partial(maker, **arguments, **given)
-    source, name = file if file is not None and file.gave(place) else None, settings["_target_"]
+    weights = [name for name, kind in kinds.items() if kind is Weights and file is not None]
+    section = dict.fromkeys(weights) | dict(settings)
+    source = file if file is not None and file.gave(place) else None
     try:
-        with nullcontext() if source is None else offline():
-            return maker(**arguments | given)
+        if source is None:
+            return _instantiated(section, place, given)
+        values = {
+            name: _argument(
+                value, f"{place}.{name}", source, kinds.get(name, kinds.get("**")), kinds
+            )
+            for name, value in section.items()
+            if name != "_target_"
+        }
+        arguments = {name: value for name, value in values.items() if name not in _HYDRA}
+        _check_taken(maker, settings["_target_"], arguments, place, source)
+        make = partial(maker, *values.get("_args_", ()), **arguments | given)
+        with offline():
+            return make if values.get("_partial_") else make()
     except (DataError, SettingError):
         raise
     except Exception as error:
-        foreign = _find(name) is None and not name.startswith("lightning.")
-        if source is None and (foreign or isinstance(error, OSError)):
-            raise
-        reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-        found, expected = f"{name} cannot be made ({reason})", "settings that it takes"
-        if source is not None:
-            raise DataError(source.path, found=f"{place}: {found}", expected=expected) from error
-        raise SettingError(place, found=found, expected=expected) from error
+        _refuse(error, settings["_target_"], place, source)
+
+
+def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, Any]) -> Any:
+    """Build a section of the user's own config as Hydra does."""
+    from hydra.utils import instantiate
+
+    for inner, at in _sections(section, place):
+        maker, kinds = _maker(inner, at, None)
+        arguments = [name for name in inner if name not in _HYDRA]
+        for name in arguments:
+            _check_whole(inner[name], f"{at}.{name}", kinds.get(name))
+        _check_taken(maker, inner["_target_"], arguments, at, None)
+    # References of the config are resolved already; Hydra would resolve what they gave twice.
+    whole = {"_convert_": "all", **section, "_partial_": True}
+    whole = without_interpolation(without_interpolation(whole))
+    try:
+        make = instantiate(whole)
+    except Exception as error:
+        inside = re.search(r"^full_key: (\S+)$", str(error), re.MULTILINE)
+        name = f"{place}.{inside[1]}" if inside else place
+        places = {re.sub(r"\.(?=\d)", "", at): at for _, at in _sections(section, place)}
+        at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
+        targets = {at: inner["_target_"] for inner, at in _sections(section, place)}
+        _refuse(error.__cause__ or error, targets[at], at, None)
+    return partial(make, **given) if section.get("_partial_") else make(**given)
+
+
+def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:
+    """A section and the sections in it that Hydra builds, with their places."""
+    if isinstance(value, Mapping) and "_target_" in value:
+        yield value, place
+    inner: Iterable[tuple[Any, Any]] = enumerate(value) if isinstance(value, list) else ()
+    if isinstance(value, Mapping) and value.get("_recursive_", True):
+        inner = value.items()
+    for name, one in inner:
+        yield from _sections(one, f"{place}.{name}")
+
+
+def _refuse(error: BaseException, name: str, place: str, source: SettingsFile | None) -> NoReturn:
+    """Raise an error of building an object: in one line, unless a user's own class raised it."""
+    if isinstance(error, DataError | SettingError):
+        raise error
+    foreign = _find(name) is None and not name.startswith("lightning.")
+    of_hydra = type(error).__module__.startswith(("hydra.", "omegaconf."))
+    if source is None and not of_hydra and (foreign or isinstance(error, OSError)):
+        raise error
+    reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
+    found, expected = f"{name} cannot be made ({reason})", "settings that it takes"
+    if source is not None:
+        raise DataError(source.path, found=f"{place}: {found}", expected=expected) from error
+    raise SettingError(place, found=found, expected=expected) from error
+
+
+def without_interpolation(value: Any) -> Any:
+    """Plain values that OmegaConf reads as they are."""
+    if isinstance(value, Mapping):
+        return {name: without_interpolation(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_interpolation(inner) for inner in value]
+    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
+
+
+def named_arguments(settings: Any) -> Any:
+    """Settings with positional arguments (``_args_``) by name, which files have to give."""
+    if isinstance(settings, list):
+        return [named_arguments(value) for value in settings]
+    if not isinstance(settings, Mapping):
+        return settings
+    named = {name: named_arguments(value) for name, value in settings.items()}
+    if "_target_" in named and "_args_" in named:
+        maker, positional = import_named(named["_target_"], ""), named["_args_"]
+        with suppress(TypeError, ValueError):
+            parameters = inspect.signature(maker).parameters.values()
+            names = [one.name for one in parameters if one.kind is one.POSITIONAL_OR_KEYWORD]
+            named |= dict(zip(names[: len(positional)], positional, strict=True))
+            del named["_args_"]
+    return named
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A sentence with the known name that is nearest to a misspelt one; "" without one.
+
+    >>> nearest("levl", ["seed", "level"])
+    'Is level meant? '
+    """
+    near = get_close_matches(name, known, 1)
+    return f"Is {near[0]} meant? " if near else ""
 
 
 def _check_taken(
@@ -156,8 +254,9 @@ def _check_taken(
         place,
         found=found,
         expected=expected,
-        remedy=f"Remove it with ~{name}, or choose an option of {place}=. Experiments have "
-        "settings of their own data set; recipe=small is for any panoramas.",
+        remedy=f"{nearest(unknown[0], known)}Remove it with ~{name}, or choose an option of "
+        f"{place}=. Experiments have settings of their own data set; recipe=small is for any "
+        "panoramas.",
     )
 
 
@@ -281,13 +380,13 @@ def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, M
 
 
 def _argument(
-    value: Any, place: str, file: SettingsFile | None, kind: Any, kinds: Collection[str] = ()
+    value: Any, place: str, file: SettingsFile, kind: Any, kinds: Collection[str] = ()
 ) -> Any:
-    """A value from settings, with the objects in it made."""
-    if file is not None and file.gave(place):
+    """A value from settings that a file gave at least in part, with the objects in it built."""
+    if file.gave(place):
         _check_argument(value, place, file, kind, kinds)
-    elif isinstance(value, str) and _is_whole(kind):
-        raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
+    else:
+        _check_whole(value, place, kind)
     if isinstance(value, Mapping) and "_target_" in value:
         return build_from_config(value, place, file)
     if isinstance(value, Mapping):
@@ -301,6 +400,8 @@ def _check_argument(
     value: Any, place: str, file: SettingsFile, kind: Any, kinds: Collection[str]
 ) -> None:
     section, _, name = place.rpartition(".")
+    if name in ("_convert_", "_recursive_"):  # values are plain, and sections are built, anyway
+        kind = _HYDRA[name]
     if name == "_partial_" and section.rpartition(".")[2] in _CALLED_LATER:
         kind = bool
     if kind is None:
@@ -311,9 +412,11 @@ def _check_argument(
         raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
 
 
-def _is_whole(kind: Any) -> bool:
-    """Whether a kind is of whole numbers or booleans only, perhaps optional."""
-    return set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
+def _check_whole(value: Any, place: str, kind: Any) -> None:
+    """Refuse text for a whole number or boolean, perhaps optional."""
+    whole = set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
+    if whole and isinstance(value, str):
+        raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
 
 
 def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:

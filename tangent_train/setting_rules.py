@@ -16,7 +16,10 @@ a transfer and one that can stand in for it, if it trains, and if it only evalua
 _ALWAYS = "resume report transfer evaluation"
 _RULES = (
     # Where files are, how a run is watched, how fast it is: no result depends on these.
-    (_ALWAYS, "checkpoint checkpoint_every_n_steps choices panels resume tensorboard_images trust"),
+    (
+        _ALWAYS,
+        "checkpoint checkpoint_every_n_steps choices logger panels resume trust validation_images",
+    ),
     (_ALWAYS, "data.in_memory data.label_table data.num_workers data.root data.store"),
     (_ALWAYS, "task.channels_last task.compile task.images_per_forward"),
     (_ALWAYS, "trainer.accelerator trainer.enable_model_summary trainer.enable_progress_bar"),
@@ -26,9 +29,9 @@ _RULES = (
     ("report", "data.fold data.seed seed"),
     # Of the evaluation: it comes after the training that is resumed.
     ("resume", "data.test_rotation task.absent_class"),
-    ("resume", "representation.average_rotations representation.further_levels"),
+    ("resume", "representation.blend representation.levels representation.rotations"),
     # Of the training: an evaluation does not depend on it.
-    ("evaluation", "optimizer scheduler"),
+    ("evaluation", "callbacks optimizer scheduler task.backbone_lr_factor"),
     ("resume evaluation", "task.images_per_chunk trainer.devices trainer.num_nodes"),
     ("resume evaluation", "trainer.max_epochs trainer.max_steps"),
     # A resumed run may go on for longer, or elsewhere, but takes the same steps.
@@ -45,6 +48,7 @@ _OF_THE_TRAINER = (
     "num_nodes plugins profiler strategy"
 )
 OF_THIS_MACHINE = (
+    *("callbacks", "logger"),
     *("data.label_table", "data.root", "data.store", "task.compile"),
     *(f"trainer.{name}" for name in _OF_THE_TRAINER.split()),
 )

@@ -22,6 +22,7 @@ from datamodules.core.inputs import (
     normalize,
     ordered_inputs,
 )
+from datamodules.core.labeled_images import LabeledImages
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
@@ -49,6 +50,7 @@ from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import shift_range
+from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
 
@@ -117,14 +119,18 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
             pass
         return index
 
-    def training_samples(self) -> TrainingImages:
-        """Samples `TrainingSample`."""
-        source, seed = self.source("train"), (self.seed, self.stream)
-        return TrainingImages(source, self.representation, seed, self.inputs, self.color_jitter)
+    def dataset(self, split: Split) -> TrainingImages | EvaluationImages:
+        """See `LabeledData`: samples `TrainingSample` or `EvaluationSample`."""
+        source, inputs = self.source(split), self.inputs
+        if split != "train":
+            return EvaluationImages(source, self.representation, inputs)
+        seed = self.seed, self.sampling_seed
+        return TrainingImages(source, self.representation, seed, inputs, self.color_jitter)
 
-    def evaluation_samples(self, split: Split) -> EvaluationImages:
-        """Samples `EvaluationSample`."""
-        return EvaluationImages(self.source(split), self.representation, self.inputs)
+    def images(self, split: Split) -> LabeledImages:
+        """Return the whole images of a split as arrays, see `LabeledImage`."""
+        reading: Any = self.index().read
+        return LabeledImages(self.source(split), reading.reader)
 
     @property
     def in_channels(self) -> int:
@@ -175,7 +181,7 @@ class PanoramaDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.need_representation(
+        self.require_representation(
             "erp_height",
             "one for panoramas",
             "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
@@ -192,6 +198,10 @@ class PanoramaDataModule(ImageDataModule):
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
+
+    def default_representation(self) -> TangentRepresentation:
+        """Tangent images of base level 0, at level 7."""
+        return TangentRepresentation(0, 7 if self.level is None else self.level)
 
     def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading]:
         """See `ImageDataModule`."""
@@ -225,6 +235,10 @@ class PanoramaDataModule(ImageDataModule):
             transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
         return SplitReader(index, split, Panorama, transforms)
 
+    def panoramas(self, split: Split) -> LabeledImages:
+        """Return the whole panoramas of a split as arrays: masked and rotated if set."""
+        return self.images(split)
+
     def estimate_up(self, judge: PanoramaJudge) -> None:
         """Let a network help to estimate the up directions of the test panoramas.
 
@@ -236,7 +250,7 @@ class PanoramaDataModule(ImageDataModule):
         """
         if self.upright == "auto":
             self._judge = judge
-            self._sources.pop("test", None)
+            self._readers.pop("test", None)
 
     def test_dataloader(self) -> DataLoader[Any]:
         """Batches for the test; a network estimates up directions first, in this process."""
@@ -266,7 +280,7 @@ class PhotoDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.need_representation(
+        self.require_representation(
             "of_camera",
             "one for photos",
             "Choose representation=perspective, or panoramas, as data=synthrooms.",
@@ -279,6 +293,10 @@ class PhotoDataModule(ImageDataModule):
             "its filters start at zero.",
         )
 
+    def default_representation(self) -> PerspectiveRepresentation:
+        """Crops of 45° at the resolution of level 7."""
+        return PerspectiveRepresentation(7 if self.level is None else self.level)
+
     def reading(self, reader: ImageReader) -> tuple[str, PhotoReading]:
         """See `ImageDataModule`."""
         return "photos", PhotoReading(reader, len(self.class_names))
@@ -288,6 +306,10 @@ class PhotoDataModule(ImageDataModule):
     ) -> SplitReader[ImageFiles, Photo]:
         """Photos from files or store."""
         return SplitReader(index, split, Photo)
+
+    def photos(self, split: Split) -> LabeledImages:
+        """Return the whole photos of a split as arrays."""
+        return self.images(split)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; crops must fit into the photo, too."""

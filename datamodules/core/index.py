@@ -77,16 +77,17 @@ class DatasetIndex(Generic[_Item]):
         """Decode every file by itself and note what is broken; nothing is written.
 
         Args:
-            problems: Known problems; new ones are added.
+            problems: Known problems; new ones and warnings are added.
             label_counts: The pixels of each label are added by image; shapes have none.
 
         Returns:
             How many images or shapes were read.
         """
         items = problems.without(self.of())
-        in_parts = hasattr(self.read, "parts")
         read: Any = self.read
-        parts = partial(read.parts, label_counts) if in_parts else partial(_whole, read)
+        parts = partial(_whole, read)
+        if hasattr(read, "parts"):
+            parts = partial(read.parts, label_counts, problems.warnings)
         self._note(problems, parts, items, "Checking")
         return len(items)
 

@@ -87,10 +87,7 @@ class Normalization:
         if isinstance(given, str):
             given = _NAMED.get(given, given)
         if isinstance(given, Mapping) and set(given) == {"mean", "std"}:
-            try:
-                given = cls(given["mean"], given["std"])
-            except SettingError as error:
-                raise SettingError(setting, found=error.found, expected=error.expected) from error
+            given = cls(given["mean"], given["std"])
             if given.channels < _SHAPES:
                 _check_colors(given, setting)
         if not isinstance(given, cls):

@@ -9,12 +9,12 @@ from typing import Any
 import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, Sampler, Subset
 
 from tangent_train.errors import DataError, SettingError
 
 Seed = int | tuple[int, int]
-"""A seed, 0 or more, or one with a stream; (seed, 0) is the same as the seed alone."""
+"""A seed, 0 or more, or two of them; (seed, 0) is the same as the seed alone."""
 
 
 def sample_rng(seed: Seed, epoch: int, index: int) -> np.random.Generator:
@@ -29,14 +29,26 @@ def sample_rng(seed: Seed, epoch: int, index: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch, index)))
 
 
-class EpochSampler(Sampler[tuple[int, int]]):
-    """Yields (epoch, index).
+def sample_key(key: int | tuple[int, int], length: int) -> tuple[int, int]:
+    """Return epoch and index of a sample: an index alone is of epoch 0.
 
-    * Shuffled (training), every process gets the same number of samples, as gradients are
-      exchanged at every step: the last few of the epoch's order, fewer than there are processes,
-      are dropped, different ones every epoch.
-    * In order (evaluation), process r gets r, r + world_size, …: every sample exactly once on any
-      number of processes, nothing repeated or dropped.
+    Args:
+        key: An index of a data set, which may count from its end; or an epoch and an index.
+        length: Number of samples.
+
+    Raises:
+        IndexError: There are fewer samples.
+    """
+    epoch, index = key if isinstance(key, tuple) else (0, key)
+    return epoch, range(length)[index]
+
+
+class EpochSampler(Sampler[tuple[int, int]]):
+    """Yields (epoch, index) in a new random order every epoch.
+
+    Every process gets the same number of samples, as gradients are exchanged at every step: the
+    last few of the epoch's order, fewer than there are processes, are dropped, different ones every
+    epoch.
 
     Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: create
     the trainer with ``use_distributed_sampler=False``.
@@ -44,7 +56,6 @@ class EpochSampler(Sampler[tuple[int, int]]):
     Args:
         length: Number of samples in the data set.
         seed: Seed of the order.
-        shuffle: A new random order every epoch.
         rank: This process.
         world_size: Number of processes.
         start: An epoch and the number of its samples that this process has consumed: a resumed run
@@ -58,27 +69,17 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self,
         length: int,
         seed: Seed,
-        shuffle: bool,
         rank: int = 0,
         world_size: int = 1,
         start: tuple[int, int] = (0, 0),
     ) -> None:
-        if length == 0:
-            raise SettingError("data", found="a split without images", expected="one or more")
-        if length < world_size:
-            raise SettingError(
-                "trainer.devices",
-                found=f"{world_size} processes for {length} samples",
-                expected="at least one sample each, in every split",
-                remedy="Use fewer processes.",
-            )
+        _check_length(length, world_size)
         self._length = length
         self._seed = seed
-        self._shuffle = shuffle
         self._rank = rank
         self._world_size = world_size
         self._start = start
-        # Workers of a resumed run start to fetch before Lightning says the epoch.
+        # Workers of a resumed run start to fetch before Lightning sets the epoch.
         self._epoch = start[0]
 
     def set_epoch(self, epoch: int) -> None:
@@ -86,23 +87,42 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self._epoch = epoch
 
     def __len__(self) -> int:
-        return len(range(self._rank, self._used, self._world_size))
+        return self._length // self._world_size
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         epoch = self._epoch
-        order = np.arange(self._length)
-        if self._shuffle:
-            order = np.random.default_rng(
-                np.random.SeedSequence(self._seed, spawn_key=(epoch,))
-            ).permutation(self._length)
-        start_epoch, had = self._start
-        mine = order[self._rank : self._used : self._world_size]
-        for index in mine[had if epoch == start_epoch else 0 :]:
+        seed = np.random.SeedSequence(self._seed, spawn_key=(epoch,))
+        order = np.random.default_rng(seed).permutation(self._length)
+        share = order[self._rank :: self._world_size][: len(self)]
+        start_epoch, consumed = self._start
+        for index in share[consumed if epoch == start_epoch else 0 :]:
             yield epoch, int(index)
 
-    @property
-    def _used(self) -> int:
-        return self._length - (self._length % self._world_size if self._shuffle else 0)
+
+def share_of_process(dataset: Dataset[Any]) -> Dataset[Any]:
+    """Return the samples of this process: of n processes, process r gets every n-th one from r on.
+
+    Each sample is in one share.
+
+    Raises:
+        SettingError: No samples, or fewer than processes.
+    """
+    rank, world_size = this_process()
+    length = len(dataset)  # type: ignore[arg-type]
+    _check_length(length, world_size)
+    return dataset if world_size == 1 else Subset(dataset, range(rank, length, world_size))
+
+
+def _check_length(length: int, world_size: int) -> None:
+    if length == 0:
+        raise SettingError("data", found="a split without images", expected="one or more")
+    if length < world_size:
+        raise SettingError(
+            "trainer.devices",
+            found=f"{world_size} processes for {length} samples",
+            expected="at least one sample each, in every split",
+            remedy="Use fewer processes.",
+        )
 
 
 _FEWER = (
@@ -114,16 +134,20 @@ _CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Erro
 
 
 def make_loader(
-    dataset: Dataset[Any], sampler: EpochSampler, batch_size: int, num_workers: int, seed: int
+    dataset: Dataset[Any],
+    batch_size: int,
+    num_workers: int,
+    seed: int,
+    sampler: EpochSampler | None = None,
 ) -> DataLoader[Any]:
-    """Batches of samples.
+    """Return batches of samples.
 
     Args:
-        dataset: Samples by (epoch, index).
-        sampler: Order of the samples.
+        dataset: Samples.
         batch_size: Samples of a batch.
         num_workers: Worker processes.
-        seed: Of the loader's own random numbers.
+        seed: Seed of the loader's own random numbers.
+        sampler: Order of the samples; by default that of the data set.
     """
     return DataLoader(
         dataset,

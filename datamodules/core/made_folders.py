@@ -53,3 +53,14 @@ def claim_folder(
             remedy="Name another folder.",
         )
     write_text(path, json.dumps({**about, "settings": dict(settings)}, indent=1) + "\n")
+
+
+def require_generated(root: Path) -> None:
+    """Refuse a generated data set whose folder is missing.
+
+    Raises:
+        DataError: There is no such folder.
+    """
+    if not root.is_dir():
+        remedy = "Run tangent-prepare with the same settings."
+        raise DataError(root, found="no such folder", expected="the data set", remedy=remedy)

@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.split_module import tell
+from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.images.gpano import area_of
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
@@ -170,10 +170,12 @@ class ImagePairs(PanoramaPairs):
         if pairing not in ("consecutive", "all"):
             raise SettingError("pairing", found=pairing, expected="consecutive or all")
         if input is not None:
-            paths = image_paths(input, tell=tell)
+            paths = image_paths(input, tell=print_on_rank_zero)
         else:
             paths = [
-                path for side in (str(left), str(right)) for path in image_paths(side, tell=tell)
+                path
+                for side in (str(left), str(right))
+                for path in image_paths(side, tell=print_on_rank_zero)
             ]
         if len(paths) < 2 or (input is None and len(paths) > 2):
             expected = "two panoramas" + ("" if input is None else " or more")

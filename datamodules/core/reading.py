@@ -31,6 +31,7 @@ class SplitReader(Generic[_Item, _Image]):
 
     Attributes:
         items: Their files.
+        transforms: Changes to every image, in their order.
     """
 
     def __init__(
@@ -43,7 +44,7 @@ class SplitReader(Generic[_Item, _Image]):
         self.items = index.splits[split]
         self._decode, self._store = index.read, index.store
         self._kind = kind
-        self._transforms = transforms
+        self.transforms = transforms
         self._kept: list[_Image] = []
 
     def __len__(self) -> int:
@@ -63,7 +64,7 @@ class SplitReader(Generic[_Item, _Image]):
             return self._kept[index]
         item = self.items[index]
         image = self._decode(item) if self._store is None else self._stored(self._store, item)
-        for transform in self._transforms:
+        for transform in self.transforms:
             image = transform(image, index, item)
         return image
 
@@ -71,14 +72,14 @@ class SplitReader(Generic[_Item, _Image]):
         """The labels of one image, cheaper than the whole image."""
         decode: Any = self._decode
         image: Any = None
-        if self._kept or self._transforms or self._store is not None:
+        if self._kept or self.transforms or self._store is not None:
             image = self.read(index)
         labels: NDArray[np.uint8] = (
             decode.labels(self.items[index]) if image is None else image.labels
         )
         return labels
 
-    def remember(self, root: object) -> None:
+    def keep_in_memory(self, root: object) -> None:
         """Read all images now and keep them in memory.
 
         Done before the loader's workers start, which then share the memory (on systems that fork);

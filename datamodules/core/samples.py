@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
 from datamodules.core.inputs import MAX_DEPTH_M, Input
-from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.reading import SplitReader
 from tangent_train.geometry import equirect_elevations
@@ -50,24 +50,22 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     """One whole panorama or photo; collated, each has a leading batch dimension.
 
     Attributes:
-        images: N images that cover it, as in `TrainingSample`.
+        images: Images of all view sets, one set after the other, as in `TrainingSample`.
         target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
             the crops of a photo.
-        rays: As in `TrainingSample`.
-        rotations: ``(K, 3, 3)`` float32, see `Views.rotations`.
+        rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
         index: Place in its split.
     """
 
     images: _Images
     target: Tensor
-    rays: Tensor
-    rotations: Tensor
+    rotation: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
 
 
 @dataclass(frozen=True)
 class TrainingImages(Dataset[TrainingSample[Inputs]]):
-    """Random views of images, by (epoch, index).
+    """Random views of images, by index or (epoch, index).
 
     Attributes:
         source: The images.
@@ -86,8 +84,8 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> TrainingSample[Inputs]:
-        epoch, index = key
+    def __getitem__(self, key: int | tuple[int, int]) -> TrainingSample[Inputs]:
+        epoch, index = sample_key(key, len(self))
         image = self.source.read(index)
         rng = sample_rng(self.seed, epoch, index)
         views = image.sampler(self.representation).sample(rng)
@@ -101,7 +99,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
 
 @dataclass(frozen=True)
 class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
-    """Whole images, by (epoch, index); the epoch changes nothing.
+    """Whole images, by index or (epoch, index); the epoch changes nothing.
 
     Attributes:
         source: The images.
@@ -116,17 +114,15 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> EvaluationSample[Inputs]:
-        _, index = key
+    def __getitem__(self, key: int | tuple[int, int]) -> EvaluationSample[Inputs]:
+        _, index = sample_key(key, len(self))
         image = self.source.read(index)
-        views = image.sampler(self.representation).whole()
-        return EvaluationSample(
-            render_inputs(image, views, self.inputs),
-            torch.tensor(image.target(self.representation)),
-            torch.from_numpy(world_rays(views, image.up)),
-            torch.from_numpy(views.rotations().astype(np.float32)),
-            index,
-        )
+        view_sets = image.sampler(self.representation).view_sets()
+        of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
+        images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
+        rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
+        target = torch.tensor(image.target(self.representation))
+        return EvaluationSample(images, target, torch.from_numpy(rotation), index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

@@ -20,9 +20,9 @@ import numpy as np
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.index import Split
 from datamodules.core.inputs import Input
+from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.core.split_module import tell
 from datamodules.folder.cameras import read_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
@@ -85,7 +85,7 @@ class LabelledFolder(ImageDataModule):
     def prepare_data(self) -> None:
         """See `SplitDataModule`; files that are not images are counted."""
         super().prepare_data()
-        image_paths(self.root / "images", tell=tell)
+        image_paths(self.root / "images", tell=print_on_rank_zero)
 
     def check(self) -> tuple[Problems, int]:
         """See `SplitDataModule`; files that training would pass over are named too."""

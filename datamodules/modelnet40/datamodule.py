@@ -35,6 +35,7 @@ from datamodules.modelnet40.shape_samples import (
 )
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
+from tangent_train.rendering import TangentRepresentation
 
 _PER_PROCESS = 40
 
@@ -71,7 +72,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.need_representation(
+        self.require_representation(
             "erp_height",
             "one for panoramas, such as the spheres of shapes",
             "Choose representation=tangent.",
@@ -82,6 +83,10 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         self.erp_height: int = self.representation.erp_height
         self.class_names = self.find_classes()
         self.set_normalization(SPHERE_NORMALIZATION, CHANNELS)
+
+    def default_representation(self) -> TangentRepresentation:
+        """Tangent images of base level 0, at level 5."""
+        return TangentRepresentation(0, 5 if self.level is None else self.level)
 
     def find_classes(self) -> tuple[str, ...]:
         """Names of the classes, even before the files exist."""
@@ -111,16 +116,13 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         """The spheres in the store."""
         return SplitReader(index, split, Spheres)
 
-    def training_samples(self) -> ShapeViews:
-        """Samples `ShapeSample`: random views, drawn and rotated as the representation says."""
-        source, seed = self.source("train"), (self.seed, self.stream)
-        return ShapeViews(source, self.class_names, self.representation, seed, random=True)
-
-    def evaluation_samples(self, split: Split) -> ShapeViews:
-        """Samples `ShapeSample` of all views; those of the test split are rotated if set."""
-        source, rotation = self.source(split), self.test_rotation if split == "test" else None
-        views = self.class_names, self.representation, self.seed
-        return ShapeViews(source, *views, rotation=rotation)
+    def dataset(self, split: Split) -> ShapeViews:
+        """See `LabeledData`: samples `ShapeSample`; the test shapes are rotated if set."""
+        source, views = self.source(split), (self.class_names, self.representation)
+        if split == "train":
+            return ShapeViews(source, *views, (self.seed, self.sampling_seed), random=True)
+        rotation = self.test_rotation if split == "test" else None
+        return ShapeViews(source, *views, self.seed, rotation=rotation)
 
     @property
     def in_channels(self) -> int:

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from datamodules.core.inputs import Normalization, normalize_channels
-from datamodules.core.loading import Seed, sample_rng
+from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.reading import SplitReader
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import ShapeFile
@@ -79,7 +79,7 @@ class ShapeSample(NamedTuple):
 
 @dataclass(frozen=True)
 class ShapeViews(Dataset[ShapeSample]):
-    """Views of shapes, by (epoch, index).
+    """Views of shapes, by index or (epoch, index).
 
     Attributes:
         source: The shapes.
@@ -100,10 +100,10 @@ class ShapeViews(Dataset[ShapeSample]):
     def __len__(self) -> int:
         return len(self.source)
 
-    def __getitem__(self, key: tuple[int, int]) -> ShapeSample:
-        epoch, index = key
-        views = self._views(epoch, index)
-        images = views.render(self.source.read(index).spheres, "bilinear")
+    def __getitem__(self, key: int | tuple[int, int]) -> ShapeSample:
+        epoch, index = sample_key(key, len(self))
+        spheres = self.source.read(index).spheres
+        images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(epoch, index)])
         # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
@@ -111,13 +111,13 @@ class ShapeViews(Dataset[ShapeSample]):
             torch.tensor(index),
         )
 
-    def _views(self, epoch: int, index: int) -> Any:
+    def _views(self, epoch: int, index: int) -> list[Any]:
         if self.random:
-            return self.representation.sample(sample_rng(self.seed, epoch, index))
+            return [self.representation.sample(sample_rng(self.seed, epoch, index))]
         if self.rotation is None:
-            return self.representation.whole()
+            return self.representation.view_sets()
         # Rotated back, it sees what a rotated shape shows.
-        return self.representation.turned(self.shape_rotation(index).T).whole()
+        return self.representation.with_rotation(self.shape_rotation(index).T).view_sets()
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
         """Return the rotation of one shape, ``(3, 3)``: its point x is now at R x."""

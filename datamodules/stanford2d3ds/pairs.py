@@ -11,15 +11,12 @@ hard with the overlap, 0.86, that six easy ones have: the split is by figures be
 from __future__ import annotations
 
 import csv
-import math
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
@@ -31,32 +28,8 @@ from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meter
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
-from datamodules.stanford2d3ds.reader import read_depth, read_pose_numbers
-from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
+from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PanoramaPose
-
-_KEYS = {"camera_rt_matrix": (3, 4), "camera_original_rotation": (3,), "camera_location": (3,)}
-
-
-def read_panorama_pose(path: Path) -> PanoramaPose:
-    """Read the pose file of a panorama.
-
-    Args:
-        path: ``…_domain_pose.json``.
-
-    Raises:
-        DataError: It cannot be read, or does not hold a pose.
-    """
-    rt, angles, location = read_pose_numbers(path, _KEYS)
-    if np.abs(angles).max() > 2 * math.pi:
-        angles = np.radians(angles)
-    original = euler_rotation(angles)
-    try:
-        return PanoramaPose(original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
-    except SettingError as error:
-        raise DataError(path, found=error.found, expected="a rotation") from error
-
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _SHORT = 7  # hexadecimal digits of a camera that the paper prints
@@ -143,9 +116,9 @@ class StanfordPairs(PanoramaPairs):
         rgb = read_rgb(image.rgb)
         shape = paired_shape(image.rgb, rgb, self._height)
         steps = resize_depth(read_depth(image.parts["depth"]), shape)
-        distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))
         pose = read_panorama_pose(files.pose)
-        return PairedPanorama(image.name, resize_area(rgb, shape), image.rgb, distance_m, pose)
+        small = resize_area(rgb, shape)
+        return PairedPanorama(image.name, small, image.rgb, steps_to_meters(steps), pose)
 
 
 def _room(files: PictureFiles) -> str:

@@ -7,6 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from datamodules.core.index import DatasetIndex
+from datamodules.core.made_folders import require_generated
+from datamodules.core.panoramas import ImageFiles
+from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
@@ -26,8 +30,6 @@ class SynthRoomsAreas(StanfordAreas):
         rooms: Rooms to generate; their areas are the areas used.
     """
 
-    is_made = True
-
     areas: Sequence[str] = field(init=False, default=())
     rooms: RoomSettings | Mapping[str, int | str | Mapping[str, int]]
 
@@ -39,6 +41,11 @@ class SynthRoomsAreas(StanfordAreas):
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
         generate_rooms(self.root, RoomSettings.of(self.rooms))
+
+    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
+        """See `LabeledData`."""
+        require_generated(self.root)
+        return super().find(problems)
 
 
 @registered

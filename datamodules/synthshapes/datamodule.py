@@ -6,7 +6,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from datamodules.core.index import DatasetIndex
+from datamodules.core.made_folders import require_generated
+from datamodules.core.problems import Problems
 from datamodules.modelnet40.datamodule import ModelNet40
+from datamodules.modelnet40.shape_files import ShapeFile
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 from tangent_train.registry import registered
 
@@ -23,8 +27,6 @@ class SynthShapes(ModelNet40):
         SettingError: A setting is invalid.
     """
 
-    is_made = True
-
     shapes: ShapeSettings | Mapping[str, int] | None = None
 
     def __post_init__(self) -> None:
@@ -40,3 +42,8 @@ class SynthShapes(ModelNet40):
         """Generate the files, unless they are there."""
         shapes: Any = self.shapes
         generate_shapes(self.root, shapes)
+
+    def find(self, problems: Problems) -> DatasetIndex[ShapeFile]:
+        """See `LabeledData`."""
+        require_generated(self.root)
+        return super().find(problems)

@@ -81,23 +81,25 @@ def read_settings(path: Path) -> dict[str, Any]:
     Raises:
         DataError: It is missing, or something else.
     """
-    expected = "the settings of a run"
+    expected = "the settings of a run, without aliases"
     try:
-        text = path.read_text(encoding="utf-8")
-        events = yaml.parse(text, yaml.SafeLoader)
-        aliased = any(isinstance(event, yaml.AliasEvent) for event in events)
-        content = None if aliased else _Loader(text).get_single_data()
+        content = _Loader(path.read_text(encoding="utf-8")).get_single_data()
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
         first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
         raise DataError(path, found=first_line, expected=expected) from error
     if not isinstance(content, dict):
-        found = "an alias" if aliased else type(content).__name__
-        raise DataError(path, found=found, expected=f"{expected}, without aliases")
+        raise DataError(path, found=type(content).__name__, expected=expected)
     settings: dict[str, Any] = check_plain(path, content, "settings")
     return settings
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        """Refuse aliases."""
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("an alias")
+        return super().compose_node(parent, index)
+
     def flatten_mapping(self, node: Any) -> None:
         """Refuse names that are there twice, of which PyYAML takes the last one."""
         names = [(name.tag, str(name.value)) for name, _ in node.value]

@@ -31,10 +31,10 @@ class ClassScoreNetwork(nn.Module):
         network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict with those under
             ``"out"`` (torchvision's), or to label maps.
         num_classes: K.
-        groups: Of every class the network's scores that make it up; scores in no group never win,
-            nor do classes without scores.
+        groups: The network's scores that make up each class; scores in no group never win, nor do
+            classes without scores.
         tile: Rows and columns of the only images that the network takes: larger ones are divided.
-        kind: What the network returns. Of kinds with a place K, groups name that place.
+        kind: Output of the network; groups contain the place K of kinds that have it.
 
     Attributes:
         num_scores: Scores of a pixel: K, or the number of groups.
@@ -125,15 +125,15 @@ def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:
         # Below all others at every pixel, and so in every mean of pixels. Not minus infinity, which
         # is not a number when it is weighted by 0.
         return scores.amin(1, keepdim=True) - _CERTAIN
-    own = scores[:, list(group)]
-    return own if len(group) == 1 else own.logsumexp(1, keepdim=True)
+    chosen = scores[:, list(group)]
+    return chosen if len(group) == 1 else chosen.logsumexp(1, keepdim=True)
 
 
 def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
     """The mean scores of the evenly spaced tiles that cover larger images."""
     starts = [
-        torch.linspace(0, side - own, -(-side // own)).round().int().tolist()
-        for side, own in zip(images.shape[-2:], tile, strict=True)
+        torch.linspace(0, side - part, -(-side // part)).round().int().tolist()
+        for side, part in zip(images.shape[-2:], tile, strict=True)
     ]
     total: Any = 0
     count = images.new_zeros(images.shape[-2:])
@@ -149,17 +149,8 @@ def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
     return result
 
 
-_PROBED = {
-    1: (127, 131),
-    2: (67, 71),
-    4: (37, 41),
-    8: (17, 19),
-    14: (11, 13),
-    16: (11, 13),
-    32: (5, 7),
-    64: (5, 7),
-    128: (5, 7),
-}
+_PROBED = {1: (127, 131), 2: (67, 71), 4: (37, 41), 8: (17, 19), 14: (11, 13), 16: (11, 13)}
+_PROBED |= dict.fromkeys((32, 64, 128), (5, 7))
 """Candidate multiples, and the factors to try each with: primes, so that a tried side is a
 multiple of nothing else. 14 is for transformers with such patches."""
 
@@ -168,7 +159,7 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
     """Find by trial the number that height and width must be multiples of.
 
     Args:
-        network: In evaluation mode, on the CPU; its result a tensor.
+        network: Network in evaluation mode on the CPU that returns a tensor.
         in_channels: Channels of its images.
 
     Returns:

@@ -59,8 +59,8 @@ class TrainedNetwork:
         inner: The network as it was trained or imported, in evaluation mode; see `network`.
         class_names: K + 1 names of the labels, the unknown class first; score k is that of label
             k + 1.
-        inputs: Its inputs, see `datamodules.core.inputs.Input`.
-        normalization: Of RGB and depth.
+        inputs: Inputs of the network, see `datamodules.core.inputs.Input`.
+        normalization: Normalization of RGB and depth.
         level: Level s it was trained at.
         representation: The section of the config it was trained with.
         image_size: Rows and columns of the images that representation evaluates on.
@@ -104,9 +104,10 @@ class TrainedNetwork:
         """Channels of its images."""
         return len(channel_names(self.inputs))
 
-    def labels(self, best: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
-        """Labels 1 … K of the best scores 0 … K - 1, and 0 where no class won, or was certain."""
-        labels = best + best.dtype.type(1)
+    def labels(self, best: Tensor) -> NDArray[np.unsignedinteger]:
+        """Labels 1 … K of the best scores 0 … K - 1; 0 where an unknown class won, or none."""
+        labels: NDArray[np.unsignedinteger] = best.cpu().numpy()
+        labels = labels + labels.dtype.type(1)
         labels[labels >= len(self.class_names)] = 0
         return labels
 
@@ -117,8 +118,8 @@ class NetworkDescription:
 
     Attributes:
         class_names: Names of its labels.
-        inputs: Its inputs; None of shapes.
-        normalization: Their ``mean`` and ``std``.
+        inputs: Inputs of the network; None for shapes.
+        normalization: ``mean`` and ``std`` of the inputs.
         groups: See `TrainedNetwork`.
         score_kind: See `TrainedNetwork`.
         settings: The section of a config that makes it, for any data: null where the data decides
@@ -152,13 +153,13 @@ _KINDS = {
 def completed_settings(
     settings: Any, in_channels: int, num_classes: int, *, restored: bool = False
 ) -> Any:
-    """Settings of a network, and of networks inside them, with what the data says where null.
+    """Complete the null settings of a network, and of networks inside it, from the data.
 
     Args:
         settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
         in_channels: Channels of the images.
         num_classes: Scores of the network.
-        restored: Whether a checkpoint will bring the tensors: no others are fetched first.
+        restored: True if a checkpoint has the tensors, so that no others are fetched first.
     """
     known = dict.fromkeys(_OF_THE_DATA, num_classes) | {"in_channels": in_channels}
     unwanted = _PRETRAINED if restored else ()

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import redirect_stdout
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from datamodules.core.class_weights import label_doubts
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.registry import build_from_config
 from tangent_train.results.tables import Table, percent
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 def check(settings: Mapping[str, Any]) -> None:
@@ -41,14 +37,16 @@ def check(settings: Mapping[str, Any]) -> None:
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
     labelled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
-    warnings = [
+    warnings = sorted(problems.warnings) + [
         doubt
         for split, counts in labelled.items()
         for doubt in label_doubts(split, counts, data.class_names)
     ]
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labelled:
-            _share_table(labelled, data.class_names).print()
+            shares = [[percent(share) for share in n / n.sum()] for n in labelled.values()]
+            columns = zip(data.class_names, *shares, strict=True)
+            Table("Pixels of each class, %", ["class", *labelled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     found = counted(len(listed), "problems") if listed else "Nothing is wrong"
@@ -57,11 +55,3 @@ def check(settings: Mapping[str, Any]) -> None:
     print_text(f"{found}; {read}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
-
-
-def _share_table(
-    label_counts: Mapping[str, NDArray[np.int64]], class_names: Sequence[str]
-) -> Table:
-    shares = [[percent(share) for share in n / n.sum()] for n in label_counts.values()]
-    rows = list(map(list, zip(class_names, *shares, strict=True)))
-    return Table("Pixels of each class, %", ["class", *label_counts], rows)

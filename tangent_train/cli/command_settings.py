@@ -43,8 +43,8 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
     for prefix, section in (("", config), ("photos.", config.get("photos") or {})):
         data = section.get("data") or {}
         root, mask = Path(str(data.get("root"))), data.get("mask")
-        is_read = datamodules.is_read(str(data.get("_target_")))
-        if f"{prefix}data.root" in typed_names and is_read and not root.is_dir():
+        is_missing = f"{prefix}data.root" in typed_names and not root.is_dir()
+        if is_missing and datamodules.is_read(str(data.get("_target_"))):
             raise DataError(
                 root,
                 found="no such folder",
@@ -107,7 +107,6 @@ class PredictSettings(InputSettings):
     depth_scale: float
     projection: Literal["equirectangular", "perspective"]
     fov: float | None
-    level: int | None
     levels: tuple[int, ...] | None
     base_level: int | None
     blend: Literal["feather", "nearest"]
@@ -204,7 +203,7 @@ class RunSettings:
     seed: int
     level: int
     panels: int
-    tensorboard_images: int
+    validation_images: int
     checkpoint_every_n_steps: int | None
     ema: float | None
 

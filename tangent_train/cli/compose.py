@@ -8,13 +8,14 @@ from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.registry import without_interpolation
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
 """Text that Hydra reads as this text, without quotes."""
@@ -83,15 +84,6 @@ def quoted(text: str) -> str:
     if _PLAIN.fullmatch(text):
         return text
     return QuotedString(without_interpolation(text), Quote.single).with_quotes()
-
-
-def without_interpolation(value: Any) -> Any:
-    """Plain values that OmegaConf reads as they are."""
-    if isinstance(value, dict):
-        return {name: without_interpolation(inner) for name, inner in value.items()}
-    if isinstance(value, list):
-        return [without_interpolation(inner) for inner in value]
-    return re.sub(r"(\\*)\$\{", r"\1\1\\${", value) if isinstance(value, str) else value
 
 
 def _quoted_path(value: str) -> str:

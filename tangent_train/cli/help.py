@@ -17,7 +17,7 @@ def annotate(text: str, folder: Path, command: str) -> str:
 
     Args:
         text: As Hydra prints it.
-        folder: Of the configs.
+        folder: Folder of the configs.
         command: The command, ``<command>.yaml`` there.
     """
     own = folder / f"{command}.yaml"
@@ -28,8 +28,14 @@ def annotate(text: str, folder: Path, command: str) -> str:
         group = [] if file == own else [file.parent.name]
         for path, line in _settings(file.read_text("utf-8").splitlines(), group):
             comments[path] = line.partition(" # ")[2].strip()
-    lines = text.replace(OWN, "\n".join([OWN, *_own_lines(own)])).splitlines()
-    return "\n".join(_annotated(lines, comments)) + "\n"
+    own_lines = (line.partition(" # ")[0].rstrip() for line in own.read_text("utf-8").splitlines())
+    settings = [line for line in own_lines if re.match(r"(?!defaults|hydra)\w+:", line)]
+    annotated = []
+    for path, line in _settings(text.replace(OWN, "\n".join([OWN, *settings])).splitlines(), []):
+        # photos.data.root is a data.root.
+        comment = comments.get(path) or comments.get(path.partition(".")[2])
+        annotated.append(f"{line:<{_COLUMN}}# {comment}\n" if comment else f"{line}\n")
+    return "".join(annotated)
 
 
 def _target(file: Path) -> str:
@@ -45,16 +51,3 @@ def _settings(lines: Iterable[str], group: list[str]) -> Iterator[tuple[str, str
         if found:
             parents[len(found[1]) // 2 :] = [found[2]]
         yield ".".join([*group, *parents]) if found else "", line
-
-
-def _own_lines(file: Path) -> Iterator[str]:
-    for line in file.read_text("utf-8").splitlines():
-        if re.match(r"(?!defaults|hydra)\w+:", line):
-            yield line.partition(" # ")[0].rstrip()
-
-
-def _annotated(lines: Iterable[str], comments: dict[str, str]) -> Iterator[str]:
-    for path, line in _settings(lines, []):
-        # photos.data.root is that of data.root.
-        comment = comments.get(path) or comments.get(path.partition(".")[2])
-        yield f"{line:<{_COLUMN}}# {comment}" if comment else line

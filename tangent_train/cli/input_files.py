@@ -16,7 +16,7 @@ from tangent_train.results.predictions import frame_name
 
 
 def is_video(path: Path) -> bool:
-    """Whether a file is a video, by its suffix."""
+    """True if the suffix of a file is that of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
@@ -71,7 +71,7 @@ class Inputs:
         return cls(files, {name: job.then(size) for name, job in videos.items()}, every)
 
     def part(self, shard: Shard) -> Inputs:
-        """Those of a shard; a video is not divided."""
+        """Return the inputs of a shard; a video is not divided."""
         names = shard.part(list(self.files))
         files = {name: self.files[name] for name in names}
         videos = {name: job for name, job in self.videos.items() if name in files}

@@ -25,8 +25,8 @@ class Job:
     Attributes:
         item: Name of the item.
         path: The file that it is from.
-        value: What the next step takes; in the end, the result.
-        error: Why there is none.
+        value: Input of the next step; finally the result.
+        error: Message if there is no result.
     """
 
     item: Any
@@ -56,7 +56,7 @@ def run_jobs(
     """Do some work for every item, with its rate and the time left on a bar.
 
     Args:
-        description: Of the work.
+        description: Label of the progress bar.
         jobs: The items.
         count: How many there are.
         work: Done here, one by one. Takes a job, and a function to call with the share of the work
@@ -97,7 +97,7 @@ class Shard:
 
     Attributes:
         number: 1 to `count`.
-        count: Of the parts.
+        count: Number of parts.
     """
 
     number: int

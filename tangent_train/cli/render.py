@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.folder.reader import class_masks
 from datamodules.images.colmap_project import ColmapProject, flat_names
@@ -81,21 +80,19 @@ def render(config: Mapping[str, Any]) -> None:
         _colmap(settings)
     else:
         jobs, count, work = _forward(settings) if settings.input is not None else _back(settings)
-        _end(_each(jobs, count, work), count)
+        _end(_rendered(jobs, count, work), count)
 
 
-def _each(jobs: Iterable[Job], count: int, work: _Work) -> list[Path]:
+def _rendered(jobs: Iterable[Job], count: int, work: _Work) -> list[Path]:
     """Results of the panoramas that could be rendered."""
     return [job.value for job in run_jobs("Rendering", jobs, count, work) if not job.error]
 
 
 def _end(done: Sequence[Path], count: int) -> None:
-    """Say what was written, and exit with 1 if not all panoramas were."""
+    """Print the written files, and exit with status 1 if some panoramas were not rendered."""
     if done:
-        written = list(dict.fromkeys(done))
-        print_text(
-            f"Written: {written[0]}" + (f" and {len(written) - 1} more" if written[1:] else "")
-        )
+        first, *others = dict.fromkeys(done)
+        print_text(f"Written: {first}" + (f" and {len(others)} more" if others else ""))
     if len(done) < count:
         failed = f"{count - len(done)} of {count} panoramas"
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
@@ -153,7 +150,13 @@ def _suffix(settings: Settings) -> str:
 def _grid(settings: Settings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
     """The images of panoramas with so many rows, and the indices of those to write."""
     level = nearest_level(rows) if settings.level is None else settings.level
-    grid = TangentGrid(settings.base_level, level, settings.dim, _rotation(settings))
+    rotation = None
+    if settings.rotation is not None:  # x forward, y to the right, z up
+        yaw, pitch, roll = np.radians(settings.rotation)
+        # A positive rotation about y looks down.
+        tilt = rotation_about((0, 1, 0), -pitch) @ rotation_about((1, 0, 0), -roll)
+        rotation = rotation_about((0, 0, 1), yaw) @ tilt
+    grid = TangentGrid(settings.base_level, level, settings.dim, rotation)
     return grid, tuple(int(face) for face in grid.face_indices(settings.faces))
 
 
@@ -165,7 +168,7 @@ def _colmap(settings: Settings) -> None:
     check_new(settings, output)
     masks = _masks(settings)
     names = flat_names(inputs.names())
-    # One camera has images of one size. If no panorama can be read, each says why below.
+    # One camera has images of one size. Errors of unreadable panoramas are printed below.
     grid, faces = _grid(settings, max(_rows(settings, inputs)) or 512)
     with replaced_folder(output) as folder:
         project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
@@ -177,7 +180,7 @@ def _colmap(settings: Settings) -> None:
             project.add(names[name], file, image, masks.read(name, area), progress)
             return output
 
-        done = _each(inputs.missing(()), len(names), work)
+        done = _rendered(inputs.missing(()), len(names), work)
         if not done:
             _end(done, len(names))
         project.write_rig()
@@ -216,19 +219,6 @@ def _poses(settings: Settings, model: Path) -> None:
     write_poses(output, poses)
     print_text(
         f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"
-    )
-
-
-def _rotation(settings: Settings) -> NDArray[np.float64] | None:
-    """The rotation in the frame of directions: x forward, y to the right, z up."""
-    if settings.rotation is None:
-        return None
-    yaw, pitch, roll = np.radians(settings.rotation)
-    # y is to the right here: a positive rotation about it looks down.
-    return (
-        rotation_about((0, 0, 1), yaw)
-        @ rotation_about((0, 1, 0), -pitch)
-        @ rotation_about((1, 0, 0), -roll)
     )
 
 

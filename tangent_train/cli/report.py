@@ -24,7 +24,7 @@ def report(arguments: Sequence[str]) -> None:
     for folder in options.folders:
         if not folder.is_dir():
             raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
-    # Heavy, and not needed to say what is wrong with the command line.
+    # Slow to import, and not needed to refuse a command line.
     with elsewhere():
         from tangent_train.results.comparisons import runs_report
         from tangent_train.results.record import find_runs, load_record, unfinished_runs

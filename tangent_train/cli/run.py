@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,30 +12,27 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import Callback
-from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.command_settings import ClassMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
+from tangent_train.cli.trainer import build_trainer
 from tangent_train.cli.trials import try_network, try_training
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.views import check_size
-from tangent_train.registry import SettingsFile, build_from_config, resolve_target
+from tangent_train.inference.representations import check_size
+from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
     headline,
@@ -45,6 +41,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -100,38 +97,21 @@ class Run:
         else:
             data, task, notes = build_trained(settings, trained, source)
         kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
-        kept = {"choices": _choices(settings, source), **kept}
+        kept = {"choices": _choices(settings, source), **named_arguments(kept)}
         write_settings(folder / "config.yaml", kept)
         return Run(folder, kept, source, data, task, trained, notes)
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
         """The trainer of the config, with callbacks besides those of every run."""
-        kept = {"config": self.settings, **inputs_and_classes(self.data)}
-        common = [
-            CheckpointContents({"predicts": self.task.predicts, **kept}),
-            ProgressBar(),
-            ClassScores(),
-            PredictionPanels(self.folder / "panels", self.settings["panels"]),
-            ValidationPictures(self.settings["tensorboard_images"]),
-        ]
-        section = self.settings["trainer"]
-        # Devices found, advertisements, what the settings say anyway.
-        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-        every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
-        if epochs not in (None, -1):
-            at_least("trainer.max_epochs", epochs, 1)
-        return build_from_config(
-            section,
-            "trainer",
-            self.source,
-            # A run shorter than that is validated at its end.
-            check_val_every_n_epoch=min(every, epochs) if every and (epochs or -1) > 0 else every,
-            default_root_dir=str(self.folder),
-            callbacks=[*callbacks, *common],
-            logger=TensorBoardLogger(self.folder, name="", version="tensorboard"),
-            plugins=[AtomicCheckpointIO()],
-            # The data module's samplers count every image once on any number of processes.
-            use_distributed_sampler=False,
+        # Checkpoints are passed on; settings of a logger may hold the address of a server.
+        config = {name: value for name, value in self.settings.items() if name != "logger"}
+        contents = {
+            "predicts": self.task.predicts,
+            "config": config,
+            **inputs_and_classes(self.data),
+        }
+        return build_trainer(
+            self.settings, self.folder, self.task, contents, callbacks, self.source
         )
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
@@ -187,19 +167,19 @@ class Run:
         own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
-        notes = [f"Checkpoint: {name}", *self.notes]
+        notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
-            tables=[*result_tables(record), confusion_table(record)],
+            tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
             class_names=self.task.class_names,
             notes=[headline(record), *notes],
         )
         for line in (*self.notes, headline(record)):
             print_text(line)
-        result_tables(record)[0].print()
+        tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
@@ -225,9 +205,9 @@ def build(
     """
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
-    section = completed_settings(
-        settings["network"], data.in_channels, data.num_classes, restored=restored
-    )
+    count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
+    outputs = count_outputs(data.num_classes)
+    section = completed_settings(settings["network"], data.in_channels, outputs, restored=restored)
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
     try_network(task, data.in_channels)
@@ -319,11 +299,12 @@ def _build_task(
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
-        optimizer = dict(settings["optimizer"])
-        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+        section = dict(settings["scheduler"])
+        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        scheduler = build_from_config(section, "scheduler", source)
+        parts["scheduler"] = Schedule(scheduler, **stepped)
     return build_from_config(
         settings["task"],
         "task",

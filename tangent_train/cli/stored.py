@@ -22,7 +22,10 @@ from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
 
 _SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
-GROUPS = ("experiment", "recipe", *_SECTIONS)
+_NEVER_STORED = ("callbacks", "debug", "logger")
+"""Groups whose settings are never taken from a file: a resumed run composes its options again."""
+
+GROUPS = ("experiment", "recipe", *_SECTIONS, *_NEVER_STORED)
 """Config groups whose chosen options a checkpoint keeps, as ``choices``."""
 
 _RUN = {
@@ -154,8 +157,8 @@ class StoredNetwork:
             DataError: The file cannot be used.
         """
         from tangent_train.checkpoints.trained import load_trained
-        from tangent_train.inference.predictor import views_per_forward
-        from tangent_train.inference.views import panorama_settings
+        from tangent_train.inference.engine import views_per_forward
+        from tangent_train.inference.representations import panorama_settings
 
         own = names_of(self.user_overrides)
         trust = parse_settings(Trust, said).trust
@@ -231,7 +234,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
         _check_evaluation(path, names_of(left), of_run=config is not None)
         if config is None:
             return StoredNetwork(path, left)
-    kept = GROUPS if command == "train" else ("experiment", "recipe")
+    kept = (*_SECTIONS, "experiment", "recipe") if command == "train" else ("experiment", "recipe")
     if chosen := [a for a in left if a.partition("=")[0] in kept]:
         raise SettingError(
             place[0],
@@ -242,8 +245,12 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
+    if command != "train":  # a file does not choose who sees the evaluation
+        choices = {g: name for g, name in choices.items() if g not in _NEVER_STORED}
     own = {a.partition("=")[0] for a in left}.intersection(GROUPS)
-    if own:  # what an experiment sets of a section is not meant for another option of it
+    if own.intersection(
+        _SECTIONS
+    ):  # what an experiment sets of a section is not meant for another option of it
         choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
     added = [f"level={known['level']}", f"seed={known['seed']}"]
     added += [f"{group}={name}" for group, name in choices.items() if group not in own]

@@ -15,7 +15,7 @@ from pathlib import Path
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.callbacks import EMAWeightAveraging, LearningRateMonitor
+from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
@@ -57,7 +57,7 @@ def train(settings: Settings, source: SettingsFile | None = None) -> float | Non
     needed = _typed_local(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.monitor_mode)
-    trainer = run.trainer([last, LearningRateMonitor(), best])
+    trainer = run.trainer([last, best])
     if settings["ema"] is not None:  # first: the last step is in the average that is saved
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
@@ -172,4 +172,5 @@ def _typed_local(remembered: Collection[str]) -> list[str]:
         text
         for text, name, value in named
         if name == "trust" or not (name in remembered or from_file(name, value))
+        if not is_own_option(name, value)  # kept among the run's choices
     ]

@@ -27,11 +27,11 @@ from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.cli.compose import without_interpolation
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
+from tangent_train.registry import without_interpolation
 from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]
@@ -140,7 +140,7 @@ class _Planner:
             tuned["scheduler"] = tuned["fine_tuning"]["scheduler"]
             tuned["trainer"]["max_epochs"] = epochs
             # Other crops than those of P's first epochs.
-            tuned["photos"]["data"]["stream"] = 1
+            tuned["photos"]["data"]["sampling_seed"] = 1
             for on in "PS":
                 yield self._stage(f"{on}-FT-{epochs}", tuned, "train")
 

@@ -46,6 +46,11 @@ class PinholeGrid(ABC):
 
     @property
     @abstractmethod
+    def owned_dim(self) -> int:
+        """Side in pixels of the part of an image that contains every direction it owns."""
+
+    @property
+    @abstractmethod
     def overlapping(self) -> bool:
         """True if every direction is inside an image, not only on its outer edge."""
 

@@ -25,7 +25,7 @@ from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields
 
 Unmapped = Literal["unknown", "never"]
-"""Whether a source class that a map does not name may win, which is label 0, or never wins."""
+"""Source classes that a map does not name are label 0 where they win, or never win."""
 
 _FOLDER = Path(__file__).with_suffix("")
 """The maps of this package: ``class_maps/<name>.json``."""
@@ -39,9 +39,9 @@ class ClassMap:
     """The classes of a source data set as those of a target.
 
     Attributes:
-        name: Of the map, or its file.
-        source: Name of the source data set; None where the file does not say.
-        classes: Of every target class the names of its source classes.
+        name: Name of the map, or its file.
+        source: Name of the source data set; None if the file has none.
+        classes: Names of the source classes of every target class.
     """
 
     name: str
@@ -55,9 +55,9 @@ class MappedNetwork:
 
     Attributes:
         trained: The network.
-        classes: Of every target class the classes of the original network that make it up.
-        unmapped: Its other classes.
-        unmapped_wins: Whether these may win.
+        classes: Classes of the original network that make up every target class.
+        unmapped: Other classes of the original network.
+        unmapped_wins: True if unmapped classes may win.
     """
 
     trained: TrainedNetwork
@@ -66,14 +66,14 @@ class MappedNetwork:
     unmapped_wins: bool
 
     def __str__(self) -> str:
-        """What was understood, in one line."""
+        """Return a description in one line."""
         parts = [f"{n} ← {', '.join(names)}" for n, names in self.classes.items() if names]
         missing = [name for name, names in self.classes.items() if not names]
         if missing:
             parts.append(f"never given: {', '.join(missing)}")
         if self.unmapped:
-            said = "unknown where they win" if self.unmapped_wins else "never win"
-            parts.append(f"{said}: {', '.join(self.unmapped)}")
+            effect = "unknown where they win" if self.unmapped_wins else "never win"
+            parts.append(f"{effect}: {', '.join(self.unmapped)}")
         return "; ".join(parts)
 
 
@@ -126,8 +126,8 @@ def map_classes(
     Args:
         trained: The network.
         class_map: The map.
-        unmapped: What becomes of classes that the map does not name. What an imported network took
-            for nothing stays that.
+        unmapped: Effect of classes that the map does not name. Unknown classes of an imported
+            network stay unknown.
         targets: All classes wanted, in their order, without unknown; None for those of the map.
 
     Raises:
@@ -142,16 +142,16 @@ def map_classes(
             expected=f"of {', '.join(targets)}",
         )
     target_of = {_plain(n): target for target, names in class_map.classes.items() for n in names}
-    own = trained.class_names[1:]
-    groups = trained.groups or [[k] for k in range(len(own))]
+    names = trained.class_names[1:]
+    groups = trained.groups or [[k] for k in range(len(names))]
     places: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
-    for k, name in enumerate(own):
+    for k, name in enumerate(names):
         places[target_of.get(_plain(name))].append(k)
     left = places.pop(None)
-    if len(left) == len(own):
+    if len(left) == len(names):
         raise SettingError(
             f"class_map={class_map.name}",
-            found=f"no class of {class_map.source or 'the map'} in a network of {', '.join(own)}",
+            found=f"no class of {class_map.source or 'the map'} in a network of {', '.join(names)}",
             expected="a map whose source classes are the network's",
         )
     if left and unmapped == "never" and trained.score_kind == "labels":
@@ -161,15 +161,15 @@ def map_classes(
             expected="unknown: there is no second best class",
         )
     scores = [[k for place in group for k in groups[place]] for group in places.values()]
-    unknown = [k for group in groups[len(own) :] for k in group]
+    unknown = [k for group in groups[len(names) :] for k in group]
     if unmapped == "unknown":
         unknown += [k for place in left for k in groups[place]]
     scores += [unknown] if unknown else []
-    found = {str(target): [own[k] for k in group] for target, group in places.items()}
+    found = {str(target): [names[k] for k in group] for target, group in places.items()}
     return MappedNetwork(
         trained=replace(trained, class_names=("unknown", *targets), groups=scores),
         classes=found,
-        unmapped=[own[k] for k in left],
+        unmapped=[names[k] for k in left],
         unmapped_wins=unmapped == "unknown",
     )
 

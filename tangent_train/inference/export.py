@@ -23,7 +23,7 @@ from tangent_train.checkpoints.trained import (
 )
 from tangent_train.errors import SettingError, of_extra
 from tangent_train.files import atomic_path
-from tangent_train.inference.library_output import hide_output
+from tangent_train.imports import hide_output
 
 SUFFIXES = (".onnx", ".safetensors")
 
@@ -58,7 +58,7 @@ def export_network(
     """Write a network, read it again and compare it with PyTorch on random images.
 
     The batch size is dynamic. Height and width are too (multiples of the network's stride) where
-    the exporter can express that, else they are those of the training, and the file says so.
+    the exporter can express that; otherwise the file is for the size of the training.
 
     Args:
         trained: The network; of a checkpoint or of a safetensors file.

@@ -1,6 +1,6 @@
 """COLMAP databases of panoramas, their keypoints and matches; poses that COLMAP found.
 
-In COLMAP the centre of the first pixel is (½, ½). Panoramas have the camera model EQUIRECTANGULAR,
+In COLMAP the center of the first pixel is (½, ½). Panoramas have the camera model EQUIRECTANGULAR,
 whose parameters are their size.
 """
 
@@ -97,13 +97,9 @@ def _camera_id(database: Any, shape: tuple[int, int]) -> int:
 
 def _geometry(pairs: NDArray[np.uint32], found: TwoView) -> Any:
     pycolmap = colmap()
-    kinds = pycolmap.TwoViewGeometryConfiguration
     geometry = pycolmap.TwoViewGeometry()
-    geometry.config = {
-        "general": kinds.CALIBRATED,
-        "rotation": kinds.PANORAMIC,
-        "none": kinds.DEGENERATE,
-    }[found.kind]
+    kind = {"general": "CALIBRATED", "rotation": "PANORAMIC", "none": "DEGENERATE"}[found.kind]
+    geometry.config = getattr(pycolmap.TwoViewGeometryConfiguration, kind)
     geometry.inlier_matches = pairs[found.inliers]
     if found.rotation is not None:
         motion = rigid_matrix(found.rotation, found.translation)
@@ -118,10 +114,10 @@ def panorama_poses(model: Path, rig: RigFile) -> dict[str, PanoramaPose]:
 
     Args:
         model: A sparse model of COLMAP, binary or text.
-        rig: Of the project that it was made of.
+        rig: Rig of the project that the model was made of.
 
     Returns:
-        By file of the panorama; those that are in the model, in its world and units.
+        Poses by file, of the panoramas in the model, in its world and units.
 
     Raises:
         DataError: The model cannot be read, or no panorama is in it.

@@ -21,10 +21,10 @@ from tangent_train.keypoints.spherical import angles_between
 from tangent_train.rendering.sampling import bilinear_equirect_taps
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
-"""Occlusion tolerance behind a surface: share of the distance, and metres."""
+"""Occlusion tolerance behind a surface: share of the distance, and meters."""
 
 _SMOOTH = 1.1
-"""Distances of neighbouring pixels of one surface rarely differ by more than this factor."""
+"""Distances of neighboring pixels of one surface rarely differ by more than this factor."""
 
 _ROWS = 512
 """Rows of a panorama on which the overlap is sampled."""
@@ -35,7 +35,7 @@ class DepthView:
     """Depth and pose of a panorama, as known of its room.
 
     Args:
-        distance_m: ``(H, W)`` distances from the centre in metres, of any resolution; NaN where
+        distance_m: ``(H, W)`` distances from the center in meters, of any resolution; NaN where
             missing.
         pose: Camera pose.
     """
@@ -56,7 +56,7 @@ class DepthView:
             directions_xyz: ``(n, 3)``.
 
         Returns:
-            ``(n,)`` distances in metres, and ``(n,)`` how far the same surface may be; NaN where
+            ``(n,)`` distances in meters, and ``(n,)`` how far the same surface may be; NaN where
             all four pixels are missing.
         """
         height, width = self.distance_m.shape
@@ -148,7 +148,7 @@ def correct_matches(
     right: DepthView,
     max_error_deg: float = 1.0,
 ) -> MatchTruth:
-    """Judge matches by depth and pose, independently of any estimated geometry.
+    """Verify matches by depth and pose, independently of any estimated geometry.
 
     The left point is placed at its distance and seen from the right, and vice versa; the match is
     correct where one of the two ends within `max_error_deg` of its partner. One is enough:

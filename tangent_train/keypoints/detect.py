@@ -39,7 +39,7 @@ class Detections(NamedTuple):
     """Keypoints of one image.
 
     Attributes:
-        points_xy: ``(n, 2)`` float64 column and row; pixel centres are integers.
+        points_xy: ``(n, 2)`` float64 column and row; pixel centers are integers.
         sizes: ``(n,)`` float64 diameters in pixels.
         angles_rad: ``(n,)`` float64 from right towards down.
         responses: ``(n,)`` float32.
@@ -81,7 +81,7 @@ def detect_on_equirect(image: NDArray[np.uint8]) -> SphericalKeypoints:
     ±180° are found once. It is not extended beyond the poles, as in the paper's baseline.
 
     Args:
-        image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
+        image: ``(H, W)`` gray or ``(H, W, 3)`` RGB, uint8.
     """
     gray = _gray(image)
     height, width = gray.shape
@@ -104,7 +104,7 @@ def detect_on_tangent_images(
     finds it in the other's cell it is lost, about one in 500 at base level 2.
 
     Args:
-        image: ``(H, W)`` grey or ``(H, W, 3)`` RGB, uint8.
+        image: ``(H, W)`` gray or ``(H, W, 3)`` RGB, uint8.
         grid: The images.
         margin: Pixels added on every side of the images, at the same pitch: detectors find nothing
             near borders, and large keypoints need space.

@@ -2,7 +2,7 @@
 
 A point in direction l of the left panorama lies somewhere on a ray. In the right panorama, with
 ``x_right = R x_left + t``, the ray appears as the great-circle arc from ``R l``, its point at
-infinity, to ``t``, the left centre. Without translation the arc is the point ``R l``.
+infinity, to ``t``, the left center. Without translation the arc is the point ``R l``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def is_by_chance(
     motion: Motion,
     max_error_rad: float,
 ) -> bool:
-    """Whether a motion would fit as many matches by chance.
+    """True if a motion would fit as many matches by chance.
 
     The expected number of such motions is ``(m − s) · C(m, k) · C(k, s) · pᵏ⁻ˢ`` (Moisan and Stival
     2004, equation 6; the criterion of OpenMVG, which the paper used) with m matches, k inliers, the
@@ -113,7 +113,7 @@ def _log_choices(of: int, chosen: int) -> float:
 def prefers_rotation(
     general_errors: NDArray[np.float64], rotation_errors: NDArray[np.float64], max_error_rad: float
 ) -> bool:
-    """Whether a rotation alone explains the matches: Torr's GRIC (1998).
+    """True if a rotation alone explains the matches: Torr's GRIC (1998).
 
     ``Σ min(e²/σ², 2 (4 − d)) + n d ln 4 + k ln 4n`` with d = 3, k = 5 for a general motion and
     d = 2, k = 3 for a rotation, over the matches that one of the two allows; the smaller wins. σ

@@ -20,7 +20,7 @@ class SphericalKeypoints:
 
     Attributes:
         directions_xyz: ``(n, 3)`` float64 unit vectors.
-        sizes_rad: ``(n,)`` float32, angular diameter of the neighbourhood (``KeyPoint.size``).
+        sizes_rad: ``(n,)`` float32, angular diameter of the neighborhood (``KeyPoint.size``).
         orientations_xyz: ``(n, 3)`` float64 unit vectors, perpendicular to the directions.
         responses: ``(n,)`` float32 strength.
         descriptors: ``(n, D)`` float32.
@@ -51,7 +51,7 @@ class SphericalKeypoints:
         return type(self)(*(values[chosen] for values in self._arrays()))
 
     def equirect_pixels(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """``(n, 2)`` columns and rows in a panorama ``(H, W)``; pixel centres are integers."""
+        """``(n, 2)`` columns and rows in a panorama ``(H, W)``; pixel centers are integers."""
         return lonlat_to_equirect(xyz_to_lonlat(self.directions_xyz), shape)
 
 
@@ -93,7 +93,7 @@ def local_to_sphere(
 
     A disc of the image becomes an ellipse on the sphere; its size is the diameter of the disc of
     the same area: ``size · √|∂d/∂u × ∂d/∂v|``. The orientation of a keypoint is the mean gradient
-    of the grey values around it. A gradient is a covector: with the Jacobian J (3×2) it becomes
+    of the gray values around it. A gradient is a covector: with the Jacobian J (3×2) it becomes
     ``J (JᵀJ)⁻¹ (cos a, sin a)``, scaled to length 1.
 
     Args:

@@ -44,7 +44,7 @@ class TwoView:
     Attributes:
         inliers: ``(m,)`` bool, matches within the largest error of the motion.
         rotation: ``(3, 3)`` R; None if no motion fits more matches than chance would.
-        translation: ``(3,)`` t of length 1, the direction of the left centre in the right panorama;
+        translation: ``(3,)`` t of length 1, the direction of the left center in the right panorama;
             None without a motion, and for a pure rotation.
     """
 
@@ -54,7 +54,7 @@ class TwoView:
 
     @property
     def kind(self) -> Literal["general", "rotation", "none"]:
-        """Whether there is a motion, and whether it has a translation."""
+        """Kind of the motion: ``general`` has a translation."""
         if self.rotation is None:
             return "none"
         return "rotation" if self.translation is None else "general"
@@ -68,7 +68,7 @@ class TwoView:
 
         Returns:
             Angle between the rotations, and angle between the directions of translation, in
-            degrees; NaN where the estimate has none, or the true centres coincide.
+            degrees; NaN where the estimate has none, or the true centers coincide.
         """
         rotation, translation_m = right.relative_to(left)
         rotation_error = translation_error = math.nan
@@ -100,14 +100,14 @@ def estimate_two_view(
         left_xyz: ``(m, 3)`` unit vectors in the left panorama.
         right_xyz: ``(m, 3)`` unit vectors in the right one.
         max_error_deg: Largest error of an inlier.
-        seed: Of the random samples.
+        seed: Seed of the random samples.
 
     Raises:
         SettingError: pycolmap is missing.
     """
-    nothing = TwoView(np.zeros(len(left_xyz), np.bool_))
+    no_motion = TwoView(np.zeros(len(left_xyz), np.bool_))
     if len(left_xyz) < _MIN_INLIERS:
-        return nothing
+        return no_motion
     search = _Search(left_xyz, right_xyz, math.radians(max_error_deg), seed)
     general, rotation = search.general(), search.rotation()
     motion = general or rotation
@@ -115,12 +115,12 @@ def estimate_two_view(
         errors = search.errors(general), search.errors(rotation)
         motion = rotation if prefers_rotation(*errors, search.max_error_rad) else general
     if motion is None:
-        return nothing
+        return no_motion
     inliers = search.errors(motion) <= search.max_error_rad
     if inliers.sum() < _MIN_INLIERS or is_by_chance(
         left_xyz, right_xyz, motion, search.max_error_rad
     ):
-        return nothing
+        return no_motion
     return TwoView(inliers, *motion)
 
 
@@ -171,7 +171,7 @@ class _Search:
         return min(found, key=self.cost, default=None)
 
     def rotation(self) -> Motion | None:
-        """Of rotations through two matches each the best, refined."""
+        """The best of rotations through two matches each, refined."""
         rng = np.random.default_rng(self.seed)
         pairs = rng.integers(0, len(self.left_xyz), (_DRAWS, 2))
         # A rotation keeps the angle between two directions; those nearly parallel fix no rotation.
@@ -248,7 +248,7 @@ def _twins(start: Motion) -> list[Motion]:
     if t is None:
         return [start]
     half_turn = 2 * np.outer(t, t) - np.eye(3)
-    return [Motion(r, way) for r in (rotation, half_turn @ rotation) for way in (t, -t)]
+    return [Motion(r, sign * t) for r in (rotation, half_turn @ rotation) for sign in (1, -1)]
 
 
 def _rotations(

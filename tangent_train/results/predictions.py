@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.images.gpano import PanoramaArea
-    from tangent_train.inference.views import InputImage
+    from tangent_train.inference.images import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
 
@@ -40,7 +40,7 @@ _RESULTS = (
 )  # fmt: skip
 
 OutputKind = Literal["labels", "color", "overlay", "probabilities"]
-"""What is written of an image, each into a folder of its own."""
+"""Outputs of an image, each in its own folder."""
 
 _PICTURES: tuple[OutputKind, ...] = ("color", "overlay")
 
@@ -114,7 +114,7 @@ class PredictionFolder:
     Attributes:
         path: The folder.
         class_names: K + 1 names, the unknown class first.
-        kinds: What is written of every image.
+        kinds: Outputs of every image.
     """
 
     path: Path
@@ -214,11 +214,11 @@ class PredictionFolder:
         """Write the pictures that are wanted of a video, from the labels of its frames.
 
         Args:
-            name: Of the video.
-            path: Its file.
-            size: Its number of frames, rows and columns.
-            every: Its first and then every n-th frame have labels.
-            again: Whether to replace existing ones.
+            name: Name of the video.
+            path: File of the video.
+            size: Number of frames, rows and columns.
+            every: The first and then every n-th frame have labels.
+            again: True to replace existing videos.
 
         Raises:
             DataError: The video, or the labels of a frame, cannot be read.
@@ -242,8 +242,8 @@ class PredictionFolder:
 
         Args:
             name: From `short_names`.
-            scores: Those of the photo, or of the whole sphere.
-            area: Part of the sphere that they are written of.
+            scores: Scores of the photo, or of the whole sphere.
+            area: Part of the sphere to write.
         """
         file = self.files(name).get("probabilities")
         if file is None:
@@ -254,7 +254,8 @@ class PredictionFolder:
         with array_file(file, shape, np.float16) as array:
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
-                array[part] = scores.probabilities(rows[part])[:, columns, : shape[-1]]
+                probabilities = scores.probabilities(rows[part]).cpu().numpy()
+                array[part] = probabilities[:, columns, : shape[-1]]
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).
@@ -264,7 +265,7 @@ class PredictionFolder:
 
         Args:
             settings: Settings of the prediction.
-            entries: Of the images done so far.
+            entries: Entries of the images done so far.
         """
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
@@ -314,7 +315,7 @@ class PredictionFolder:
         """Write ``report.html``.
 
         Args:
-            entries: Of all images.
+            entries: Entries of all images.
             shown: Some of them, for the report.
         """
         tables = [self.mean_shares(entries)]

@@ -14,7 +14,7 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import SettingError
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import build_from_config
 from tests.inference.trained import trained_network
 from tests.running import composed
@@ -68,7 +68,7 @@ def test_the_stages_in_their_order(rooms: DictConfig) -> None:
         assert config["data"]["_target_"].endswith("Perspective") == photos
         assert config["representation"]["_target_"].endswith("PerspectiveRepresentation") == photos
         assert config["data"]["root"] == "data/rooms_transfer"
-        assert config["data"].get("stream", 0) == ("P-FT" in stage.name), "other crops"
+        assert config["data"].get("sampling_seed", 0) == ("P-FT" in stage.name), "other crops"
 
 
 def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:

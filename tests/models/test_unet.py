@@ -74,6 +74,6 @@ def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
         "models.unet",
         "tangent_train",
         "tangent_train.errors",
-        "tangent_train.offline",
+        "tangent_train.imports",
         "tangent_train.registry",
     }

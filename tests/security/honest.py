@@ -19,7 +19,7 @@ SETTINGS = (
     "data.inputs=[rgb]",
     "trainer.max_epochs=1",
     "panels=0",
-    "tensorboard_images=0",
+    "validation_images=0",
 )
 
 

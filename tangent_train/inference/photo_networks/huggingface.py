@@ -13,7 +13,7 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
 from tangent_train.errors import DataError
-from tangent_train.inference.library_output import hide_output
+from tangent_train.imports import hide_output, offline
 from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
@@ -21,7 +21,6 @@ from tangent_train.inference.photo_networks.network import (
     names_of,
 )
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
-from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, build_from_config
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
@@ -44,7 +43,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     No code of its author is run, and weights are read from safetensors only.
 
     Args:
-        model: Its name on the hub, or a folder written by ``save_pretrained``.
+        model: Name on the hub, or a folder written by ``save_pretrained``.
         classes: JSON file of the class names; None for those of its config.
         normalization: See `Normalization.of`; None for that of its image processor.
 

@@ -26,7 +26,7 @@ from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import unregistered
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
@@ -55,9 +55,10 @@ def import_network(
         base_level: Base level b of the tangent images; None for the size of those photos.
         unknown_classes: Names of scores of no class, such as a background.
         unknown_wins: True if these may win, which is then written as unknown (label 0).
-        image_size: The only rows and columns to give the network; None for the size that it says
-            and, where it takes others, any.
-        score_kind: What it returns; None for what its library says, or to find it by trying.
+        image_size: The only rows and columns to give the network; None for its own size and, if it
+            takes others, any.
+        score_kind: Output of the network; None for the output that its library declares, or to find
+            it by trial.
 
     Returns:
         The network as its file gives it back.
@@ -114,14 +115,14 @@ def representation_of(
 ) -> dict[str, Any]:
     """Settings of the tangent images that look most like the photos a network was trained on.
 
-    Level s has the focal length nearest to theirs, ``2^s / R_v(−1)`` pixels;
-    base level b the largest images that are not larger than theirs. Their side is that of the
-    photos' shorter one: what is beyond the default side overlaps with other images. Images of a
-    network that takes one size only have its longer side, and are divided where it is not square.
+    Level s has the focal length nearest to that of the photos, ``2^s / R_v(−1)`` pixels; base level
+    b has the largest images that are not larger than the photos. The side of the images is the
+    shorter side of the photos: pixels beyond the default side overlap with other images. Images of
+    a network that takes one size only have its longer side, and are divided if it is not square.
 
     Args:
         image_size: Rows and columns of the photos.
-        fov_deg: Their horizontal field of view.
+        fov_deg: Horizontal field of view of the photos.
         level: Given level s.
         base_level: Given base level b.
         is_fixed: True if the network takes images of this size only.

@@ -1,4 +1,4 @@
-"""What is known of a photo network, whatever library it comes from."""
+"""A photo network of any library, and the names of its scores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tangent_train.files import read_json
 from tangent_train.registry import is_class_name
 
 USUAL_SIZE = (512, 512)
-"""Rows and columns of the photos, where nothing says what they were."""
+"""Rows and columns of the photos, if they are not known."""
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,11 @@ class PhotoNetwork:
             with these under ``"out"``, or to label maps ``(B, h, w)``.
         settings: The section of a config that makes it, plain values; None of an ONNX file.
         score_names: Name of every score.
-        normalization: Of the images.
+        normalization: Normalization of the images.
         image_size: Rows and columns that it was trained for.
         fixed_size: True if it takes images of this size only.
-        score_kind: Output of the network where its library says it; None to find it by trying.
-        remarks: What else the user should know, a sentence each.
+        score_kind: Output of the network if its library declares it; None to find it by trial.
+        remarks: Sentences to print for the user.
     """
 
     network: nn.Module
@@ -67,7 +67,7 @@ def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
 
     Args:
         content: A list of names, or a dict with the name of each place.
-        path: Its file, for the message.
+        path: File of the names, for the message.
         expected: For the message.
 
     Raises:

@@ -23,7 +23,7 @@ def load(
     """A network of ``configs/network``.
 
     Args:
-        settings: Its section.
+        settings: Section of the network.
         weights: File of its state dict.
         classes: JSON file of the class names.
         normalization: See `Normalization.of`.

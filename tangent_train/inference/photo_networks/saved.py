@@ -63,7 +63,7 @@ def json_in(folder: Path, name: str) -> dict[str, Any]:
 
 
 def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
-    """The weights of such a folder as float32, and what is to be said about them.
+    """The weights of such a folder as float32, and remarks about them.
 
     Raises:
         DataError: There are none as safetensors, or they are unreadable.

@@ -47,6 +47,15 @@ _OF_ONE_SCORE: dict[ScoreKind, ScoreKind] = {
 }
 """A softmax over one score is always 1, so that its networks end in a sigmoid."""
 
+_NAME_SCORES = (
+    "Name it: scores=logits for a network whose last step, a softmax, is missing; "
+    "scores=probabilities for one that ends in it."
+)
+_NAME_SCORE = (
+    "Set scores=sigmoid_logits if a sigmoid follows, with numbers above 0 for the class. A "
+    "logarithm of a sigmoid is at most 0: save the network without the logarithm and set "
+    "scores=sigmoid."
+)
 _FACTOR = (
     "If they are probabilities times a factor (100, 255), save the network without the factor and "
     "set scores=sigmoid."
@@ -55,17 +64,17 @@ _FACTOR = (
 
 @torch.no_grad()
 def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
-    """The kind of a network's scores and their number K, 1 of label maps.
+    """Return the kind of a network's scores and their number K, 1 for label maps.
 
-    The kind is the one that the user or the network's library states. Else the network sees up to
-    four images, for one alone may mislead:
+    The kind is the one that the user or the network's library states. Otherwise the network gets
+    up to four images, because a single one may mislead:
 
-    * One score: whole numbers are labels, numbers from 0 to 1 come from a sigmoid, and numbers
-      of both signs go into one. For one or two names, 0 and one number above 1 (255) are a mask,
-      which is taken as a sigmoid.
-    * More scores: those with the same sum at every pixel come from a softmax, also where they are
-      rounded or clipped, or slightly negative after a bicubic interpolation. So do those whose sum
-      over the whole image is 1. Others from 0 to 1 come from sigmoids.
+    * One score: whole numbers are labels, numbers from 0 to 1 come from a sigmoid, and numbers of
+      both signs precede one. For one or two names, 0 and one number above 1 (255) are a mask,
+      which counts as a sigmoid.
+    * More scores: the same sum at every pixel indicates a softmax, even if the scores are rounded,
+      clipped, or slightly negative after a bicubic interpolation. So does a sum of 1 over the whole
+      image. Other scores from 0 to 1 come from sigmoids.
 
     Args:
         network: The network; in evaluation mode afterwards.
@@ -74,15 +83,15 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
         SettingError: The network does not take RGB images of its size, or its scores fit no kind.
     """
     network.network.eval()
-    kind = network.score_kind
-    tried: list[Tensor] = []
+    stated, named = network.score_kind, len(network.score_names)
+    kind, tried = stated, []
     for image in _images(network):
         tried.append(_scores(network, image).movedim(1, 0).flatten(1))
-        if network.score_kind is None:
-            kind = _kind_of(tried, len(network.score_names))
+        kind = stated or _kind_of(tried, named)
         if kind in _CERTAIN:
             break
     pixels = torch.cat(tried, dim=1)
+    count, least, most = len(pixels), pixels.amin().item(), pixels.amax().item()
     if not pixels.isfinite().any():
         raise SettingError(
             "output of the network",
@@ -90,10 +99,14 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
             expected="scores or labels",
             remedy="Check the weights: they may contain NaN.",
         )
-    count = len(pixels)
     if kind is None:
-        raise _unknown_kind(count, pixels)
-    if count == 1 and network.score_kind != "labels" and bool((pixels == 1).all()):
+        raise SettingError(
+            "scores",
+            found=f"{count} per pixel, from {least:g} to {most:g}",
+            expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
+            remedy=_NAME_SCORES if count > 1 else _FACTOR if least >= 0 else _NAME_SCORE,
+        )
+    if count == 1 and stated != "labels" and bool((pixels == 1).all()):
         raise SettingError(
             "scores",
             found="1 at every pixel, such as a softmax over one score",
@@ -102,53 +115,21 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
             "For label maps, set scores=labels.",
         )
     if kind == "labels":
-        found = np.unique(pixels.nan_to_num(_VOID).numpy())
-        _check_labels(found.tolist(), len(network.score_names))
+        _check_labels(np.unique(pixels.nan_to_num(_VOID).numpy()).tolist(), named)
     kind = _OF_ONE_SCORE.get(kind, kind) if count == 1 else kind
-    _check_range(kind, network.score_kind or kind, tried)
-    return kind, count
-
-
-def _unknown_kind(count: int, pixels: Tensor) -> SettingError:
-    """The error for scores ``(K, pixels)`` of no kind, with the settings that may be right."""
-    least, most = pixels.amin().item(), pixels.amax().item()
-    if count > 1:
-        remedy = (
-            "Name it: scores=logits for a network whose last step, a softmax, is missing; "
-            "scores=probabilities for one that ends in it."
-        )
-    elif least >= 0:
-        remedy = _FACTOR
+    if kind == "probabilities":
+        is_wrong = least < 0 and _kind_of(tried, named) != kind
     else:
-        remedy = (
-            "Set scores=sigmoid_logits if a sigmoid follows, with numbers above 0 for the class. "
-            "A logarithm of a sigmoid is at most 0: save the network without the logarithm and set "
-            "scores=sigmoid."
-        )
-    return SettingError(
-        "scores",
-        found=f"{count} per pixel, from {least:g} to {most:g}",
-        expected=f"of a kind that can be recognized: {', '.join(get_args(ScoreKind))}",
-        remedy=remedy,
-    )
-
-
-def _check_range(kind: ScoreKind, stated: ScoreKind, tried: Sequence[Tensor]) -> None:
-    """Refuse numbers that are not probabilities."""
-    pixels = torch.cat(list(tried), dim=1)
-    least, most = pixels.amin().item(), pixels.amax().item()
-    wrong = False
-    if kind == "sigmoid" and not _is_mask(pixels):
-        wrong = least < -_OVERSHOOT or most > 1 + _OVERSHOOT
-    elif kind == "probabilities":
-        wrong = least < 0 and _kind_of(tried, 0) != kind
-    if wrong:
+        is_beyond = least < -_OVERSHOOT or most > 1 + _OVERSHOOT
+        is_wrong = kind == "sigmoid" and is_beyond and not _is_mask(pixels)
+    if is_wrong:
         raise SettingError(
             "scores",
-            found=f"{stated}, but numbers from {least:g} to {most:g}",
+            found=f"{stated or kind}, but numbers from {least:g} to {most:g}",
             expected="probabilities from 0 to 1",
             remedy=_FACTOR if least >= 0 else "",
         )
+    return kind, count
 
 
 def _images(network: PhotoNetwork) -> Iterator[Tensor]:
@@ -212,19 +193,19 @@ def _kind_of(tried: Sequence[Tensor], named: int) -> ScoreKind | None:
     if not scores.numel():
         return None
     least, most = scores.amin().item(), scores.amax().item()
-    within = least >= 0 and most <= 1
     # ONNX's Softmax before version 13 normalizes over classes, rows and columns together.
     over_image = least >= 0 and all(abs(float(s.double().sum()) - 1) < _ROUNDED for s in tried)
     if len(scores) == 1:
-        return _kind_of_one(scores, whole, named, over_image=over_image and not whole)
+        kind = _kind_of_one(scores, whole, named)
+        return None if over_image and kind == "sigmoid" else kind
     if most > least and (over_image or _has_even_sums(scores, whole)):
         return "probabilities"
-    if within and most > least:
+    if most > least >= 0 and most <= 1:
         return "sigmoid"
     return "logits" if least < 0 or not whole else None
 
 
-def _kind_of_one(scores: Tensor, whole: bool, named: int, *, over_image: bool) -> ScoreKind | None:
+def _kind_of_one(scores: Tensor, whole: bool, named: int) -> ScoreKind | None:
     """The kind of one score."""
     least, most = scores.amin().item(), scores.amax().item()
     if named <= _MASK_NAMES and _is_mask(scores):
@@ -232,7 +213,7 @@ def _kind_of_one(scores: Tensor, whole: bool, named: int, *, over_image: bool) -
     if whole and len(np.unique(scores[scores < 0].numpy())) <= 1:  # of void, e.g. -1
         return "labels"
     if least >= 0 and most <= 1:
-        return None if over_image else "sigmoid"
+        return "sigmoid"
     return "sigmoid_logits" if least < 0 < most else None
 
 
@@ -246,12 +227,7 @@ def _has_even_sums(scores: Tensor, whole: bool) -> bool:
     """True if the scores of every pixel have the same sum, up to rounding of each of them."""
     sums = scores.sum(dim=0)
     mean = sums.mean().item()
-    if scores.amin() < -mean:
-        return False
-    if (sums - mean).abs().max() <= _ROUNDED * mean:
-        return True
-    for scale in _SCALES:
-        step = max(scale / _BYTE, float(whole))
-        if (sums - scale).abs().max() <= min(len(scores) * step, scale / 2):
-            return True
-    return False
+    steps = {scale: len(scores) * max(scale / _BYTE, float(whole)) for scale in _SCALES}
+    allowed = [(mean, _ROUNDED * mean), *((s, min(step, s / 2)) for s, step in steps.items())]
+    is_even = any((sums - total).abs().max() <= most for total, most in allowed)
+    return is_even and bool(scores.amin() >= -mean)

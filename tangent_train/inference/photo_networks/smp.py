@@ -8,9 +8,9 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
 from tangent_train.errors import DataError, SettingError
+from tangent_train.imports import offline
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
-from tangent_train.offline import offline
 from tangent_train.registry import SettingsFile, build_from_config
 
 _CLASS = "_model_class"

@@ -23,7 +23,7 @@ def load(
     """A network of ``torchvision.models.segmentation``, with published weights or one's own.
 
     Args:
-        model: Its name.
+        model: Name of the network.
         weights: Published weights by name, or a file of a state dict, to which the classes and
             normalization of the default weights belong.
         classes: JSON file of the class names; None for those of the weights.
@@ -58,12 +58,12 @@ def load(
     tensors = tensors_for(network, file) if is_file else fetch_tensors(chosen)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
     load_tensors(network, tensors, weights)
-    own = Normalization(preset.mean, preset.std)
+    default = Normalization(preset.mean, preset.std)
     return PhotoNetwork(
         network=network,
         settings=settings,
         score_names=names,
-        normalization=own if normalization is None else Normalization.of(normalization, 3),
+        normalization=default if normalization is None else Normalization.of(normalization, 3),
         image_size=(preset.resize_size[0], preset.resize_size[0]),
         score_kind="logits",
     )

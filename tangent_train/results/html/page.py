@@ -28,6 +28,9 @@ _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 88)
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 _SCRIPTS = ("view.js", "surfaces.js", "gestures.js", "viewer.js")
+_SCRIPT = '<script>\n"use strict";\n{{\n{}}}\n</script>'
+"""A block of its own: no names in the page's global scope."""
+
 _IMAGES = "<!--images-->\n"
 _PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}")
 
@@ -38,13 +41,13 @@ class EncodedImage(NamedTuple):
     Attributes:
         name: Shown beside it.
         note: A line about it, such as a score.
-        sphere: Whether it is a whole equirectangular panorama; others are shown flat.
+        sphere: True for a whole equirectangular panorama; others are shown flat.
         width: Columns of the image before it was compressed.
         height: Rows of the image before it was compressed.
         input: The image, a JPEG.
         thumbnail: A small JPEG of it.
-        prediction: 8-bit grey PNG of class indices, perhaps of fewer pixels.
-        truth: Likewise.
+        prediction: 8-bit gray PNG of class indices, perhaps of fewer pixels.
+        truth: The same for the ground truth.
         shares: ``(class index, share of the truth, share of the prediction)``, without the maps
             that are missing, of the classes that appear; by solid angle on panoramas.
     """
@@ -73,7 +76,7 @@ def encode_image(
 ) -> EncodedImage:
     """Compress an image for the report, to a few megabytes at most.
 
-    Sides longer than `MOST_PIXELS` are downsampled, colours by area, labels by nearest neighbour.
+    Sides longer than `MOST_PIXELS` are downsampled, colors by area, labels by nearest neighbour.
 
     Args:
         name: Shown beside it.
@@ -81,7 +84,7 @@ def encode_image(
         class_count: K + 1, the unknown class 0 included; at most 256.
         prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
         truth: ``(h, w)`` class indices, 0 unknown; of any size.
-        sphere: Whether it is a whole equirectangular panorama.
+        sphere: True for a whole equirectangular panorama.
         note: A line about it.
     """
     maps = {"truth": truth, "prediction": prediction}
@@ -140,7 +143,7 @@ def write_report(
 
     Args:
         path: The file.
-        title: Of the page.
+        title: Title of the page.
         tables: Below the viewer.
         images: For the viewer.
         class_names: K + 1 names of the classes in the label maps, the unknown class first.
@@ -151,7 +154,7 @@ def write_report(
         "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in notes),
         "style": _resource("viewer.css"),
         "viewer": _viewer(class_names) if images else "",
-        "script": _script() if images else "",
+        "script": _SCRIPT.format("\n".join(map(_resource, _SCRIPTS))) if images else "",
         "tables": "\n".join(table.html() for table in tables),
     }
     page = _filled(_resource("page.html"), parts)
@@ -171,12 +174,6 @@ def _viewer(class_names: Sequence[str]) -> str:
     classes = [{"name": name, "rgb": rgb} for name, rgb in zip(class_names, colors, strict=True)]
     parts = {"images": _IMAGES, "classes": _json(classes), "shader": _resource("viewer.frag")}
     return _filled(_resource("viewer.html"), parts)
-
-
-def _script() -> str:
-    # A block of its own: no names in the page's global scope.
-    body = "\n".join(map(_resource, _SCRIPTS))
-    return f'<script>\n"use strict";\n{{\n{body}}}\n</script>'
 
 
 def _write_image(file: TextIO, image: EncodedImage) -> None:

@@ -38,7 +38,7 @@ from tangent_train.rendering import rotate_equirect
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
+    from datamodules.core.panorama_pairs import PanoramaPair
 
 
 Row = dict[str, Any]
@@ -156,7 +156,11 @@ class Comparer:
             )
             image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level)
-        views = [_depth_view(side) for side in sides]
+        views = [
+            None if side.distance_m is None or side.pose is None
+            else DepthView(side.distance_m, side.pose)
+            for side in sides
+        ]  # fmt: skip
         overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
         known = {
             "pair": pair.name,
@@ -262,12 +266,6 @@ def _truth(
     figures = (*map(_defined, errors), *areas, *shares)
     counts = int(visible[0].sum()), int(visible[1].sum())
     return counts, dict(zip(_TRUTH, figures, strict=True))
-
-
-def _depth_view(panorama: PairedPanorama) -> DepthView | None:
-    if panorama.distance_m is None or panorama.pose is None:
-        return None
-    return DepthView(panorama.distance_m, panorama.pose)
 
 
 def _defined(value: float) -> float | None:

@@ -41,7 +41,7 @@ _VISIBLE = {
     "all keypoints": "n_L and n_R are all keypoints, as depth and pose are unknown: PMR and MS are "
     "smaller than among the visible ones.",
 }
-"""What tables say of n_L and n_R."""
+"""Notes on n_L and n_R above the tables."""
 
 _MOST_LINES = 150
 
@@ -52,7 +52,7 @@ class KeypointReport:
 
     Attributes:
         rows: From `Comparer.compare`, of all pairs.
-        representations: In the order of the columns.
+        representations: Representations in the order of the columns.
         settings: Settings that affect the scores.
         published: The paper's pairs by name, where the data are those; else empty.
     """
@@ -135,7 +135,7 @@ def with_splits(rows: Sequence[Row]) -> list[Row]:
     """Split pairs in two halves by overlap, as in the paper, unless splits are given.
 
     Args:
-        rows: Of all pairs.
+        rows: Rows of all pairs.
 
     Returns:
         The half with the smaller overlaps is ``hard``, the other, which may have one more,
@@ -185,7 +185,7 @@ def _triple(scores: Sequence[float | None]) -> str:
 def matches_png(comparison: Comparison, condition: str) -> bytes:
     """A picture of the matches of one pair, a panel for each representation.
 
-    The left panorama is above the right one. Lines join up to 150 inliers, coloured by their
+    The left panorama is above the right one. Lines join up to 150 inliers, colored by their
     longitude on the left, the shorter way around; red dots are other matches.
 
     Args:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -60,8 +61,8 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     data = _toy(tmp_path)
     data.prepare_data()
     assert len(data.source("train")) == 2
-    samples = data.evaluation_samples("test")
-    sample = samples[0, 0]
+    samples: Any = data.dataset("test")
+    sample = samples[0]
     assert len(samples) == 1
     np.testing.assert_array_equal(sample.target, read_png(tmp_path / "labels" / "c.png"))
     problems, count = data.check()
@@ -78,12 +79,10 @@ def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
         data.source("test").labels(0)
 
 
-def test_data_sets_that_are_read_are_those_that_are_not_made() -> None:
-    sets = {name: getattr(datamodules, name) for name in datamodules.__all__}
-    made = {name for name, kind in sets.items() if getattr(kind, "is_made", False)}
-    assert {"SynthRooms", "SynthShapes"} <= made
-    for name in sets.keys() - {"SynthRoomsPairs"}:  # which has no such attribute
-        assert datamodules.is_read(f"datamodules.{name}") == (name not in made)
+def test_data_sets_that_are_read_are_those_that_are_not_generated() -> None:
+    read = {name for name in datamodules.__all__ if datamodules.is_read(f"datamodules.{name}")}
+    generated = {"SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective", "SynthShapes"}
+    assert read == set(datamodules.__all__) - generated
     assert not datamodules.is_read("mine.Toy")
 
 

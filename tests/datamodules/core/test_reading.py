@@ -137,7 +137,7 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     items = SplitReader(
         DatasetIndex("panoramas", {"test": FILES}, decode), "test", Panorama, [double]
     )
-    items.remember("data")
+    items.keep_in_memory("data")
     for index in (0, 1):
         np.testing.assert_array_equal(items.read(index).rgb, _heights().rgb)
         assert np.unique(items.labels(index)).tolist() == [index]
@@ -145,6 +145,6 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     assert sorted(read) == ["0", "1"]
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
-        SplitReader(DatasetIndex("panoramas", {"test": broken}, decode), "test", Panorama).remember(
-            "data"
-        )
+        SplitReader(
+            DatasetIndex("panoramas", {"test": broken}, decode), "test", Panorama
+        ).keep_in_memory("data")

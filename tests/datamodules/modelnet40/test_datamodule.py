@@ -68,7 +68,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def make_module(root: Path) -> MakeModule:
     def make(rotation: Any = "none", **settings: Any) -> ModelNet40:
-        return ModelNet40(root, TangentRepresentation(0, LEVEL, rotation=rotation), **settings)
+        return ModelNet40(
+            root, TangentRepresentation(0, LEVEL, random_rotation=rotation), **settings
+        )
 
     return make
 
@@ -125,7 +127,7 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
     """All six channels, against a rendering in float64 by the torch renderer."""
     module = make_module()
     batch = module.on_after_batch_transfer(next(iter(module.test_dataloader())), 0)
-    mesh = read_off(root / f"{module.sample_name('test', 3)}.off")
+    mesh = read_off(root / f"{module.source('test').name(3)}.off")
     spheres = torch.from_numpy(mesh_spheres(clean_mesh(mesh), (16, 32))).movedim(-1, 0)
     views = equirect_to_tangent(spheres, module.representation.grid)
     normalization: Any = module.normalization
@@ -137,13 +139,13 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
 
 def test_training_is_rotated_anew_every_time_and_evaluation_is_not(make_module: MakeModule) -> None:
     plain, rotated = make_module(), make_module("so3")
-    first = plain.training_samples()
+    first = plain.dataset("train")
     assert torch.equal(first[0, 4].images, first[1, 4].images)
-    again = rotated.training_samples()
+    again = rotated.dataset("train")
     assert not torch.equal(again[0, 4].images, again[1, 4].images)
     assert torch.equal(again[0, 4].images, again[0, 4].images)
     for split in SPLITS[1:]:
-        one, other = plain.evaluation_samples(split)[0, 0], rotated.evaluation_samples(split)[0, 0]
+        one, other = plain.dataset(split)[0], rotated.dataset(split)[0]
         assert torch.equal(one.images, other.images)
 
 
@@ -164,15 +166,15 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         ball.export(path)
     module = ModelNet40(root, representation, test_rotation=rotation, validation_fraction=0)
     module.prepare_data()
-    samples = module.evaluation_samples("test")
+    samples = module.dataset("test")
     assert isinstance(samples, ShapeViews)
     for index in range(2):
         rotated = samples.shape_rotation(index)
         assert bool(rotated[2, 2] > 1 - 1e-12) is (rotation == "yaw")
-        mesh = clean_mesh(read_off(root / f"{module.sample_name('test', index)}.off"))
+        mesh = clean_mesh(read_off(root / f"{module.source('test').name(index)}.off"))
         mesh.vertices = mesh.vertices @ rotated.T
         steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
-        views = representation.whole()
+        (views,) = representation.view_sets()
         expected = np.concatenate(
             [views.render(steps[..., k : k + 3], "bilinear") for k in (0, 3)], axis=-1
         )

@@ -1,0 +1,355 @@
+"""Base of all data sets: settings, index, checks, and the PyTorch data set of each split."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+from lightning.pytorch.utilities import rank_zero_only
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.utils.data import Dataset
+
+from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
+from datamodules.core.index import SPLITS, DatasetIndex, Item, Split
+from datamodules.core.inputs import Normalization
+from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.problems import Problems
+from datamodules.core.reading import SplitReader
+from tangent_train.console import print_text
+from tangent_train.errors import DataError, SettingError
+from tangent_train.registry import is_class_name
+from tangent_train.threads import in_threads
+
+_Item = TypeVar("_Item", bound=Item)
+
+REMEDY = (
+    "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
+    "broken files out."
+)
+"""What to do about broken items."""
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class LabeledData(ABC, Generic[_Item]):
+    """A data set split for training, validation and test.
+
+    A data set is a dataclass: its fields are the settings `data.*` of a config. It defines the
+    items of its splits (`find`), their readers (`split_reader`) and their samples (`dataset`).
+
+    Args:
+        root: Folder of the data set.
+        representation: Representation of the images; by default the one of
+            `default_representation`.
+        level: Level of the default representation.
+        validation_fraction: Share of the training data that is held out for validation; 0 for no
+            validation.
+        normalization: See `Normalization.of`; by default that of the data.
+        seed: Seed of the splits, the order, the views and the augmentation, 0 or more.
+        sampling_seed: Further seed of the order, the views and the augmentation: with another
+            number, fine-tuning does not repeat the views of the first training.
+        store: Folder of a prepared store, see `store`: everything is decoded once, then read from
+            there. The samples are the same without.
+        in_memory: Keep decoded data in memory.
+        skip_broken: Read all items first and leave out broken ones, instead of refusing the data.
+
+    Attributes:
+        class_names: Name of every label; the first of pixel classes is unknown, not a class.
+        labels: Labels that its items have, see `datamodules.core.labels`.
+        noun: Name of the items, in the plural.
+        label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    labels: ClassVar[str] = PIXEL_CLASSES
+    noun: ClassVar[str]
+
+    root: Path = field(kw_only=False)
+    representation: Any = field(kw_only=False, default=None)
+    level: int | None = None
+    validation_fraction: float = 0.1
+    normalization: Normalization | str | Mapping[str, Sequence[float]] | None = None
+    seed: int = 0
+    sampling_seed: int = 0
+    store: Path | None = None
+    in_memory: bool = False
+    skip_broken: bool = False
+    class_names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        super().__init__()
+        self.root = Path(self.root)
+        self.store = None if self.store is None else Path(self.store)
+        if self.representation is None:
+            self.representation = self.default_representation()
+        else:
+            self.require("level", self.level is None, "null: the representation has a level")
+        fine = 0 <= self.validation_fraction < 1
+        self.require("validation_fraction", fine, "0 to below 1")
+        for name in ("seed", "sampling_seed"):
+            self.require(name, getattr(self, name) >= 0, "0 or more")
+        self.label_counts: dict[Split, NDArray[np.int64]] = {}
+        self._index: DatasetIndex[_Item] | None = None
+        self._readers: dict[Split, SplitReader[_Item, Any]] = {}
+
+    # --- what a kind of data defines ---------------------------------------------------------
+
+    @abstractmethod
+    def default_representation(self) -> Any:
+        """Representation of `level`, without a setting for it."""
+
+    @abstractmethod
+    def find(self, problems: Problems) -> DatasetIndex[_Item]:
+        """Find the items of all splits and check them without decoding.
+
+        Args:
+            problems: Problems are added; the index contains broken items nevertheless.
+
+        Raises:
+            DataError: The data set as a whole cannot be used.
+        """
+
+    @abstractmethod
+    def split_reader(self, index: DatasetIndex[_Item], split: Split) -> SplitReader[_Item, Any]:
+        """Reader of the items of a split."""
+
+    @abstractmethod
+    def dataset(self, split: Split) -> Dataset[Any]:
+        """Return the samples of a split as a map-style data set of PyTorch.
+
+        A sample of ``"train"`` consists of views drawn at random, one of ``"val"`` and ``"test"``
+        of all views. A key is an index, or an epoch and an index: other epochs draw other views,
+        an index alone those of epoch 0.
+
+        Args:
+            split: The split.
+        """
+
+    @property
+    @abstractmethod
+    def in_channels(self) -> int:
+        """Number of input channels."""
+
+    @abstractmethod
+    def normalized(self, batch: Any) -> Tensor:
+        """Return the images of a batch, normalized for the network."""
+
+    def make_files(self) -> None:
+        """Generate the files of a synthetic data set."""
+
+    # --- settings ------------------------------------------------------------------------------
+
+    def require(self, setting: str, fine: bool, expected: str, remedy: str = "") -> None:
+        """Refuse the value of a setting ``data.<setting>`` that is not fine.
+
+        Raises:
+            SettingError: It is not.
+        """
+        if not fine:
+            found = getattr(self, setting)
+            found = list(found) if isinstance(found, tuple) else found
+            raise SettingError(f"data.{setting}", found=found, expected=expected, remedy=remedy)
+
+    def set_normalization(self, default: Normalization, channels: int) -> None:
+        """Make the setting a `Normalization`.
+
+        Args:
+            default: Value without a setting.
+            channels: Required number of channels.
+
+        Raises:
+            SettingError: It is something else, or has other channels.
+        """
+        given = self.normalization or default
+        self.normalization = Normalization.of(given, channels, "data.normalization")
+
+    def require_representation(self, attribute: str, expected: str, remedy: str) -> None:
+        """Refuse a representation of another kind of images.
+
+        Args:
+            attribute: Attribute of all representations of the right kind.
+            expected: The right kind, for the message.
+            remedy: Remedy, for the message.
+
+        Raises:
+            SettingError: It is of another kind.
+        """
+        if not hasattr(self.representation, attribute):
+            raise SettingError(
+                "representation",
+                found=type(self.representation).__name__,
+                expected=expected,
+                remedy=remedy,
+            )
+
+    def check_classes(self) -> None:
+        """Check that the data set names its classes, in names that checkpoints can hold.
+
+        Raises:
+            SettingError: It does not.
+        """
+        names = getattr(self, "class_names", ())
+        setting = f"class_names of {type(self).__name__}"
+        if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
+            raise SettingError(
+                setting,
+                found=f"{names[0]} first" if names else "none",
+                expected="unknown, then the classes: label 0 is ignored",
+            )
+        for name in names:
+            if not is_class_name(name):
+                expected = "names without control characters and line ends"
+                raise SettingError(setting, found=repr(name), expected=expected)
+
+    # --- finding and checking ----------------------------------------------------------------
+
+    def index(self) -> DatasetIndex[_Item]:
+        """Return the index of the usable items; the first call finds and checks them.
+
+        Raises:
+            DataError: Something is broken; the message names all problems.
+            SettingError: A setting does not suit the data.
+        """
+        if self._index is None:
+            self._index = self._find_usable()
+        return self._index
+
+    def check(self) -> tuple[Problems, int]:
+        """Read the whole data set, and count its labels; nothing is generated or written.
+
+        Returns:
+            All problems, and the number of images or shapes read.
+        """
+        problems, count = Problems(), 0
+        counts: dict[str, NDArray[np.int64]] = {}
+        with problems.noted():
+            index = self._find_all(problems)
+            count = index.check(problems, counts)
+            for split in SPLITS:
+                of_split = [counts[i.name] for i in index.splits[split] if i.name in counts]
+                none = np.zeros(len(self.class_names), np.int64)
+                self.label_counts[split] = np.sum([none, *of_split], axis=0)
+        return problems, count
+
+    def prepare_part(self, part: Callable[[Sequence[_Item]], Sequence[_Item]]) -> int:
+        """Complete a part of the store, as on one of several machines.
+
+        Args:
+            part: Chooses from all items, which are listed the same way on every machine.
+
+        Returns:
+            The number of its items that are in the store.
+
+        Raises:
+            DataError: Something in it is broken.
+            SettingError: There is no store.
+        """
+        self.make_files()
+        problems = Problems()
+        index = self._find_checked(problems)
+        if index.store is None:
+            expected = "a folder: files of the store are all that can be prepared in parts"
+            raise SettingError("data.store", found="none, with shard=", expected=expected)
+        if not self.skip_broken:
+            problems.refuse(self.root, REMEDY)
+        items = part(index.of())
+        part_of = replace(index, splits={"train": items, "val": [], "test": []})
+        part_of.read_all(SPLITS, problems, whole=True)
+        if not self.skip_broken:
+            problems.refuse(self.root, REMEDY)
+        return len(problems.without(items))
+
+    def _find_all(self, problems: Problems) -> DatasetIndex[_Item]:
+        """Index of all items, with the checks that hold for every data set."""
+        self.check_classes()
+        index = self.find(problems)
+        if not index.of() and not problems.items:
+            expected = f"{self.noun}, as docs and the docstring of the data set describe them"
+            raise DataError(self.root, found=f"no {self.noun}", expected=expected)
+        return index
+
+    def _find_checked(self, problems: Problems) -> DatasetIndex[_Item]:
+        """Index of all items, broken ones too; refuse a data set that cannot be used at all."""
+        index: Any = None
+        with problems.noted():
+            index = self._find_all(problems)
+        if problems.fatal:
+            problems.refuse(self.root)
+        return index
+
+    def _find_usable(self, *, sample: bool = False, whole: bool = True) -> DatasetIndex[_Item]:
+        """Index of the usable items; refuse broken ones, unless they are left out.
+
+        Args:
+            sample: True to decode some images.
+            whole: True to check the content of the store where everything is read.
+        """
+        problems = Problems()
+        index = self._find_checked(problems)
+        if not self.skip_broken:
+            if sample and self.store is None:
+                index.read_some(self.seed, problems)
+            problems.refuse(self.root, REMEDY)
+            return index
+        index.read_all(SPLITS, problems, whole=whole)
+        usable = index.without(problems)
+        for split in SPLITS:
+            if index.splits[split] and not usable.splits[split]:
+                raise DataError(
+                    self.root,
+                    found=f"no {self.noun} for {split} that can be used",
+                    expected="one or more",
+                    remedy="tangent-check lists their problems.",
+                )
+        if problems.items:
+            total = len(problems.items.union(item.name for item in index.of()))
+            print_on_rank_zero(
+                f"{len(problems.items)} of {total} {self.noun} are broken and left out "
+                "(data.skip_broken=true); tangent-check lists them."
+            )
+        return usable
+
+    # --- reading -------------------------------------------------------------------------------
+
+    @property
+    def num_classes(self) -> int:
+        """Classes K: the scores of a network."""
+        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
+
+    def source(self, split: Split) -> SplitReader[_Item, Any]:
+        """Return the reader of a split; with `in_memory`, everything is read now."""
+        if split not in self._readers:
+            reader = self.split_reader(self.index(), split)
+            if self.in_memory:
+                reader.keep_in_memory(self.root)
+            self._readers[split] = reader
+        return self._readers[split]
+
+    def class_weights(self, kind: ClassWeights) -> Tensor:
+        """Return weights of the classes in the loss, from the labels of the training split.
+
+        Print a warning where labels seem to belong to other classes.
+
+        Args:
+            kind: See `class_weights.class_weights`.
+        """
+        counts = np.zeros(len(self.class_names), np.int64)
+        if kind != "none":
+            source = self.source("train")
+            for labels in in_threads(source.labels, range(len(source))):
+                counts += np.bincount(labels.ravel(), minlength=len(counts))
+            for doubt in label_doubts("train", counts, self.class_names):
+                print_on_rank_zero(f"Warning: {doubt}")
+        return class_weights(counts[1:], kind)
+
+
+@rank_zero_only
+def print_on_rank_zero(text: str) -> None:
+    """Print text as it is, in the first process."""
+    print_text(text)
