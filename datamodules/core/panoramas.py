@@ -176,7 +176,7 @@ class Panorama(NamedTuple):
         """The sampler of its views: the representation, aligned with gravity."""
         if self.up is None:
             return representation
-        return representation.turned(upright_rotation(self.up))
+        return representation.with_rotation(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> NDArray[np.uint8]:
         """All labels: predictions are rendered back to the panorama."""
@@ -298,7 +298,7 @@ class Photo(NamedTuple):
 
     def target(self, representation: PerspectiveRepresentation) -> NDArray[np.uint8]:
         """``(n, d, d)`` labels of the crops, each place of the photo in one of them only."""
-        crops = self.sampler(representation).whole()
+        (crops,) = self.sampler(representation).view_sets()
         return np.where(crops.owned(), crops.render(self.labels, "nearest"), np.uint8(0))
 
 

@@ -107,7 +107,6 @@ class PredictSettings(InputSettings):
     depth_scale: float
     projection: Literal["equirectangular", "perspective"]
     fov: float | None
-    level: int | None
     levels: tuple[int, ...] | None
     base_level: int | None
     blend: Literal["feather", "nearest"]

@@ -31,7 +31,7 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,

@@ -157,8 +157,8 @@ class StoredNetwork:
             DataError: The file cannot be used.
         """
         from tangent_train.checkpoints.trained import load_trained
-        from tangent_train.inference.predictor import views_per_forward
-        from tangent_train.inference.views import panorama_settings
+        from tangent_train.inference.engine import views_per_forward
+        from tangent_train.inference.representations import panorama_settings
 
         own = names_of(self.user_overrides)
         trust = parse_settings(Trust, said).trust

@@ -122,7 +122,9 @@ def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) 
 
 def _facts(records: Sequence[Record]) -> dict[str, str]:
     record = records[0]
-    rotations = [record.settings.get(n) for n in ("representation.rotation", "data.test_rotation")]
+    rotations = [
+        record.settings.get(n) for n in ("representation.random_rotation", "data.test_rotation")
+    ]
     facts = {
         "data": record.data,
         "s": str(record.settings.get("level") or "–"),

@@ -9,12 +9,13 @@ from typing import Any, ClassVar, get_args
 import numpy as np
 import torch
 from jaxtyping import Float, Integer
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
-from tangent_train.inference.predictor import sees_rays, view_scores
+from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
     AbsentClass,
@@ -24,7 +25,8 @@ from tangent_train.metrics.segmentation import (
     segmentation_scores,
 )
 from tangent_train.registry import registered
-from tangent_train.rendering import Assembler, EquirectRepresentation
+from tangent_train.rendering import EquirectRepresentation
+from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.results.evaluation import class_entries, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
@@ -49,7 +51,7 @@ class SegmentationTask(Task):
             and optionally auxiliary scores under ``"aux"``; score k is that of label k + 1. One
             whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing rays of
             its images and bounds its memory itself (`models.SphereContext`).
-        representation: Representation of the images; it assembles the scores.
+        representation: Representation of the images.
         class_names: K + 1 names of the labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
@@ -70,12 +72,11 @@ class SegmentationTask(Task):
     monitor: ClassVar[str] = "val/miou"
     takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
     class_weights: Tensor
-    representation: Assembler
 
     def __init__(
         self,
         network: nn.Module,
-        representation: Assembler,
+        representation: Any,
         class_names: Sequence[str],
         *arguments: Any,
         class_weights: ClassWeights | Sequence[float] = "log",
@@ -149,11 +150,15 @@ class SegmentationTask(Task):
             at_once = self.images_per_chunk if self.training else self.images_per_forward
             returned = self.network(images, rays, at_once)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        # More than there are classes where an imported network also knows nothing, see `Groups`.
-        count = getattr(self.network, "num_scores", len(self.class_weights))
-        expected = (len(images), count, *images.shape[-2:])
+        expected = (len(images), self._num_scores, *images.shape[-2:])
         self.checked_scores(outputs["out"], expected)
         return outputs
+
+    @property
+    def _num_scores(self) -> int:
+        """One more than there are classes where an imported network has unknown ones too."""
+        count: int = getattr(self.network, "num_scores", len(self.class_weights))
+        return count
 
     def example(self, channels: int) -> Tensor:
         """One empty image ``(1, C, h, w)``."""
@@ -194,55 +199,49 @@ class SegmentationTask(Task):
         self,
         images: Float[Tensor, "images channels height width"],
         shape: tuple[int, ...],
-        rays: Float[Tensor, "images 3 3"] | None = None,
-        rotations: Float[Tensor, "rotations 3 3"] | None = None,
+        rotation: NDArray[np.float64] | None = None,
     ) -> Integer[Tensor, ...]:
         """Class index of every pixel of one panorama, or of the crops of a photo.
 
         Args:
-            images: The representation's views of the whole.
-            shape: Of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
-            rays: Of the views.
-            rotations: Of the views; none by default.
+            images: All view sets of the representation, one after the other.
+            shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
+                crops.
+            rotation: Rotation of the representation.
 
         Returns:
             Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
-        count = 1 if rotations is None else len(rotations)
-        of_turns = [None] * count if rays is None else rays.chunk(count)
-        scores = (self._scores(*part) for part in zip(images.chunk(count), of_turns, strict=True))
-        turns = None if rotations is None else rotations.cpu().double().numpy()
-        if turns is None or count == 1:
-            turn = None if turns is None else turns[0]
-            best = self.representation.to_labels(next(scores), shape, turn)
+        if len(shape) > 2:  # each crop by itself
+            parts = view_scores(self, images.__getitem__, len(images), self.images_per_forward)
+            best = torch.cat([scores.argmax(dim=1) for _, scores in parts])
         else:
-            representation: Any = self.representation  # one whose `whole` has several rotations
-            best = representation.to_averaged_labels(scores, shape, turns).to(images.device)
+            best = self._mosaic(images, (shape[0], shape[1]), rotation).labels().long()
+            best = best.to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
-    def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
-        """Scores of all views of one rotation, see `view_scores`."""
-        of_sphere = rays if self.sees_rays and rays is not None and rays.numel() else None
-        parts = view_scores(
-            self, lambda part: images[part], len(images), self.images_per_forward, of_sphere
-        )
-        # Filled part by part: to concatenate them would hold them twice, and compiled networks may
-        # write every result to the same memory (mode=reduce-overhead).
-        all_scores = images.new_empty(0)
-        for part, scores in parts:
-            if part.start == 0:
-                all_scores = scores.new_empty((len(images), *scores.shape[1:]))
-            all_scores[part] = scores
-        return all_scores
+    def _mosaic(
+        self, images: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None
+    ) -> ScoreMosaic:
+        upright: Any = self.representation
+        seen = upright if rotation is None else upright.with_rotation(rotation)
+        sets = seen.view_sets()
+        counts = [len(views) for views in sets]
+        of_sets = (part.__getitem__ for part in torch.split(images, counts))
+        rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
+        count, several = self._num_scores, len(sets) > 1
+        mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
+        return fill(mosaic, self, zip(sets, of_sets, rays, strict=True), self.images_per_forward)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; returns the predictions."""
         predictions = []
-        for images, target, rays, rotations in zip(
-            batch.images, batch.target, batch.rays, batch.rotations, strict=True
+        for images, target, rotation in zip(
+            batch.images, batch.target, batch.rotation, strict=True
         ):
-            predictions.append(self.predict_labels(images, tuple(target.shape), rays, rotations))
-            self.metric.update(predictions[-1], target)
+            labels = self.predict_labels(images, tuple(target.shape), rotation.cpu().numpy())
+            predictions.append(labels)
+            self.metric.update(labels, target)
         return torch.stack(predictions)
 
     def build_metric(self) -> SegmentationMetric:

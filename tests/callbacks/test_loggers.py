@@ -229,10 +229,9 @@ def test_the_same_images_are_shown_after_every_validation(
     for tag, index in chosen.items():
         panorama = source.read(index)
         normalization: Any = data.normalization
-        inputs = render_inputs(panorama, TANGENT.whole(), data.inputs)
-        with torch.no_grad():
-            scores = task.network(normalize(inputs, normalization, data.inputs))
-        labels = TANGENT.to_labels(scores, (32, 64)).numpy() + 1
+        inputs = render_inputs(panorama, TANGENT.view_sets()[0], data.inputs)
+        images = normalize(inputs, normalization, data.inputs)
+        labels = task.predict_labels(images, (32, 64)).numpy()
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
         np.testing.assert_array_equal(shown[tag][-1], expected)
 

@@ -14,7 +14,7 @@ from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import SettingError
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import build_from_config
 from tests.inference.trained import trained_network
 from tests.running import composed

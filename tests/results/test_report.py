@@ -135,7 +135,7 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
         "data._target_": "datamodules.ModelNet40",
         "level": 5,
         "name": "shapes",
-        "representation.rotation": "yaw",
+        "representation.random_rotation": "yaw",
         "data.test_rotation": "so3",
         "representation.base_level": 0,
     }

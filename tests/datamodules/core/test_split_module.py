@@ -88,7 +88,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     assert aware.up is not None
     assert np.degrees(np.arccos(aware.up[2])) == pytest.approx(30)
     representation = TangentRepresentation(0, 3)
-    rotation = aware.sampler(representation).whole().rotations()[0]
+    rotation = aware.sampler(representation).grid.rotation
     np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
