@@ -207,7 +207,9 @@ def build(
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
     outputs = count_outputs(data.num_classes)
-    section = completed_settings(settings["network"], data.in_channels, outputs, restored=restored)
+    section = completed_settings(
+        settings.get("network"), data.in_channels, outputs, restored=restored
+    )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
     try_network(task, data.in_channels)
