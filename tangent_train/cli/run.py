@@ -134,7 +134,7 @@ class Run:
         if record and images == total:
             self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
             return
-        if not trainer.fast_dev_run and str(trainer.limit_test_batches) == "1.0":
+        if not getattr(trainer, "fast_dev_run", False) and str(trainer.limit_test_batches) == "1.0":
             raise RuntimeError(f"{images} of {total} test {noun} were counted")
         rank_zero_only(print_text)(
             f"{images} of {total} test {noun} were evaluated, as trainer.limit_test_batches or "
