@@ -99,7 +99,7 @@ def step(quick: bool) -> Iterator[Table]:
     """
     small = ["level=5", "network=unet_small"] if quick else []
     settings = ["data.panoramas_per_step=3", "task.class_weights=none", "optimizer=adam"]
-    settings += ["representation.rotation=none"]  # no table of the one is used by the other
+    settings += ["representation.random_rotation=none"]  # no table of the one is used by the other
     overrides = ["experiment=rooms/standard", *settings, "scheduler=constant", *small]
     with tempfile.TemporaryDirectory() as root, quiet():
         data, task = built(overrides, f"{root}/rooms", 64 if quick else 256, rooms=24)

@@ -21,7 +21,7 @@ _BY_SIGNATURE = {
     "torch.nn": "Conv2d",
     "torch.optim": "ASGD Adadelta Adagrad Adam AdamW Adamax NAdam RAdam RMSprop Rprop SGD",
     "torch.optim.lr_scheduler": "ConstantLR CosineAnnealingLR CosineAnnealingWarmRestarts CyclicLR "
-    "ExponentialLR LinearLR MultiStepLR OneCycleLR PolynomialLR StepLR",
+    "ExponentialLR LinearLR MultiStepLR OneCycleLR PolynomialLR ReduceLROnPlateau StepLR",
     "segmentation_models_pytorch": "DPT DeepLabV3 DeepLabV3Plus FPN Linknet MAnet PAN PSPNet "
     "Segformer UPerNet Unet UnetPlusPlus",
 }

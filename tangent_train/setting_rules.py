@@ -29,9 +29,9 @@ _RULES = (
     ("report", "data.fold data.seed seed"),
     # Of the evaluation: it comes after the training that is resumed.
     ("resume", "data.test_rotation task.absent_class"),
-    ("resume", "representation.average_rotations representation.further_levels"),
+    ("resume", "representation.blend representation.levels representation.rotations"),
     # Of the training: an evaluation does not depend on it.
-    ("evaluation", "callbacks optimizer scheduler"),
+    ("evaluation", "callbacks optimizer scheduler task.backbone_lr_factor"),
     ("resume evaluation", "task.images_per_chunk trainer.devices trainer.num_nodes"),
     ("resume evaluation", "trainer.max_epochs trainer.max_steps"),
     # A resumed run may go on for longer, or elsewhere, but takes the same steps.

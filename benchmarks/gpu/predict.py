@@ -20,11 +20,11 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.inference.engine import Predictor, view_scores, views_per_forward
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
-from tangent_train.inference.predictor import Predictor, view_scores, views_per_forward
-from tangent_train.inference.views import InputImage, PanoramaViews
+from tangent_train.inference.representations import PanoramaViews
 from tangent_train.registry import build_from_config
-from tangent_train.rendering import equirect_to_tangent, tangent_to_labels
 
 
 def predict(quick: bool) -> Iterator[Table]:
@@ -59,7 +59,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
 
 
 def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
-    """The network alone, `Predictor` as it is, and everything on the device."""
+    """The network alone, and `Predictor`, with everything on the device."""
     shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
     per_forward = views_per_forward((grid.dim, grid.dim))
@@ -71,12 +71,6 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
         parts = view_scores(trained.network, views, grid.num_images, per_forward)
         return [part for _, part in parts]
 
-    def on_device() -> None:
-        panorama = torch.from_numpy(image.rgb).to(DEVICE).movedim(-1, 0) / 255
-        faces = np.arange(grid.num_images)
-        found = scores(lambda part: equirect_to_tangent(panorama, grid, faces[part]))
-        tangent_to_labels(torch.cat(found), grid, shape).byte().cpu()
-
     def labelled(predictor: Predictor) -> None:
         trained.labels(predictor.predict(image).labels())
 
@@ -84,7 +78,6 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
     for blend in ("feather", "nearest"):
         predictor = Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
         ways.append(Way(f"Predictor, {blend}", partial(labelled, predictor), ours=True))
-    ways.append(Way("rendered and labelled on the device, nearest", on_device))
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
         return measure(ways, rounds)
 

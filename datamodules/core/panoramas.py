@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -25,6 +25,7 @@ from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError, width_height
+from tangent_train.geometry import PanoramaPose
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -115,6 +116,11 @@ class ImageReader(ABC):
             DataError: The file is broken, or holds a value without a class.
         """
 
+    def label_warning(self, files: ImageFiles) -> str:
+        """Return a finding about labels that can be used; empty without one."""
+        del files
+        return ""
+
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
         raise NotImplementedError(files.name)
@@ -122,6 +128,11 @@ class ImageReader(ABC):
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
         raise NotImplementedError(files.name)
+
+    def pose(self, files: ImageFiles) -> PanoramaPose | None:
+        """Pose in a world of metres, see `LabeledImage`; None if it is unknown."""
+        del files
+        return None
 
 
 class PngReader(ImageReader):
@@ -165,7 +176,7 @@ class Panorama(NamedTuple):
         """The sampler of its views: the representation, aligned with gravity."""
         if self.up is None:
             return representation
-        return representation.turned(upright_rotation(self.up))
+        return representation.with_rotation(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> NDArray[np.uint8]:
         """All labels: predictions are rendered back to the panorama."""
@@ -243,8 +254,9 @@ def mask_black(
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in metres, float32, of depth in steps of 1/512 m."""
-    return steps.astype(np.float32) / np.float32(STEPS_PER_M)
+    """Depth in metres, float32, NaN where missing, of depth in steps of 1/512 m."""
+    meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
+    return np.where(steps == 0, np.float32(np.nan), meters)
 
 
 def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
@@ -286,7 +298,7 @@ class Photo(NamedTuple):
 
     def target(self, representation: PerspectiveRepresentation) -> NDArray[np.uint8]:
         """``(n, d, d)`` labels of the crops, each place of the photo in one of them only."""
-        crops = self.sampler(representation).whole()
+        (crops,) = self.sampler(representation).view_sets()
         return np.where(crops.owned(), crops.render(self.labels, "nearest"), np.uint8(0))
 
 
@@ -325,11 +337,18 @@ class _Reading:
         reader: Reader of the data set.
         num_classes: K + 1, the unknown class included.
         shape: Rows and columns of the result; None for those of the files.
+        kind: Kind of the images.
     """
 
     reader: ImageReader
     num_classes: int
     shape: tuple[int, int] | None = None
+    kind: ClassVar[type[Panorama | Photo]]
+
+    @property
+    def store_name(self) -> str:
+        """Name of the images in a store."""
+        return "photos" if self.shape is None else "{}x{}".format(*self.shape)
 
     @property
     def layout(self) -> Layout:
@@ -354,18 +373,21 @@ class _Reading:
         return labels
 
     def parts(
-        self, label_counts: dict[str, NDArray[np.int64]], files: ImageFiles
+        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str], files: ImageFiles
     ) -> list[Callable[[], object]]:
         """Functions that decode each of its files separately.
 
         Args:
             label_counts: The pixels of each label are added under the name of the image.
+            warnings: Warnings of labels are added.
             files: Files of the image.
         """
 
         def count_labels(files: ImageFiles) -> None:
             labels = replace(self, shape=None).labels(files)
             label_counts[files.name] = np.bincount(labels.ravel(), minlength=self.num_classes)
+            if warning := self.reader.label_warning(files):
+                warnings.append(warning)
 
         read = {"labels": count_labels}
         return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
@@ -373,6 +395,8 @@ class _Reading:
 
 class PanoramaReading(_Reading):
     """Reads panoramas at one size."""
+
+    kind = Panorama
 
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
@@ -383,6 +407,8 @@ class PanoramaReading(_Reading):
 
 class PhotoReading(_Reading):
     """Reads photos; z-depth becomes distance from the centre of projection."""
+
+    kind = Photo
 
     @property
     def layout(self) -> Layout:

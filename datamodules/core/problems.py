@@ -38,10 +38,15 @@ class Problem(NamedTuple):
 
 
 class Problems:
-    """Collects problems; several threads may do so at once."""
+    """Collects problems; several threads may do so at once.
+
+    Attributes:
+        warnings: Findings about files that can be used.
+    """
 
     def __init__(self) -> None:
         self._noted: list[Problem] = []
+        self.warnings: list[str] = []
 
     @contextmanager
     def noted(self, item: str | None = None, file: Path | None = None) -> Iterator[None]:

@@ -50,18 +50,16 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     """One whole panorama or photo; collated, each has a leading batch dimension.
 
     Attributes:
-        images: N images that cover it, as in `TrainingSample`.
+        images: Images of all view sets, one set after the other, as in `TrainingSample`.
         target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
             the crops of a photo.
-        rays: As in `TrainingSample`.
-        rotations: ``(K, 3, 3)`` float32, see `Views.rotations`.
+        rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
         index: Place in its split.
     """
 
     images: _Images
     target: Tensor
-    rays: Tensor
-    rotations: Tensor
+    rotation: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
 
 
@@ -119,14 +117,12 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     def __getitem__(self, key: int | tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = sample_key(key, len(self))
         image = self.source.read(index)
-        views = image.sampler(self.representation).whole()
-        return EvaluationSample(
-            render_inputs(image, views, self.inputs),
-            torch.tensor(image.target(self.representation)),
-            torch.from_numpy(world_rays(views, image.up)),
-            torch.from_numpy(views.rotations().astype(np.float32)),
-            index,
-        )
+        view_sets = image.sampler(self.representation).view_sets()
+        of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
+        images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
+        rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
+        target = torch.tensor(image.target(self.representation))
+        return EvaluationSample(images, target, torch.from_numpy(rotation), index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

@@ -11,14 +11,12 @@ hard with the overlap, 0.86, that six easy ones have: the split is by figures be
 from __future__ import annotations
 
 import csv
-import math
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
-
-import numpy as np
 
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
@@ -30,39 +28,15 @@ from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meter
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
-from datamodules.stanford2d3ds.reader import read_depth, read_pose_numbers
-from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
+from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PanoramaPose
-
-_KEYS = {"camera_rt_matrix": (3, 4), "camera_original_rotation": (3,), "camera_location": (3,)}
-
-
-def read_panorama_pose(path: Path) -> PanoramaPose:
-    """Read the pose file of a panorama.
-
-    Args:
-        path: ``…_domain_pose.json``.
-
-    Raises:
-        DataError: It cannot be read, or holds no pose.
-    """
-    rt, angles, location = read_pose_numbers(path, _KEYS)
-    if np.abs(angles).max() > 2 * math.pi:
-        angles = np.radians(angles)
-    original = euler_rotation(angles)
-    try:
-        return PanoramaPose(original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
-    except SettingError as error:
-        raise DataError(path, found=error.found, expected="a rotation") from error
-
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _SHORT = 7  # hexadecimal digits of a camera that the paper prints
 
 
 def published_pairs() -> list[PublishedPair]:
-    """The paper's pairs, in the order of their numbers."""
+    """Read the paper's pairs in the order of their numbers."""
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.reader(file))[1:]
     pairs = []
@@ -128,8 +102,8 @@ class StanfordPairs(PanoramaPairs):
             if one.room == other.room
         ]
         if not chosen:
-            found_, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
-            raise DataError(self.root, found=found_, expected=expected, remedy=GET_IT)
+            none, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
+            raise DataError(self.root, found=none, expected=expected, remedy=GET_IT)
         return chosen
 
     def image(self, files: PictureFiles) -> Path:
@@ -142,9 +116,9 @@ class StanfordPairs(PanoramaPairs):
         rgb = read_rgb(image.rgb)
         shape = paired_shape(image.rgb, rgb, self._height)
         steps = resize_depth(read_depth(image.parts["depth"]), shape)
-        distance_m = np.where(steps == 0, np.float32(np.nan), steps_to_meters(steps))
         pose = read_panorama_pose(files.pose)
-        return PairedPanorama(image.name, resize_area(rgb, shape), image.rgb, distance_m, pose)
+        small = resize_area(rgb, shape)
+        return PairedPanorama(image.name, small, image.rgb, steps_to_meters(steps), pose)
 
 
 def _room(files: PictureFiles) -> str:
@@ -155,20 +129,17 @@ def _camera(files: PictureFiles) -> str:
     return files.name.camera[:_SHORT]
 
 
-def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
-    """The files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
+def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
+    """Return the files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
 
     Raises:
         DataError: Some names fit no panorama, or several; the message lists all.
     """
-    by_name: dict[str, list[PictureFiles]] = {}
+    by_name: defaultdict[str, list[PictureFiles]] = defaultdict(list)
     for file in files:
-        by_name.setdefault(f"{_camera(file)}_{_room(file)}", []).append(file)
-    wrong = [
-        f"{name} ({len(by_name.get(name, []))} times)"
-        for name in sorted(names)
-        if len(by_name.get(name, [])) != 1
-    ]
+        by_name[f"{_camera(file)}_{_room(file)}"].append(file)
+    counts = {name: len(by_name[name]) for name in sorted(names)}
+    wrong = [f"{name} ({count} times)" for name, count in counts.items() if count != 1]
     if wrong:
         raise DataError(
             files[0].image.rgb.parent,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,15 +15,21 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
-from tangent_train.errors import DataError, counted
+from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
+from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import parse_json, read_json
-from tangent_train.geometry import is_camera_matrix
+from tangent_train.geometry import PanoramaPose, is_camera_matrix
 
 UNKNOWN = 0
 """The label of pixels without a class: ignored in training and evaluation."""
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+_PANORAMA_KEYS = {
+    "camera_rt_matrix": (3, 4),
+    "camera_original_rotation": (3,),
+    "camera_location": (3,),
+}
 _MOST = 1e6  # meters, radians, pixels
 
 
@@ -62,40 +69,40 @@ class LabelTable:
             raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
         return cls(np.array([ids[name] for name in classes], np.uint8))
 
-    def decode(self, colors: NDArray[np.uint8], path: object = "labels") -> NDArray[np.uint8]:
-        """Labels of a `semantic` image.
+    def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the labels of a `semantic` image; instances past the end of the table are unknown.
 
         Args:
             colors: ``(H, W, 3)`` uint8 in RGB order.
-            path: Their file, for messages.
 
         Returns:
             ``(H, W)`` uint8 labels.
 
-        Raises:
-            DataError: There are instances past the end of the table, other than the mark of missing
-                labels.
-
         >>> table = LabelTable(np.array([0, 1, 12], np.uint8))
-        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13]]], np.uint8)).tolist()
-        [[12, 0]]
+        >>> table.decode(np.array([[[0, 0, 2], [13, 13, 13], [0, 0, 3]]], np.uint8)).tolist()
+        [[12, 0, 0]]
         """
-        red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
-        index = (red << 16) | (green << 8) | blue
-        end = len(self.class_ids)
-        past = index >= end
-        strange = past & (index != MISSING_LABEL)
-        if strange.any():
-            count = int(np.count_nonzero(strange))
-            raise DataError(
-                path,
-                found=f"instance {index[strange].min()} in {counted(count, 'pixels')}",
-                expected=f"0 to {end - 1}, the entries of the class table, or #{MISSING_LABEL:06X} "
-                "where labels are missing",
-                remedy="Use the file and semantic_labels.json of one release.",
-            )
-        index[past] = 0
-        return np.where(past, np.uint8(UNKNOWN), self.class_ids[index])
+        instances = _instances(colors)
+        past = instances >= len(self.class_ids)
+        instances[past] = 0
+        return np.where(past, np.uint8(UNKNOWN), self.class_ids[instances])
+
+    def past_end(self, colors: NDArray[np.uint8]) -> NDArray[np.int32]:
+        """Return the instances past the end of the table, without the mark of missing labels.
+
+        Args:
+            colors: See `decode`.
+
+        Returns:
+            ``(n,)``, one for each of n pixels.
+        """
+        instances = _instances(colors)
+        return instances[(instances >= len(self.class_ids)) & (instances != MISSING_LABEL)]
+
+
+def _instances(colors: NDArray[np.uint8]) -> NDArray[np.int32]:
+    red, green, blue = np.moveaxis(colors.astype(np.int32), -1, 0)
+    return (red << 16) | (green << 8) | blue
 
 
 @dataclass(frozen=True)
@@ -119,25 +126,44 @@ class StanfordReader(PngReader):
         return {"unknown": self.unknown, "class table": classes}
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes by the class table, 0 where black pixels are masked."""
+        """Return classes by the class table, 0 where black pixels are masked."""
         colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
-        labels = self.table.decode(resize_nearest(colors, shape), files.labels)
+        labels = self.table.decode(resize_nearest(colors, shape))
         if self.unknown == "labels":
             return labels
         return mask_black(labels, resize_nearest(self.rgb(files), shape), self.unknown)
 
+    def label_warning(self, files: ImageFiles) -> str:
+        """See `ImageReader`: instances past the end of the class table."""
+        past = self.table.past_end(read_rgb(files.labels))
+        if not past.size:
+            return ""
+        return (
+            f"{files.labels}: {counted(past.size, 'pixels')} of instance {past.min()} or higher, "
+            f"past the end of the class table ({len(self.table.class_ids) - 1}), are unknown: use "
+            "the file and semantic_labels.json of one release."
+        )
+
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Depth in steps of 1/512 m, as in the files."""
+        """Read depth in steps of 1/512 m, as in the files."""
         return read_depth(files.parts["depth"])
 
+    def pose(self, files: ImageFiles) -> PanoramaPose | None:
+        """The pose in the pose file; None without a file."""
+        pose = files.rgb.name.removesuffix("rgb.png") + "pose.json"
+        path = files.rgb.parents[1] / "pose" / pose
+        if not path.is_file():
+            return None
+        return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
+
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix in the pose file."""
+        """Read the camera matrix in the pose file."""
         return read_camera_matrix(files.parts["camera"])
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, 0 where missing.
+    """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
         DataError: The file is broken.
@@ -148,7 +174,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:
-    """The camera matrix of a pose file.
+    """Read the camera matrix of a pose file.
 
     Args:
         path: ``camera_…_domain_pose.json``.
@@ -166,12 +192,47 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     return _CENTERS_FROM_CORNERS @ matrix
 
 
-def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
-    """Numbers in a pose file.
+def read_panorama_pose(path: Path) -> PanoramaPose:
+    """Read the pose file of a panorama.
+
+    Args:
+        path: ``…_domain_pose.json``.
+
+    Raises:
+        DataError: It cannot be read, or holds no pose.
+    """
+    rt, angles, location = read_pose_numbers(path, _PANORAMA_KEYS)
+    if np.abs(angles).max() > 2 * math.pi:
+        angles = np.radians(angles)
+    original = euler_rotation(angles)
+    return _checked_pose(path, original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
+
+
+def read_photo_pose(path: Path) -> PanoramaPose:
+    """Read the pose of a photo, in the axes of `LabeledImage`.
+
+    The camera matrix [R | t] of the file takes points of the world to the camera: x right, y down,
+    z forward. This was tested with SynthRooms.
 
     Args:
         path: ``camera_…_domain_pose.json``.
-        keys: What to read, with its shape.
+
+    Raises:
+        DataError: It cannot be read, or holds no pose.
+    """
+    (rt,) = read_pose_numbers(path, {"camera_rt_matrix": (3, 4)})
+    world_from_camera = rt[:, :3].T
+    return _checked_pose(
+        path, world_from_camera @ CAMERA_FROM_SPHERE, -world_from_camera @ rt[:, 3]
+    )
+
+
+def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
+    """Read numbers in a pose file.
+
+    Args:
+        path: ``camera_…_domain_pose.json``.
+        keys: Names and shapes of the numbers to read.
 
     Raises:
         DataError: It cannot be read, or lacks one of them.
@@ -186,6 +247,15 @@ def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[N
             expected=f"a pose as JSON, with {', '.join(keys)}",
             remedy="Copy or extract the file again.",
         ) from error
+
+
+def _checked_pose(
+    path: Path, world_from_panorama: NDArray[np.float64], location_m: NDArray[np.float64]
+) -> PanoramaPose:
+    try:
+        return PanoramaPose(world_from_panorama, location_m)
+    except SettingError as error:
+        raise DataError(path, found=error.found, expected="a rotation") from error
 
 
 def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import torch
 from lightning import LightningModule, Trainer
 from lightning.fabric.plugins import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, Timer
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.console import print_text
@@ -47,7 +47,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 
 class CheckpointContents(Callback):
-    """Store what later commands need in every checkpoint, and the random state.
+    """Store in every checkpoint what later commands need, the random state and an early end.
 
     Args:
         contents: Nested dicts and lists of plain values, by name.
@@ -56,12 +56,16 @@ class CheckpointContents(Callback):
     def __init__(self, contents: dict[str, Any]) -> None:
         self.contents = contents | {"tangent_train_version": version("tangent-train")}
         self._random_states: list[dict[str, Any]] | None = None
+        self._stopped = False
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
+        # A resumed run may get more time.
+        out_of_time = any(isinstance(one, Timer) for one in trainer.callbacks)  # type: ignore[attr-defined]
+        checkpoint["stopped"] = trainer.should_stop and not out_of_time
         # Data has generators of its own, see `sample_rng`.
         cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
         state = {"cpu": torch.get_rng_state(), "cuda": cuda}
@@ -72,11 +76,13 @@ class CheckpointContents(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take the generators' states."""
+        """Take the generators' states, and whether a callback had ended the training."""
         self._random_states = checkpoint.get("random")
+        self._stopped = checkpoint.get("stopped") is True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Restore them: the random state (dropout) continues, on as many processes as before."""
+        trainer.should_stop |= self._stopped
         states = self._random_states
         if states is not None and len(states) == trainer.world_size:
             state = states[trainer.global_rank]

@@ -104,9 +104,10 @@ class TrainedNetwork:
         """Channels of its images."""
         return len(channel_names(self.inputs))
 
-    def labels(self, best: NDArray[np.unsignedinteger]) -> NDArray[np.unsignedinteger]:
-        """Labels 1 … K of the best scores 0 … K - 1, and 0 where no class won, or was certain."""
-        labels = best + best.dtype.type(1)
+    def labels(self, best: Tensor) -> NDArray[np.unsignedinteger]:
+        """Labels 1 … K of the best scores 0 … K - 1; 0 where an unknown class won, or none."""
+        labels: NDArray[np.unsignedinteger] = best.cpu().numpy()
+        labels = labels + labels.dtype.type(1)
         labels[labels >= len(self.class_names)] = 0
         return labels
 

@@ -37,7 +37,7 @@ def check(settings: Mapping[str, Any]) -> None:
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
     labelled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
-    warnings = [
+    warnings = sorted(problems.warnings) + [
         doubt
         for split, counts in labelled.items()
         for doubt in label_doubts(split, counts, data.class_names)

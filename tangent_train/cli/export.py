@@ -13,8 +13,8 @@ from tangent_train.cli.command_settings import ExportSettings as Settings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
+from tangent_train.inference.engine import sees_rays
 from tangent_train.inference.export import export_network
-from tangent_train.inference.predictor import sees_rays
 
 
 def export(config: Mapping[str, Any]) -> None:

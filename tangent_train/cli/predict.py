@@ -27,10 +27,16 @@ from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
-from tangent_train.inference.images import DepthFolder, read_panorama, read_photo, with_up
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import (
+    DepthFolder,
+    InputImage,
+    read_panorama,
+    read_photo,
+    with_up,
+)
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
@@ -41,8 +47,8 @@ from tangent_train.results.predictions import (
 )
 
 _DECISIVE = (
-    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "level",
-    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
+    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "levels",
+    "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
 """Settings that results depend on: those of resumed predictions must be the same."""
@@ -299,14 +305,14 @@ def _inputs(settings: Settings) -> Inputs:
 
 
 def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
-    how = settings.base_level, settings.blend
-    levels = settings.levels or (settings.level,)
+    how = trained, settings.levels, settings.base_level, settings.blend
     views: PhotoViews | PanoramaViews
-    if settings.projection == "perspective":
-        views = PhotoViews(trained, settings.level, *how)
+    if settings.projection == "equirectangular":
+        views = PanoramaViews(*how, settings.rotations)
+    elif settings.rotations == 1:
+        views = PhotoViews(*how)
     else:
-        upright = settings.upright is not None
-        views = PanoramaViews(trained, levels, *how, settings.rotations, upright=upright)
+        raise SettingError("rotations", found=settings.rotations, expected="1 for photos")
     of_forward = settings.device, settings.images_per_forward
     return Predictor(trained, views, *of_forward, settings.min_confidence)
 

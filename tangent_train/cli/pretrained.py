@@ -99,7 +99,7 @@ def load_pretrained(path: Path | None, run: Run) -> None:
     if path is None:
         if run.task.backbone_lr_factor != 1:
             raise SettingError(
-                "optimizer.backbone_lr_factor",
+                "task.backbone_lr_factor",
                 found=run.task.backbone_lr_factor,
                 expected="1 without init_from=, which says what the backbone is",
             )

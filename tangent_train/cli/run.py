@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
@@ -31,7 +32,7 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
@@ -41,6 +42,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
+from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -126,12 +128,19 @@ class Run:
         if getattr(self.data, "upright", None) == "auto":
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        noun = self.data.noun
-        record = self.task.record(self.task.result, noun)
-        total = len(self.data.source("test"))
-        if record.images != total:
-            raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
-        self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+        noun, total = self.data.noun, len(self.data.source("test"))
+        tested = sum(trainer.num_test_batches) > 0  # else the result is that of a validation
+        record = self.task.record(self.task.result, noun) if tested else None
+        images = record.images if record else 0
+        if record and images == total:
+            self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+            return
+        if not getattr(trainer, "fast_dev_run", False) and str(trainer.limit_test_batches) == "1.0":
+            raise RuntimeError(f"{images} of {total} test {noun} were counted")
+        rank_zero_only(print_text)(
+            f"{images} of {total} test {noun} were evaluated, as trainer.limit_test_batches or "
+            "trainer.fast_dev_run says: no results are written."
+        )
 
     def _as_trained(self) -> TrainedNetwork:
         """The network of the run, with what it was trained on."""
@@ -166,19 +175,19 @@ class Run:
         own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
         name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
-        notes = [f"Checkpoint: {name}", *self.notes]
+        notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
-            tables=[*result_tables(record), confusion_table(record)],
+            tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
             class_names=self.task.class_names,
             notes=[headline(record), *notes],
         )
         for line in (*self.notes, headline(record)):
             print_text(line)
-        result_tables(record)[0].print()
+        tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
 
@@ -204,11 +213,20 @@ def build(
     """
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
+    count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
+    outputs = count_outputs(data.num_classes)
     section = completed_settings(
-        settings["network"], data.in_channels, data.num_classes, restored=restored
+        settings.get("network"), data.in_channels, outputs, restored=restored
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
+    if getattr(data, "upright", None) == "auto" and task.predicts != PIXEL_CLASSES:
+        raise SettingError(
+            "data.upright",
+            found=f"auto, with {type(task).__name__}",
+            expected=f"null or pose: a network that predicts {PIXEL_CLASSES} estimates which way "
+            "is up",
+        )
     try_network(task, data.in_channels)
     if trains:
         try_training(task, data, settings)
@@ -298,11 +316,12 @@ def _build_task(
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
-        optimizer = dict(settings["optimizer"])
-        parts["backbone_lr_factor"] = optimizer.pop("backbone_lr_factor", 1.0)
-        parts["optimizer"] = build_from_config(optimizer, "optimizer", source)
+        parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
-        parts["scheduler"] = build_from_config(settings["scheduler"], "scheduler", source)
+        section = dict(settings["scheduler"])
+        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        scheduler = build_from_config(section, "scheduler", source)
+        parts["scheduler"] = Schedule(scheduler, **stepped)
     return build_from_config(
         settings["task"],
         "task",

@@ -13,8 +13,8 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.pictures import ValidationPictures
 from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.callbacks.tensorboard import ClassScores, ValidationPictures
 from tangent_train.errors import SettingError, at_least
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.setting_rules import flat_settings
@@ -83,7 +83,6 @@ def build_trainer(
             *_build_named(settings, "callbacks", known),
             CheckpointContents(contents),
             ProgressBar(),
-            ClassScores(),
             PredictionPanels(folder / "panels", settings["panels"]),
             ValidationPictures(settings["validation_images"]),
             *[LearningRateMonitor()] * bool(loggers),

@@ -16,7 +16,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
-from tangent_train.inference.views import panorama_settings
+from tangent_train.inference.representations import panorama_settings
 
 _NAME = re.compile(r"\w[\w.+-]*")
 """It becomes part of a folder's name."""

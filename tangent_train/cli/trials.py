@@ -9,6 +9,7 @@ from typing import Any
 
 import torch
 from torch import nn
+from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from tangent_train.errors import SettingError, counted
 
@@ -39,10 +40,11 @@ def _try_schedule(task: Any, settings: Mapping[str, Any]) -> None:
     group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
 
     def schedule() -> None:
-        made = task.optimization(lambda: 1000)
+        made = task.optimization(lambda: {"epoch": 1000, "step": 1000})
         if isinstance(made, dict):
             made["optimizer"].step(lambda: 0.0)  # some optimizers need a closure
-            made["lr_scheduler"]["scheduler"].step()
+            scheduler = made["lr_scheduler"]["scheduler"]
+            scheduler.step(*[0.0] * isinstance(scheduler, ReduceLROnPlateau))
 
     trials: dict[str, Callable[[], object]] = {
         "optimizer": lambda: task.make_optimizer([group]),
@@ -51,6 +53,8 @@ def _try_schedule(task: Any, settings: Mapping[str, Any]) -> None:
     for name, trial in trials.items():
         try:
             trial()
+        except SettingError:
+            raise
         except Exception as error:
             expected = f"settings that {settings[name]['_target_']} takes"
             raise SettingError(

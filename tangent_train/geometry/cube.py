@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,11 @@ class CubeGrid(PinholeGrid):
     def neighbors(self) -> NDArray[np.int32]:
         """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one."""
         return _NEIGHBORS
+
+    @property
+    def owned_dim(self) -> int:
+        """Pixels that span 90°."""
+        return math.ceil(2 / self.pitch - 1e-9)
 
     @property
     def overlapping(self) -> bool:

@@ -139,8 +139,12 @@ class TangentGrid(PinholeGrid):
     @staticmethod
     def least_dim(base_level: int, level: int) -> int:
         """Return the smallest `dim` whose images cover every owned cell."""
-        extent = _face_table(base_level).owned_extent
-        return math.ceil(2 * extent / _pitch(base_level, level) - 1e-9) + 1
+        return _owned_dim(base_level, _pitch(base_level, level))
+
+    @property
+    def owned_dim(self) -> int:
+        """See `PinholeGrid`."""
+        return _owned_dim(self.base_level, self.pitch)
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
@@ -154,6 +158,10 @@ class TangentGrid(PinholeGrid):
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _face_table(self.base_level).world_from_camera
+
+
+def _owned_dim(base_level: int, pitch: float) -> int:
+    return math.ceil(2 * _face_table(base_level).owned_extent / pitch - 1e-9) + 1
 
 
 def _pitch(base_level: int, level: int) -> float:

@@ -46,12 +46,17 @@ class PinholeGrid(ABC):
 
     @property
     @abstractmethod
+    def owned_dim(self) -> int:
+        """Side in pixels of the part of an image that contains every direction it owns."""
+
+    @property
+    @abstractmethod
     def overlapping(self) -> bool:
         """True if every direction is inside an image, not only on its outer edge."""
 
     @abstractmethod
     def _resting_axes(self) -> NDArray[np.float64]:
-        """``(N, 3, 3)`` camera axes before the rotation."""
+        """Return ``(N, 3, 3)`` camera axes before the rotation."""
 
     def _set(self, rotation: ArrayLike | None, **values: Any) -> None:
         """Set the attributes of a new grid."""

@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from datamodules.core.panoramas import meters_to_steps, resize_nearest
+from datamodules.core.panoramas import meters_to_steps, resize_depth, resize_nearest
 from datamodules.images.gpano import PanoramaArea, up_of, whole_area
 from datamodules.images.image_files import NamedFiles, find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.inference.views import InputImage
+from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.upright.gravity import estimate_up
 
 if TYPE_CHECKING:
@@ -41,6 +41,34 @@ _NOT_WHOLE = (
     "Of a photo, give fov=, its horizontal field of view in degrees; of a part of a panorama, crop="
     "[west, east, south, north] in degrees."
 )
+
+
+@dataclass(frozen=True)
+class InputImage:
+    """A panorama of the whole sphere, or a photo.
+
+    Attributes:
+        rgb: ``(H, W, 3)`` uint8.
+        depth: ``(H, W)`` uint16 in steps of 1/512 m, 0 where missing: distance from the center in
+            panoramas, along the optical axis in photos; or None.
+        up: ``(3,)`` direction of the zenith in a panorama; None where that is z.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for panoramas.
+    """
+
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.uint16] | None = None
+    up: NDArray[np.float64] | None = None
+    camera_matrix: NDArray[np.float64] | None = None
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns."""
+        return self.rgb.shape[0], self.rgb.shape[1]
+
+    def resized(self, shape: tuple[int, int]) -> InputImage:
+        """The image at another size, as training resizes panoramas; depth is never averaged."""
+        depth = None if self.depth is None else resize_depth(self.depth, shape)
+        return replace(self, rgb=resize(self.rgb, shape, "bilinear"), depth=depth)
 
 
 @dataclass(frozen=True)

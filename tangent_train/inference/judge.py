@@ -1,18 +1,24 @@
-"""Which of several directions is up, by how sure a network is of what it sees."""
+"""Up direction of a panorama, by the confidence of a network."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from tangent_train.geometry import CubeGrid, TangentGrid
-from tangent_train.inference.predictor import image_scores, sees_rays, views_per_forward
-from tangent_train.inference.views import InputImage, grid_set, panorama_representation, resized
+from tangent_train.inference.engine import (
+    RenderedViews,
+    sees_rays,
+    view_scores,
+    views_per_forward,
+)
+from tangent_train.inference.images import InputImage
+from tangent_train.inference.representations import PanoramaViews
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -30,17 +36,17 @@ _LEAST_DOUBT = 1e-4
 
 @dataclass(frozen=True)
 class NetworkJudge:
-    """Says how likely directions are to be up, by how sure a network is of what it sees.
+    """Estimates how likely directions are to be up, by the confidence of a network.
 
-    A network that was trained on upright images is surest of such. For every direction it gets
-    views that stand upright by it: four level ones of 135°; but one with cross-image attention all
-    of its own, of which it was more often right. The doubt of a view is the mean probability that
-    the best class of a pixel is wrong; a direction becomes more likely by doubt⁻³ of each view, of
-    up to 20.
+    A network that was trained on upright images is most confident there. For every direction it
+    gets views that stand upright by that direction: four level views of 135°; a network with
+    cross-image attention all views of its representation, with which it was more often right. The
+    doubt of a view is the mean probability that the best class of a pixel is wrong; a direction
+    becomes more likely by doubt⁻³ of each view, of up to 20.
 
     Attributes:
         trained: The network.
-        device: Where it is.
+        device: Device of the network.
     """
 
     trained: TrainedNetwork
@@ -54,25 +60,30 @@ class NetworkJudge:
             ups_xyz: ``(n, 3)`` directions in its frame.
 
         Returns:
-            ``(n,)``; all 0 of a network that gets the elevation of its pixels, which is told where
-            up is and believes it.
+            ``(n,)``; all 0 for a network that takes the elevation of its pixels: that depends on
+            the direction itself.
         """
         if "elevation" in self.trained.inputs:
             return np.zeros(len(ups_xyz))
         rows = min(image.rgb.shape[0], 2 ** (self.trained.level + 1))
-        seen = resized(InputImage(image.rgb, image.depth), (rows, 2 * rows))
-        doubts = np.array([self._doubts(seen, up) for up in ups_xyz])
+        panorama = InputImage(image.rgb, image.depth)
+        rendered = RenderedViews(self.trained, panorama, (rows, 2 * rows), self.device)
+        doubts = np.array([self._doubts(rendered, up) for up in ups_xyz])
         counted = min(doubts.shape[1], _COUNTED)
         return -_EXPONENT * counted * np.log(doubts + _LEAST_DOUBT).mean(axis=1)
 
-    def _doubts(self, panorama: InputImage, up: NDArray[np.float64]) -> NDArray[np.float32]:
+    def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Mean doubt in each of the views."""
-        grid = self._views.grid.with_rotation(upright_rotation(up))
-        views = grid_set(replace(panorama, up=up), grid, self._views.faces)
-        per_forward = views_per_forward((grid.dim, grid.dim))
+        network: Any = self.trained.network
+        upright, rays = self._views, None
+        views = replace(upright, grid=upright.grid.with_rotation(upright_rotation(up)))
+        per_forward = views_per_forward((views.grid.dim, views.grid.dim))
+        if sees_rays(network):
+            network = partial(network, images_per_chunk=per_forward)
+            rays = torch.from_numpy(upright.rays()).to(self.device)
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
-            for _, scores in image_scores(self.trained, views, per_forward, self.device)
+            for _, scores in view_scores(network, rendered.of(views), len(views), per_forward, rays)
         ]
         return torch.cat(found).cpu().numpy()
 
@@ -81,7 +92,7 @@ class NetworkJudge:
         """The views of an upright panorama."""
         trained = self.trained
         if sees_rays(trained.network):
-            seen: Any = panorama_representation(trained)
+            seen: Any = PanoramaViews(trained).representation
             return PinholeViews(seen.grid)
         quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its resolution
         least = quarter if trained.fixed_size is None else max(trained.fixed_size)

@@ -20,6 +20,7 @@ from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import (
     Picture,
     described,
@@ -28,8 +29,7 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -46,8 +46,7 @@ def load(
     class_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
     device: str = "cpu",
-    level: int | None = None,
-    levels: Sequence[int] | None = None,
+    levels: Levels = None,
     base_level: int | None = None,
     blend: Blend = "feather",
     rotations: int = 1,
@@ -66,11 +65,10 @@ def load(
         unmapped: Classes that the map does not name are ``unknown``, label 0, where they win; or
             they ``never`` win.
         device: A torch device, or ``auto``: a GPU if there is one.
-        level: Level s, the angular resolution; None as trained.
-        levels: Several to average over, instead; of panoramas.
+        levels: Level s, the angular resolution, or several to average over; None as trained.
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
-        rotations: Number of icosahedra, rotated about the vertical, to average over.
+        rotations: Rotations about the vertical to average over; of panoramas.
         images_per_forward: Images per call of the network, which bounds memory; None for 2^20
             pixels' worth.
         min_confidence: Pixels whose best class has a lower probability get the label 0.
@@ -85,14 +83,13 @@ def load(
     trained = original
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
-    views = PanoramaViews(trained, levels or (level,), base_level, blend, rotations)
+    views = PanoramaViews(trained, levels, base_level, blend, rotations)
     how = device, images_per_forward, min_confidence
     panoramas = Predictor(trained, views, *how)
     return Network(
         trained,
-        views,
         panoramas,
-        lambda: Predictor(trained, PhotoViews(trained, level, base_level, blend), *how),
+        lambda: Predictor(trained, PhotoViews(trained, levels, base_level, blend), *how),
         NetworkJudge(original, panoramas.device),
     )
 
@@ -106,7 +103,6 @@ class Network:
 
     Args:
         trained: The network.
-        views: Its views of panoramas.
         panoramas: Its predictor of panoramas.
         photos: Makes its predictor of photos.
         judge: Helps to estimate which way is up.
@@ -120,7 +116,6 @@ class Network:
     def __init__(
         self,
         trained: TrainedNetwork,
-        views: PanoramaViews,
         panoramas: Predictor,
         photos: Callable[[], Predictor],
         judge: NetworkJudge,
@@ -128,7 +123,6 @@ class Network:
         self.trained = trained
         self.class_names = trained.class_names
         self.palette = class_colors(len(trained.class_names))
-        self._views = views
         self._panoramas = panoramas
         self._make_photos = photos
         self._judge = judge
@@ -211,10 +205,11 @@ class Network:
         """
         mosaic, area = self._predict(image, probabilities=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        scores = np.ascontiguousarray(scores if area is None else area.cut(scores))
+        if area is not None:
+            scores = torch.from_numpy(np.ascontiguousarray(area.cut(scores.cpu().numpy())))
         if isinstance(image, Tensor):
-            return torch.from_numpy(scores).movedim(-1, 0).to(image.device)
-        return scores
+            return scores.movedim(-1, 0).contiguous().to(image.device)
+        return scores.contiguous().cpu().numpy()
 
     def _predict(
         self,
@@ -237,7 +232,6 @@ class Network:
             return self._photos.predict(photo, probabilities=probabilities), None
         if upright is not None:
             check_choice("upright", upright, ("pose", "auto"))
-            self._views.need_tangent_images(f"upright={upright}")
             if upright == "pose" and not isinstance(image, str | Path):
                 raise SettingError(
                     "upright",

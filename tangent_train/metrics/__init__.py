@@ -1,5 +1,5 @@
 """Integer confusion matrices and the scores read from them."""
 
-from tangent_train.metrics.segmentation import ConfusionMatrix, segmentation_scores
+from tangent_train.metrics.segmentation import SegmentationMetric, segmentation_scores
 
-__all__ = ["ConfusionMatrix", "segmentation_scores"]
+__all__ = ["SegmentationMetric", "segmentation_scores"]

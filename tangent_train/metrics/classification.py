@@ -46,7 +46,7 @@ def classification_scores(confusion: ArrayLike) -> ClassificationScores:
     return ClassificationScores(accuracy, float(of_class[present].mean()), of_class, counts)
 
 
-class ClassCounts(MulticlassConfusionMatrix):
+class ClassificationMetric(MulticlassConfusionMatrix):
     """The confusion matrix of whole images ``(K, K)``, integer counts summed over processes."""
 
     def compute(self) -> NDArray[np.int64]:  # type: ignore[override]

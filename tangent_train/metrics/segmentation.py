@@ -109,7 +109,7 @@ def bootstrap_intervals(
     images, and the number of processes that counted them, does not matter.
 
     Args:
-        of_images: See `ConfusionMatrices.of_images`: pixels or solid angles.
+        of_images: Half of `SegmentationCounts.of_images`: pixels or solid angles.
         absent_class: Treatment of classes absent from the ground truth of a draw.
         draws: Number of draws.
         seed: Of the draws.
@@ -138,62 +138,87 @@ def bootstrap_intervals(
     return intervals
 
 
-class ConfusionMatrices(NamedTuple):
-    """The counts of a `ConfusionMatrix`; rows truth, columns prediction, class 0 unknown.
+class SegmentationCounts(NamedTuple):
+    """Confusion matrices of images; rows truth, columns prediction, class 0 unknown.
 
     Attributes:
         pixels: ``(K+1, K+1)`` pixels of panoramas and photos.
         solid_angle: ``(K+1, K+1)`` steradians of panoramas; all 0 for photos.
-        bands: ``(6, K+1, K+1)`` pixels of the latitude bands `BAND_EDGES_DEG`, likewise.
-        images: Panoramas or photos counted.
-        of_images: ``(images, 2, 3, K)`` of each image, in pixels and in steradians, what is
-            labelled, what is predicted and hits of each class: enough for its scores, and less
-            than its matrices.
+        bands: ``(6, K+1, K+1)`` pixels of panoramas in the latitude bands `BAND_EDGES_DEG`.
+        of_images: ``(images, 2, 3, K)``: of each image, in pixels and in steradians, the labelled
+            and the predicted area and the hits of each class. These are enough for its scores.
     """
 
-    pixels: NDArray[np.int64]
-    solid_angle: NDArray[np.float64]
-    bands: NDArray[np.int64]
-    images: int
-    of_images: NDArray[np.float64]
+    pixels: Any
+    solid_angle: Any
+    bands: Any
+    of_images: Any
 
 
-class ConfusionMatrix(Metric):
-    """Confusion matrices: integer pixel counts, and of panoramas also by latitude and solid angle.
+def count_image(
+    prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"], num_classes: int
+) -> SegmentationCounts:
+    """Count the pixels of one panorama ``(H, W)``, or of the crops of one photo ``(n, h, w)``.
 
-    ERP pixels over-count the poles; the matrix of solid angles weights every pixel by its own.
-    All are summed over processes.
+    Args:
+        prediction: Class indices.
+        truth: Class indices; unknown (0) does not count.
+        num_classes: K + 1, the unknown class 0 included.
+
+    Returns:
+        Counts as tensors.
+
+    Raises:
+        SettingError: The shapes differ or an index is out of range.
+    """
+    if prediction.shape != truth.shape:
+        raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
+    known, k = truth != UNKNOWN, num_classes
+    pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
+    bands = pairs.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
+    if truth.ndim == _PANORAMA_DIMENSIONS:
+        height, width = truth.shape
+        rows = known.nonzero()[:, 0]
+        # Integers first, sums of them after: the same figures in any order, on any device.
+        by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k)
+        by_row = by_row.reshape(height, k, k)
+        # In degrees, and divided last: a row on the edge of a band is exactly there.
+        southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
+        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
+        bands.index_add_(0, torch.as_tensor(band_of_row, device=truth.device), by_row)
+        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
+        pixels, steradians = by_row.sum(dim=0), torch.tensordot(angles, by_row.double(), dims=1)
+    else:
+        pixels = torch.bincount(pairs, minlength=k * k).reshape(k, k)
+        steradians = torch.zeros_like(pixels, dtype=torch.float64)
+    sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
+    return SegmentationCounts(pixels, steradians, bands, torch.stack(sums)[None])
+
+
+class SegmentationMetric(Metric):
+    """Counts the pixels of all images of a data set, see `SegmentationCounts`.
+
+    Pixels are integer counts. Equirectangular pixels over-count the poles; the matrix of solid
+    angles weights each pixel by its own. All counts are summed over processes.
 
     Args:
         num_classes: K + 1, the unknown class 0 included.
-
-    Attributes:
-        pixels: ``(K+1, K+1)`` pixels; rows truth, columns prediction.
-        bands: ``(6, K+1, K+1)`` pixels per latitude band of 30°, see `BAND_EDGES_DEG`.
-        steradians: ``(K+1, K+1)`` the same over all latitudes, in steradians.
-        images: Panoramas and photos seen.
-        of_images: See `ConfusionMatrices`; a part for each image.
     """
 
     full_state_update = False
     pixels: Tensor
+    solid_angle: Tensor
     bands: Tensor
-    steradians: Tensor
-    images: Tensor
     of_images: list[Tensor]
 
     def __init__(self, num_classes: int) -> None:
         super().__init__()
-        self.num_classes = num_classes
-        bands = len(BAND_EDGES_DEG) - 1
-        square = (num_classes, num_classes)
-        for name, default in (
-            ("pixels", torch.zeros(square, dtype=torch.int64)),
-            ("bands", torch.zeros((bands, *square), dtype=torch.int64)),
-            ("steradians", torch.zeros(square, dtype=torch.float64)),
-            ("images", torch.zeros((), dtype=torch.int64)),
-        ):
-            self.add_state(name, default, dist_reduce_fx="sum")
+        self.num_classes = k = num_classes
+        integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
+        for name, shape in integers.items():
+            self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
+        zeros = torch.zeros((k, k), dtype=torch.float64)
+        self.add_state("solid_angle", zeros, dist_reduce_fx="sum")
         self.add_state("of_images", [], dist_reduce_fx="cat")
         self.reset()
 
@@ -202,65 +227,21 @@ class ConfusionMatrix(Metric):
         super().reset()
         # Processes without images join the others with a part of the same type and shape.
         shape = (0, 2, 3, self.num_classes - 1)
-        self.of_images.append(torch.zeros(shape, dtype=torch.float64, device=self.device))
+        self.of_images = [torch.zeros(shape, dtype=torch.float64, device=self.device)]
 
     def update(
-        self,
-        prediction: Integer[Tensor, "*shape"],
-        truth: Integer[Tensor, "*shape"],
+        self, prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"]
     ) -> None:
-        """Count one panorama ``(H, W)``, or the crops of one photo ``(n, h, w)``.
+        """Count one image, see `count_image`."""
+        counts = count_image(prediction, truth, self.num_classes)
+        for name in ("pixels", "solid_angle", "bands"):
+            setattr(self, name, getattr(self, name) + getattr(counts, name))
+        self.of_images.append(counts.of_images)
 
-        Args:
-            prediction: Class indices.
-            truth: Class indices; unknown (0) does not count.
-
-        Raises:
-            SettingError: The shapes differ or an index is out of range.
-        """
-        if prediction.shape != truth.shape:
-            raise SettingError(
-                "prediction", found=tuple(prediction.shape), expected=tuple(truth.shape)
-            )
-        k = self.num_classes
-        known = truth != UNKNOWN
-        pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
-        self.images += 1
-        if truth.ndim == _PANORAMA_DIMENSIONS:
-            pixels, steradians = self._count_panorama(pairs, known)
-        else:
-            pixels = torch.bincount(pairs, minlength=k * k).reshape(k, k)
-            steradians = torch.zeros_like(self.steradians)
-        self.pixels += pixels
-        self.steradians += steradians
-        sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
-        self.of_images.append(torch.stack(sums)[None])
-
-    def _count_panorama(self, pairs: Tensor, known: Tensor) -> tuple[Tensor, Tensor]:
-        """Add to the bands; returns the panorama's matrices of pixels and of steradians."""
-        k = self.num_classes
-        rows = known.nonzero()[:, 0]
-        height, width = known.shape
-        # In degrees, and divided last: a row on the edge of a band is exactly there.
-        southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
-        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
-        # Integers first, sums of them after: the same figures in any order, on any device.
-        by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k).reshape(
-            height, k, k
-        )
-        self.bands.index_add_(0, torch.as_tensor(band_of_row, device=known.device), by_row)
-        angles = torch.as_tensor(equirect_solid_angles((height, width)), device=known.device)
-        return by_row.sum(dim=0), torch.tensordot(angles, by_row.double(), dims=1)
-
-    def compute(self) -> ConfusionMatrices:
-        """The matrices of all processes, as arrays."""
-        return ConfusionMatrices(
-            pixels=self.pixels.cpu().numpy(),
-            solid_angle=self.steradians.cpu().numpy(),
-            bands=self.bands.cpu().numpy(),
-            images=int(self.images),
-            of_images=dim_zero_cat(self.of_images).cpu().numpy(),
-        )
+    def compute(self) -> SegmentationCounts:
+        """Return the counts of all processes as arrays."""
+        states = (dim_zero_cat(getattr(self, name)) for name in SegmentationCounts._fields)
+        return SegmentationCounts(*(state.cpu().numpy() for state in states))
 
 
 def _checked(indices: Tensor, num_classes: int) -> Tensor:

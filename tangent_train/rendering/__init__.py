@@ -5,7 +5,7 @@ by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
 """
 
 from tangent_train.rendering.applying import apply
-from tangent_train.rendering.backward import Blend, tangent_to_equirect, tangent_to_labels
+from tangent_train.rendering.backward import tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.camera_files import (
     CameraFile,
     RigFile,
@@ -15,6 +15,7 @@ from tangent_train.rendering.camera_files import (
     write_poses,
     write_rig,
 )
+from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent, rotate_equirect
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
@@ -22,11 +23,10 @@ from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
     TangentRepresentation,
 )
-from tangent_train.rendering.representations.views import Assembler, Representation
+from tangent_train.rendering.representations.views import Representation
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [
-    "Assembler",
     "Blend",
     "CameraFile",
     "CubemapRepresentation",

@@ -1,4 +1,4 @@
-"""Adding images of a grid to a panorama, for labels, feathering and mosaics.
+"""Adding images to a canvas on the CPU, for labels, feathering and mosaics.
 
 Nearest and feather are two weightings of the same sum: 1 where an image is the owner, or a weight
 that falls to 0 at its borders.
@@ -9,17 +9,18 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.files import reserve
-from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.tables import sight_of
+
+if TYPE_CHECKING:
+    from tangent_train.rendering.representations.views import Placement
 
 _NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
@@ -34,10 +35,9 @@ _SPANS = 2**23
 """Rows times images whose spans are held at once."""
 
 
-def add_to_panorama(
+def add_to_canvas(
     scores: NDArray[np.float32],
-    grid: PinholeGrid,
-    faces: NDArray[np.int64],
+    images: Placement,
     shape: tuple[int, int],
     rows: slice,
     owner: NDArray[np.integer],
@@ -45,50 +45,47 @@ def add_to_panorama(
     *,
     softmax: bool = False,
 ) -> None:
-    """Add the weighted scores of some images to rows of a panorama.
+    """Add the weighted scores of some images to rows of a canvas.
 
     Args:
-        scores: ``(n, K, d, d)`` of the images.
-        grid: Their geometry.
-        faces: ``(n,)`` which images they are.
-        shape: ``(H, W)`` of the panorama.
+        scores: ``(n, K, h, w)`` of the images.
+        images: Place of the images on the canvas.
+        shape: ``(H, W)`` of the canvas.
         rows: Rows of it, without a step.
-        owner: ``(rows, W)`` from `owners`, weights are 1 there; or `NO_OWNERS`.
+        owner: ``(rows, W)`` owners, weights are 1 there; or `NO_OWNERS`.
         total: Sums of these rows, from `zero_sums`, changed.
-        softmax: Whether to add probabilities: those of owners are of the interpolated scores,
+        softmax: True to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
     """
-    for band, own in _bands(rows, len(faces)):
-        sight = sight_of(grid, faces, shape, band, owner[own])
-        arguments = (np.ascontiguousarray(scores), sight, softmax, total[own], _NO_LABELS)
+    for band, inner in _bands(rows, len(scores)):
+        geometry = images.geometry(shape, band, owner[inner])
+        arguments = (np.ascontiguousarray(scores), geometry, softmax, total[inner], _NO_LABELS)
         over_rows(kernels.add_images, band.stop - band.start, shape[1], *arguments)
 
 
-def label_panorama(
+def label_canvas(
     scores: NDArray[np.float32],
-    grid: PinholeGrid,
-    faces: NDArray[np.int64],
+    images: Placement,
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:
     """Write the best classes of all pixels that some images own or, feathered, see.
 
     Args:
-        scores: ``(n, K, d, d)`` of the images.
-        grid: Their geometry.
-        faces: ``(n,)`` which images they are; all, to feather.
-        owner: ``(H, W)`` from `owners`; or `NO_OWNERS`.
+        scores: ``(n, K, h, w)`` of the images; of all images, for feathering.
+        images: Place of the images on the canvas.
+        owner: ``(H, W)`` owners; or `NO_OWNERS`.
         labels: ``(H, W)``, changed.
     """
     height, width = labels.shape
     scores = np.ascontiguousarray(scores)
-    for band, _ in _bands(slice(0, height), len(faces)):
-        sight = sight_of(grid, faces, (height, width), band, owner[band])
+    for band, _ in _bands(slice(0, height), len(scores)):
+        geometry = images.geometry((height, width), band, owner[band])
         if len(owner):
-            arguments: tuple[Any, ...] = scores, sight, labels[band]
+            arguments: tuple[Any, ...] = scores, geometry, labels[band]
             over_rows(kernels.label_images, band.stop - band.start, width, *arguments)
         else:
-            arguments = scores, sight, False, _NO_TOTAL, labels[band]
+            arguments = scores, geometry, False, _NO_TOTAL, labels[band]
             over_rows(kernels.add_images, band.stop - band.start, width, *arguments)
 
 

@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, zero_sums
-from tangent_train.rendering.backward import Blend, tangent_to_equirect
-from tangent_train.rendering.checks import check_blend, check_panorama
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
+from tangent_train.rendering.backward import tangent_to_equirect
+from tangent_train.rendering.checks import Blend, blend_of, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
+from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.tables import owners
 
 if TYPE_CHECKING:
@@ -67,7 +68,7 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
-    check_blend(blend, grid)
+    blend = blend_of(blend, grid)
     check_panorama(panorama, "bilinear")
     if isinstance(panorama, Tensor) and panorama.ndim > 3:
         raise SettingError(
@@ -136,7 +137,7 @@ def _mean(
         images = np.moveaxis(flat, -1, 1).astype(np.float32)
         if feather:
             images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
-        add_to_panorama(images, grid, faces, shape, slice(0, height), owner, sums)
+        add_to_canvas(images, PinholeViews(grid, faces), shape, slice(0, height), owner, sums)
     means, size = np.asarray(sums).reshape(-1), width * count
     for i in range(height):
         row = sums[i, :, : count + feather]

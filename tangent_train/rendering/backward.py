@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,14 +12,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, label_panorama, zero_sums
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, label_canvas, zero_sums
 from tangent_train.rendering.checks import (
-    check_blend,
+    Blend,
+    blend_of,
     check_images,
     check_interpolation,
     check_shape,
 )
 from tangent_train.rendering.forward import Interpolation, Pixels
+from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.sampling import (
     Taps,
     image_taps,
@@ -28,8 +30,6 @@ from tangent_train.rendering.sampling import (
     sample,
 )
 from tangent_train.rendering.tables import image_table, owners, tensors_on
-
-Blend = Literal["nearest", "feather"]
 
 _BAND = 2**20
 """Pixels whose taps or sums are held at once."""
@@ -50,8 +50,8 @@ def tangent_to_equirect(
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
         blend: ``nearest``: every direction is taken from its owner. ``feather``: the average of
-            all images that see it, weights falling to 0 at the images' borders: no seams. Only
-            for images that overlap, not for a cube's.
+            all images that see it, weights falling to 0 at the images' borders: no seams; see
+            `blend_of` for images that do not overlap.
         interpolation: ``bilinear``, or ``nearest`` for labels, masks and depth of any dtype: the
             owner's pixel whose centre is nearest, kept exactly. Only with the blend ``nearest``.
 
@@ -61,7 +61,7 @@ def tangent_to_equirect(
     Raises:
         SettingError: The images, the shape, the blend or the interpolation cannot be used.
     """
-    check_blend(blend, grid)
+    blend = blend_of(blend, grid)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
     check_images("tangent images", images, grid, interpolation)
@@ -104,7 +104,7 @@ def tangent_to_labels(
         SettingError: The logits, the shape or the blend cannot be used.
     """
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
-    check_blend(blend, grid)
+    blend = blend_of(blend, grid)
     shape = check_shape(shape)
     check_images("scores", scores, grid)
     small = torch.uint8 if scores.shape[-3] <= 256 else torch.uint16
@@ -113,9 +113,8 @@ def tangent_to_labels(
     flat = torch.zeros((len(stacks), *shape), dtype=small, device=scores.device)
     for stack, labels in zip(stacks, flat, strict=True):
         if compiled:
-            arrays, faces = stack.float().numpy(), grid.face_indices()
             owner = owners(grid, shape) if blend == "nearest" else NO_OWNERS
-            label_panorama(arrays, grid, faces, owner, labels.numpy())
+            label_canvas(stack.float().numpy(), PinholeViews(grid), owner, labels.numpy())
         else:
             _torch_labels(stack, grid, shape, blend, labels.view(-1))
     result = flat.reshape(*scores.shape[:-4], *shape)
@@ -165,7 +164,7 @@ def _feathered(
     for start in range(0, shape[0], step):
         rows = slice(start, min(shape[0], start + step))
         sums = zero_sums((rows.stop - start, shape[1]), channels + 1)
-        add_to_panorama(with_ones, grid, grid.face_indices(), shape, rows, NO_OWNERS, sums)
+        add_to_canvas(with_ones, PinholeViews(grid), shape, rows, NO_OWNERS, sums)
         total = sums[..., : channels + 1]
         panorama[rows] = total[..., :channels] / total[..., channels:]
     return panorama

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
@@ -12,10 +13,23 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid
 
+Blend = Literal["nearest", "feather"]
+"""``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
+images that see a pixel, with weights that fall to 0 at the borders of the images."""
+
 _MOST_COLORS = 4
 """Channels of an image of colours."""
 
 _COLOR_DIMENSIONS = 3
+
+
+class HasOverlap(Protocol):
+    """Images that may overlap."""
+
+    @property
+    def overlapping(self) -> bool:
+        """True if every direction is inside an image, not only on its outer edge."""
+        ...
 
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
@@ -30,16 +44,21 @@ def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
         )
 
 
-def check_blend(blend: str, grid: PinholeGrid) -> None:
-    """Raise SettingError unless the blend is known and the images can be blended so."""
+def blend_of(blend: Blend, images: HasOverlap) -> Blend:
+    """The blend of images: images that do not overlap have nothing to feather.
+
+    Feather weights are 0 on the edges where such images meet: the faces of a cube map without a
+    margin, or the panorama itself. Each pixel is taken from the image that owns it.
+
+    Args:
+        blend: The wanted blend.
+        images: The images.
+
+    Raises:
+        SettingError: There is no such blend.
+    """
     check_choice("blend", blend, ("nearest", "feather"))
-    if blend == "feather" and not grid.overlapping:
-        raise SettingError(
-            "blend",
-            found="'feather'",
-            expected="'nearest' for images that do not overlap",
-            remedy="All weights are 0 on the edges where they meet.",
-        )
+    return blend if images.overlapping else "nearest"
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

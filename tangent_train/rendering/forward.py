@@ -98,26 +98,30 @@ def _render_tensor(
         key = None if image.device.type == "cpu" else ("forward", (height, width), faces, dtype)
         build = partial(forward_positions, grid, (height, width), faces, dtype)
         u, v = tensors_on(image.device, grid, key, build)
-        if interpolation == "nearest":
-            index = nearest_equirect_index(u, v, (height, width))
-            values = source.gather(1, index.expand(len(source), -1))
-        else:
-            values = sample(source, bilinear_equirect_taps(u, v, (height, width)))
+        values = _sampled(source, u, v, (height, width), interpolation)
         images = values.reshape(*batch, channels, len(faces), grid.dim, grid.dim)
         chunks.append(images.movedim(-3, -4))
     return torch.cat(chunks, dim=-4)
 
 
-Scalar = TypeVar("Scalar", bound=np.generic)
+def _sampled(
+    source: Tensor, u: Tensor, v: Tensor, shape: tuple[int, int], interpolation: Interpolation
+) -> Tensor:
+    """``(S, P)`` of a source ``(S, H W)`` at P columns and rows."""
+    if interpolation == "nearest":
+        index = nearest_equirect_index(u, v, shape)
+        return source.gather(1, index.expand(len(source), -1))
+    return sample(source, bilinear_equirect_taps(u, v, shape))
 
 
 def rotate_equirect(
-    image: NDArray[Scalar], rotation: ArrayLike, interpolation: Interpolation = "bilinear"
-) -> NDArray[Scalar]:
+    image: Pixels, rotation: ArrayLike, interpolation: Interpolation = "bilinear"
+) -> Pixels:
     """Rotate a panorama: direction d of the result shows the input at Rᵀd.
 
     Args:
-        image: ``(H, W[, C])``, as `equirect_to_tangent` takes it.
+        image: An array ``(H, W[, C])`` or a tensor ``(..., C, H, W)``, as `equirect_to_tangent`
+            takes it.
         rotation: ``(3, 3)`` rotation R.
         interpolation: ``bilinear`` or ``nearest``.
 
@@ -128,9 +132,18 @@ def rotate_equirect(
         SettingError: The panorama, the rotation or the interpolation cannot be used.
     """
     check_panorama(image, interpolation)
-    rotated = checked_rotation(rotation)
+    rotated = checked_rotation(rotation).tobytes()
+    if isinstance(image, Tensor):
+        shape = image.shape[-2], image.shape[-1]
+        dtype = map_dtype(image.dtype == torch.float64, interpolation)
+        places = _rotation_map(rotated, shape, dtype).in_panorama()
+        on_device = (torch.from_numpy(line).to(image.device) for line in places)
+        u, v = (torch.split(line, _CHUNK) for line in on_device)
+        source = image.reshape(-1, shape[0] * shape[1])
+        parts = [_sampled(source, *at, shape, interpolation) for at in zip(u, v, strict=True)]
+        return torch.cat(parts, dim=1).reshape(image.shape)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
-    table = _rotation_map(rotated.tobytes(), (image.shape[0], image.shape[1]), dtype)
+    table = _rotation_map(rotated, (image.shape[0], image.shape[1]), dtype)
     out = np.empty_like(image, order="C")
     sample_map(table, np.ascontiguousarray(image), interpolation, out)
     return out

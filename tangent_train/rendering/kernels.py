@@ -34,7 +34,7 @@ Tile = tuple[int, int, int, int]
 """First row and the one after the last, first column and the one after the last."""
 
 
-class Sight(NamedTuple):
+class CanvasGeometry(NamedTuple):
     """Geometry of n images and a canvas of ``(H, W)`` pixels.
 
     Attributes:
@@ -56,8 +56,8 @@ class Sight(NamedTuple):
     owner: Array
 
 
-class _Room(NamedTuple):
-    """Pixels of a tile that an image contributes to, and runs of neighbors.
+class _TileBuffers(NamedTuple):
+    """Buffers for the pixels of a tile that an image contributes to, and for runs of neighbors.
 
     Attributes:
         pixel: Where results of a pixel go.
@@ -138,34 +138,34 @@ def _feather(side: tuple[int, int], u: Array, v: Array, weight: Array) -> int:
 
 
 @njit_fast
-def _room(pixels: int) -> _Room:
-    """Room for a tile; one array each, as numba takes the parts of a common one for strided."""
+def _tile_buffers(pixels: int) -> _TileBuffers:
+    """Buffers for a tile; one array each, as numba takes the parts of a common one for strided."""
     u, v, weight = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     column, row = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
     right, below = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     pixel, runs = np.empty(pixels, np.int64), np.empty((pixels, 4), np.int32)
-    return _Room(pixel, u, v, weight, column, row, right, below, runs)
+    return _TileBuffers(pixel, u, v, weight, column, row, right, below, runs)
 
 
 @njit_fast
-def _room_for_taps(pixels: int) -> _Taps:
-    """Likewise."""
+def _tap_buffers(pixels: int) -> _Taps:
+    """Buffers for the taps of a tile."""
     a, b = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     c, d = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     return _Taps(np.empty(pixels, np.int32), a, b, c, d)
 
 
 @njit_fast
-def _enough(room: Array, size: int) -> Array:
+def _enough(buffers: Array, size: int) -> Array:
     """A flat array, or a new one of zeros if it is too small."""
-    return room if len(room) >= size else np.zeros(size, room.dtype)
+    return buffers if len(buffers) >= size else np.zeros(size, buffers.dtype)
 
 
 @njit_fast
-def _count(sight: Sight) -> int:
+def _count(geometry: CanvasGeometry) -> int:
     """One more than the greatest number of an image."""
-    greatest = sight.images.max()
-    return max(greatest, sight.owner.max()) + 1 if len(sight.owner) else greatest + 1
+    greatest = geometry.images.max()
+    return max(greatest, geometry.owner.max()) + 1 if len(geometry.owner) else greatest + 1
 
 
 @njit_fast
@@ -193,16 +193,16 @@ def _owned_runs(tile: Tile, owner: Array, runs: Array, owns: Array) -> int:
 
 
 @njit_fast
-def _seen_runs(tile: Tile, m: int, sight: Sight, runs: Array) -> int:
+def _seen_runs(tile: Tile, m: int, geometry: CanvasGeometry, runs: Array) -> int:
     """See `_owned_runs`, of pixels of which image m may see something."""
     top, bottom, left, right = tile
-    width, count = sight.columns.shape[1], 0
+    width, count = geometry.columns.shape[1], 0
     for i in range(top, bottom):
-        begin, span = sight.spans[m, i, 0], sight.spans[m, i, 1]
+        begin, span = geometry.spans[m, i, 0], geometry.spans[m, i, 1]
         for back in range(0, width + 1, width):
             start, stop = max(left, begin - back), min(right, begin + span - back)
             if start < stop:
-                runs[count, 0], runs[count, 1] = sight.images[m], i
+                runs[count, 0], runs[count, 1] = geometry.images[m], i
                 runs[count, 2], runs[count, 3] = start, stop
                 count += 1
     return count
@@ -210,31 +210,36 @@ def _seen_runs(tile: Tile, m: int, sight: Sight, runs: Array) -> int:
 
 @njit_fast
 def _list_pixels(
-    m: int, side: tuple[int, int], sight: Sight, found: int, step: tuple[int, int], room: _Room
+    m: int,
+    side: tuple[int, int],
+    geometry: CanvasGeometry,
+    found: int,
+    step: tuple[int, int],
+    buffers: _TileBuffers,
 ) -> int:
     """List the pixels of runs that image m contributes to; returns how many.
 
     Args:
-        m: Index of the image in `sight`.
+        m: Index of the image in `geometry`.
         side: Rows and columns of the image.
-        sight: Geometry of images and canvas.
+        geometry: Geometry of images and canvas.
         found: Number of runs, of any images.
         step: From a row to the next one where results go, and there the place of pixel (0, 0).
-        room: Holds the runs; pixels, columns, rows and weights are written.
+        buffers: Holds the runs; pixels, columns, rows and weights are written.
     """
-    pixel, u, v, weight = room.pixel, room.u, room.v, room.weight
+    pixel, u, v, weight = buffers.pixel, buffers.u, buffers.v, buffers.weight
     count = 0
     for n in range(found):
-        image, i, start, stop = room.runs[n]
-        if image != sight.images[m]:
+        image, i, start, stop = buffers.runs[n]
+        if image != geometry.images[m]:
             continue
         first, count = count, count + stop - start
-        row = sight.rows[i]
-        _project(sight.matrices[m], row, sight.columns, start, stop, u[first:], v[first:])
+        row = geometry.rows[i]
+        _project(geometry.matrices[m], row, geometry.columns, start, stop, u[first:], v[first:])
         pixels, weights = pixel[first:count], weight[first:count]
         for p in range(len(pixels)):
             pixels[p], weights[p] = i * step[0] + step[1] + start + p, 1
-        if len(sight.owner) == 0 and _feather(side, u[first:], v[first:], weights) > 0:
+        if len(geometry.owner) == 0 and _feather(side, u[first:], v[first:], weights) > 0:
             last, count = count, first
             for p in range(first, last):
                 if weight[p] > 0:
@@ -267,29 +272,29 @@ def _split_axis(places: Array, count: int, whole: Array, rest: Array) -> tuple[i
 
 
 @njit_fast
-def _split(n: int, side: tuple[int, int], room: _Room) -> tuple[int, int, int, int]:
+def _split(n: int, side: tuple[int, int], buffers: _TileBuffers) -> tuple[int, int, int, int]:
     """Split the columns and rows of n pixels; returns first row, first column, rows, columns."""
-    left, wide = _split_axis(room.u[:n], side[1], room.column, room.right)
-    top, high = _split_axis(room.v[:n], side[0], room.row, room.below)
+    left, wide = _split_axis(buffers.u[:n], side[1], buffers.column, buffers.right)
+    top, high = _split_axis(buffers.v[:n], side[0], buffers.row, buffers.below)
     return top, left, high, wide
 
 
 @njit_fast
-def _weigh(n: int, step: tuple[int, int], room: _Room, taps: _Taps) -> None:
+def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers, taps: _Taps) -> None:
     """Write the taps of n pixels.
 
     Args:
         n: How many.
         step: Places from a row to the next one, and the place of pixel (0, 0) of the image.
-        room: Their columns, rows and weights.
+        buffers: Their columns, rows and weights.
         taps: Written.
     """
     first, a, b, c, d = taps
     for p in range(n):
-        first[p] = room.row[p] * step[0] + room.column[p] + step[1]
-        lower = np.float32(room.weight[p]) * room.below[p]
-        upper = np.float32(room.weight[p]) - lower
-        b[p], d[p] = room.right[p] * upper, room.right[p] * lower
+        first[p] = buffers.row[p] * step[0] + buffers.column[p] + step[1]
+        lower = np.float32(buffers.weight[p]) * buffers.below[p]
+        upper = np.float32(buffers.weight[p]) - lower
+        b[p], d[p] = buffers.right[p] * upper, buffers.right[p] * lower
         a[p], c[p] = upper - b[p], lower - d[p]
 
 
@@ -313,7 +318,7 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
 
     Args:
         lines: ``(K, n)`` scores, changed; NaN gets a probability of 0.
-        highest: ``(n,)`` room.
+        highest: ``(n,)`` buffer.
         factor: ``(n,)`` factors that make the sums 1, written.
     """
     pixels = np.uint64(len(factor))
@@ -416,12 +421,12 @@ def _add_probabilities(
 
 
 @njit_fast
-def _tiles(start: int, stop: int, sight: Sight, pixels: int) -> list[Tile]:
+def _tiles(start: int, stop: int, geometry: CanvasGeometry, pixels: int) -> list[Tile]:
     """Tiles of `pixels` or fewer, about square on the sphere, that cover rows ``start:stop``."""
-    tiles, bottom, width = [], start, sight.columns.shape[1]
+    tiles, bottom, width = [], start, geometry.columns.shape[1]
     while bottom < stop:
         top, remaining = bottom, stop - bottom
-        parts = round(remaining / math.sqrt(pixels * abs(sight.rows[top, 0])))
+        parts = round(remaining / math.sqrt(pixels * abs(geometry.rows[top, 0])))
         rows = -(-remaining // max(1, parts))
         bottom, across = top + rows, pixels // rows
         for first in range(0, width, across):
@@ -452,51 +457,57 @@ def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -
 
 @njit_fast
 def _add_to_tile(
-    tile: Tile, scores: Array, sight: Sight, softmax: bool, step: tuple[int, int],
-    owns: Array, room: _Room, taps: _Taps, patch: Array, sums: Array,
+    tile: Tile, scores: Array, geometry: CanvasGeometry, softmax: bool, step: tuple[int, int],
+    owns: Array, buffers: _TileBuffers, taps: _Taps, patch: Array, sums: Array,
 ) -> Array:  # fmt: skip
     """Add weighted scores of images to the sums of a tile.
 
     Args:
         tile: The tile.
         scores: ``(n, K, h, w)``.
-        sight: Geometry of the images and the canvas.
+        geometry: Geometry of the images and the canvas.
         softmax: Whether to add probabilities.
         step: See `_list_pixels`.
-        owns: Room for all images, true at first.
-        room: Room for the tile's pixels.
-        taps: Likewise.
-        patch: Room for a part of an image.
+        owns: Buffer for all images, true at first.
+        buffers: Buffers for the tile's pixels.
+        taps: Buffers for the taps.
+        patch: Buffer for a part of an image.
         sums: ``(h, w, Kp)``, changed.
 
     Returns:
-        Perhaps more room for a part of an image.
+        The buffer for a part of an image, or a larger one.
     """
     side, classes, found = (scores.shape[2], scores.shape[3]), sums.shape[2], 0
-    owned = len(sight.owner) > 0
+    owned = len(geometry.owner) > 0
     if owned:
-        found = _owned_runs(tile, sight.owner, room.runs, owns)
+        found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
     for m in range(len(scores)):
-        if not owns[sight.images[m]]:
+        if not owns[geometry.images[m]]:
             continue
         if not owned:
-            found = _seen_runs(tile, m, sight, room.runs)
-        n = _list_pixels(m, side, sight, found, step, room)
+            found = _seen_runs(tile, m, geometry, buffers.runs)
+        n = _list_pixels(m, side, geometry, found, step, buffers)
         if n == 0:
             continue
-        top, left, high, wide = _split(n, side, room)
-        _weigh(n, (wide, -top * wide - left), room, taps)
+        top, left, high, wide = _split(n, side, buffers)
+        _weigh(n, (wide, -top * wide - left), buffers, taps)
         size = high * wide * classes
         patch = _enough(patch, size)
         part, blocks = patch[:size], classes // LANES
         _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
-        _add_samples(part, wide, blocks, taps, room.pixel[:n], sums.reshape(-1))
+        _add_samples(part, wide, blocks, taps, buffers.pixel[:n], sums.reshape(-1))
     return patch
 
 
 @njit_fast
 def add_images(
-    start: int, stop: int, scores: Array, sight: Sight, softmax: bool, total: Array, labels: Array
+    start: int,
+    stop: int,
+    scores: Array,
+    geometry: CanvasGeometry,
+    softmax: bool,
+    total: Array,
+    labels: Array,
 ) -> None:
     """Add weighted scores of images to rows ``start:stop`` of a canvas, or write best classes.
 
@@ -506,22 +517,22 @@ def add_images(
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        sight: Geometry of these images and the canvas.
+        geometry: Geometry of these images and the canvas.
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
         total: ``(H, W, Kp)`` sums, changed. Empty where only labels are wanted, for which all
             images of a pixel have to come at once.
         labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
     """
-    num_classes, width = scores.shape[1], sight.columns.shape[1]
-    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(sight.owner) > 0
-    owns, covered = np.ones(_count(sight), np.bool_), np.zeros(_count(sight), np.bool_)
-    for image in sight.images:
+    num_classes, width = scores.shape[1], geometry.columns.shape[1]
+    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(geometry.owner) > 0
+    owns, covered = np.ones(_count(geometry), np.bool_), np.zeros(_count(geometry), np.bool_)
+    for image in geometry.images:
         covered[image] = True
     pixels = max(64, _TILE_SCORES // classes)
-    room, taps, patch = _room(pixels), _room_for_taps(pixels), np.empty(0, np.float32)
+    buffers, taps, patch = _tile_buffers(pixels), _tap_buffers(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
-    for tile in _tiles(start, stop, sight, pixels):
+    for tile in _tiles(start, stop, geometry, pixels):
         top, bottom, left, right = tile
         sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
@@ -531,12 +542,12 @@ def add_images(
             sums[:] = 0
             step = wide, -top * wide - left
         before = softmax and not afterwards
-        patch = _add_to_tile(tile, scores, sight, before, step, owns, room, taps, patch, sums)
+        patch = _add_to_tile(tile, scores, geometry, before, step, owns, buffers, taps, patch, sums)
         if len(total) == 0:
             for i in range(top, bottom):
                 _write_classes(sums[i - top], num_classes, 0.0, labels[i, left:right])
         elif afterwards:
-            _add_probabilities(tile, covered, sight.owner, num_classes, sums, total)
+            _add_probabilities(tile, covered, geometry.owner, num_classes, sums, total)
 
 
 @njit_fast
@@ -547,7 +558,7 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
         scores: Of the image.
         left: First column of the part.
         top: First row of the part.
-        highest: ``(width,)`` room.
+        highest: ``(width,)`` buffer.
         best: ``(height, width)``, written; −1 where no score is finite and the largest.
     """
     width = best.shape[1]
@@ -580,7 +591,7 @@ def _interpolated_classes(
         scores: ``(K, h, w)`` of an image.
         count: Number of pixels n.
         taps: Of the pixels, in the image.
-        highest: Room.
+        highest: Buffer.
         best: Of the pixels, written.
     """
     right, below = np.uint64(1), np.uint64(scores.shape[2])
@@ -597,14 +608,16 @@ def _interpolated_classes(
 
 
 @njit_fast
-def _write_alike(n: int, best: Array, corner: tuple[int, int], room: _Room, labels: Array) -> int:
+def _write_alike(
+    n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array
+) -> int:
     """Write labels of pixels around which all four pixels of the image have the same best class.
 
     Args:
         n: How many pixels there are.
         best: From `_best_of_part`.
         corner: Row and column of the part in the image.
-        room: The pixels; the others are moved to the front.
+        buffers: The pixels; the others are moved to the front.
         labels: Flat, written.
 
     Returns:
@@ -613,20 +626,22 @@ def _write_alike(n: int, best: Array, corner: tuple[int, int], room: _Room, labe
     flat, below = best.reshape(-1), np.uint64(best.shape[1])
     others, right = 0, np.uint64(1)
     for p in range(n):
-        at = np.uint64((room.row[p] - corner[0]) * best.shape[1] + room.column[p] - corner[1])
+        at = np.uint64((buffers.row[p] - corner[0]) * best.shape[1] + buffers.column[p] - corner[1])
         label = flat[at]
         if label == flat[at + right] == flat[at + below] == flat[at + below + right] >= 0:
-            labels[room.pixel[p]] = label
+            labels[buffers.pixel[p]] = label
             continue
-        room.pixel[others] = room.pixel[p]
-        room.column[others], room.row[others] = room.column[p], room.row[p]
-        room.right[others], room.below[others] = room.right[p], room.below[p]
+        buffers.pixel[others] = buffers.pixel[p]
+        buffers.column[others], buffers.row[others] = buffers.column[p], buffers.row[p]
+        buffers.right[others], buffers.below[others] = buffers.right[p], buffers.below[p]
         others += 1
     return others
 
 
 @njit_fast
-def label_images(start: int, stop: int, scores: Array, sight: Sight, labels: Array) -> None:
+def label_images(
+    start: int, stop: int, scores: Array, geometry: CanvasGeometry, labels: Array
+) -> None:
     """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
 
     Where the four pixels of an image around a position have the same best class, so has the
@@ -636,28 +651,32 @@ def label_images(start: int, stop: int, scores: Array, sight: Sight, labels: Arr
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        sight: Geometry of these images and the canvas, with owners.
+        geometry: Geometry of these images and the canvas, with owners.
         labels: ``(H, W)``, written.
     """
     side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
-    room, taps, owns = _room(pixels), _room_for_taps(pixels), np.empty(_count(sight), np.bool_)
+    buffers, taps, owns = (
+        _tile_buffers(pixels),
+        _tap_buffers(pixels),
+        np.empty(_count(geometry), np.bool_),
+    )
     highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
-    for tile in _tiles(start, stop, sight, pixels):
-        found = _owned_runs(tile, sight.owner, room.runs, owns)
+    for tile in _tiles(start, stop, geometry, pixels):
+        found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
         for m in range(len(scores)):
-            if not owns[sight.images[m]]:
+            if not owns[geometry.images[m]]:
                 continue
-            n = _list_pixels(m, side, sight, found, (width, 0), room)
-            top, left, high, wide = _split(n, side, room)
+            n = _list_pixels(m, side, geometry, found, (width, 0), buffers)
+            top, left, high, wide = _split(n, side, buffers)
             best = _enough(best, high * wide)
             part = best[: high * wide].reshape((high, wide))
             _best_of_part(scores[m], left, top, highest[:wide], part)
-            n = _write_alike(n, part, (top, left), room, flat)
-            _weigh(n, (side[1], 0), room, taps)
+            n = _write_alike(n, part, (top, left), buffers, flat)
+            _weigh(n, (side[1], 0), buffers, taps)
             _interpolated_classes(scores[m], n, taps, highest, unlike)
             for p in range(n):
-                flat[room.pixel[p]] = unlike[p]
+                flat[buffers.pixel[p]] = unlike[p]
 
 
 @njit_fast
@@ -671,7 +690,7 @@ def best_classes(
 
 @njit_exact
 def seen_table(
-    start: int, stop: int, side: tuple[int, int], sight: Sight,
+    start: int, stop: int, side: tuple[int, int], geometry: CanvasGeometry,
     count: Array, face: Array, u: Array, v: Array, weight: Array,
 ) -> None:  # fmt: skip
     """All images that contribute to a pixel, for the rows ``start:stop``.
@@ -680,29 +699,29 @@ def seen_table(
         start: First row.
         stop: One past the last row.
         side: Rows and columns of the images.
-        sight: Geometry of images and canvas.
+        geometry: Geometry of images and canvas.
         count: ``(H, W)`` how many images there are, 0 before, written.
         face: ``(R, H, W)`` images, written; with R = 0 they are only counted.
         u: ``(R, H, W)`` columns in the images, written.
         v: ``(R, H, W)`` rows in the images, written.
         weight: ``(R, H, W)`` weights, written.
     """
-    width = sight.columns.shape[1]
-    owned, owns = len(sight.owner) > 0, np.ones(_count(sight), np.bool_)
-    room, found = _room(width), 0
+    width = geometry.columns.shape[1]
+    owned, owns = len(geometry.owner) > 0, np.ones(_count(geometry), np.bool_)
+    buffers, found = _tile_buffers(width), 0
     for i in range(start, stop):
         tile = i, i + 1, 0, width
         if owned:
-            found = _owned_runs(tile, sight.owner, room.runs, owns)
-        for m in range(len(sight.matrices)):
-            if not owns[sight.images[m]]:
+            found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
+        for m in range(len(geometry.matrices)):
+            if not owns[geometry.images[m]]:
                 continue
             if not owned:
-                found = _seen_runs(tile, m, sight, room.runs)
-            for p in range(_list_pixels(m, side, sight, found, (0, 0), room)):
-                j = room.pixel[p]
+                found = _seen_runs(tile, m, geometry, buffers.runs)
+            for p in range(_list_pixels(m, side, geometry, found, (0, 0), buffers)):
+                j = buffers.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1
                 if rank < len(face):
-                    face[rank, i, j], weight[rank, i, j] = m, room.weight[p]
-                    u[rank, i, j], v[rank, i, j] = room.u[p], room.v[p]
+                    face[rank, i, j], weight[rank, i, j] = m, buffers.weight[p]
+                    u[rank, i, j], v[rank, i, j] = buffers.u[p], buffers.v[p]

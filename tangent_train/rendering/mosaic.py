@@ -1,33 +1,33 @@
 """Class scores of one panorama or photo, accumulated image by image.
 
-`tangent_to_labels` wants the scores of all images at once: 5 GB for 13 classes at level 11. Here
+`tangent_to_labels` takes the scores of all images at once: 5 GB for 13 classes at level 11. Here
 they arrive a few images at a time, from any number of grids, and are not kept. Without averaging,
 only the labels are kept.
+
+Two backends give the same results: compiled kernels on the CPU (`accumulate`), torch on any device
+(`device_mosaic`).
 """
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import torch
 
 from tangent_train.rendering import kernels
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_panorama, label_panorama, zero_sums
-from tangent_train.rendering.checks import check_blend
+from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, label_canvas, zero_sums
+from tangent_train.rendering.checks import Blend, blend_of
 from tangent_train.rendering.compiled import over_rows
-from tangent_train.rendering.sampling import plane_rays
-from tangent_train.rendering.tables import owners
+from tangent_train.rendering.device_mosaic import DeviceSums, fits_on
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from tangent_train.geometry import PinholeGrid
-    from tangent_train.rendering.backward import Blend
-    from tangent_train.rendering.representations.perspective import PhotoCrops
+    from tangent_train.rendering.representations.views import Placement, Views
+
+_LEAST_TOTAL = 1e-37
 
 
 class ScoreMosaic:
@@ -38,18 +38,21 @@ class ScoreMosaic:
         num_classes: K.
         blend: ``nearest``: a pixel takes the scores of the image that owns it, as in
             `tangent_to_labels`. ``feather``: the weighted average of the probabilities of all
-            images that see it.
-        averaged: Whether to keep sums of probabilities: always with ``feather``; with ``nearest``
-            for more than one grid, or when the probabilities are wanted. They take 4 K bytes a
-            pixel, K rounded up to 16s, beyond 2 GiB in a temporary file (of the folder TMPDIR).
+            images that see it; see `blend_of`.
+        averaged: True to keep sums of probabilities: always with ``feather``; with ``nearest``
+            for more than one set of images, or when the probabilities are wanted. They take 4 K
+            bytes a pixel; on the CPU K is rounded up to 16s, and beyond 2 GiB they are in a
+            temporary file (of the folder TMPDIR).
         min_confidence: Probability from which the best class is certain, see `labels`; above 0,
             sums are kept.
-        spare: `sums` of a mosaic that nobody uses any more, to take its memory.
+        device: Device of the mosaic; sums that are too large for it are kept on the CPU.
+        backend: ``numba`` on the CPU, or ``torch``; None for the one that suits the device.
+        spare: `sums` of a mosaic that is no longer used, to reuse its memory.
 
     Attributes:
         shape: As given.
         blend: As given.
-        sums: Of probabilities, from `zero_sums`; empty where they are not kept.
+        sums: Sums of probabilities on the CPU, from `zero_sums`; empty where they are not kept.
 
     Raises:
         SettingError: The temporary file for the sums does not fit on the disk.
@@ -63,92 +66,72 @@ class ScoreMosaic:
         *,
         averaged: bool = False,
         min_confidence: float = 0.0,
+        device: torch.device | str = "cpu",
+        backend: Literal["numba", "torch"] | None = None,
         spare: NDArray[np.float32] | None = None,
     ) -> None:
         self.shape = shape
-        self.blend = blend
-        self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
-        averaged = averaged or blend == "feather" or min_confidence > 0
+        self.blend: Blend = blend
         self._num_classes = num_classes
         self._min_confidence = min_confidence
-        self.sums = zero_sums(shape if averaged else (0, 0), num_classes, spare)
-        self._owned: tuple[object, NDArray[np.integer]] = None, NO_OWNERS
+        self._averaged = averaged or blend == "feather" or min_confidence > 0
+        self._owned: tuple[object, Any] = None, NO_OWNERS
+        self._on_device: DeviceSums | None = None
+        self.sums = np.empty((0, 0, 0), np.float32)
+        if backend is None:
+            suits = torch.device(device).type != "cpu" and fits_on(device, shape, num_classes)
+            backend = "torch" if suits else "numba"
+        if backend == "torch":
+            self._on_device = DeviceSums(shape, num_classes, device, averaged=self._averaged)
+            return
+        self._labels = np.zeros(shape, np.uint8 if num_classes < 256 else np.uint16)
+        if self._averaged:
+            self.sums = zero_sums(shape, num_classes, spare)
 
-    def add(self, scores: Tensor, grid: PinholeGrid, faces: NDArray[np.int64]) -> None:
-        """Add some images of a grid; every face must be added once.
-
-        Args:
-            scores: ``(n, K, d, d)`` scores, not probabilities.
-            grid: Their grid.
-            faces: ``(n,)`` which images they are.
-
-        Raises:
-            SettingError: The images of the grid do not overlap, as `feather` needs.
-        """
-        check_blend(self.blend, grid)
-        owner = self._owners(grid, lambda: owners(grid, self.shape))
-        images = _on_cpu(scores), grid, faces
-        if len(self.sums):
-            everywhere = self.shape, slice(0, self.shape[0])
-            add_to_panorama(*images, *everywhere, owner, self.sums, softmax=True)
-        else:
-            label_panorama(*images, owner, self._labels)
-
-    def add_crops(self, scores: Tensor, crops: PhotoCrops, which: NDArray[np.int64]) -> None:
-        """Add some crops of a photo; each must be added once.
+    def add(self, scores: Tensor, views: Views) -> None:
+        """Add some views of a set; every view of the set must be added once.
 
         Args:
             scores: ``(n, K, h, w)`` scores, not probabilities.
-            crops: Positions of all crops.
-            which: ``(n,)`` which of them these are.
+            views: The views.
         """
-        height, width = self.shape
-        prepared = _on_cpu(scores)
-        views, spans = np.zeros((len(which), 3, 3)), np.zeros((len(which), height, 2), np.int32)
-        for number, box in enumerate(crops.boxes[which]):
-            left, top, right, bottom = box
-            across, down = prepared.shape[3] / (right - left), prepared.shape[2] / (bottom - top)
-            # Of the ray (j, 1, i): pixel j of the photo is at j + ½ from its corner.
-            views[number] = [
-                [across, (0.5 - left) * across - 0.5, 0],
-                [0, (0.5 - top) * down - 0.5, down],
-                [0, 1, 0],
-            ]
-            first, last = max(0, math.floor(left)), min(width, math.ceil(right))
-            spans[number, max(0, math.floor(top)) : math.ceil(bottom)] = first, last - first
-        rays = plane_rays(self.shape)
-        owner = self._owners(crops, lambda: crops.owners(self.shape))
-        sight = kernels.Sight(which, views, spans, *rays, owner)
-        if len(self.sums):
-            arguments = (prepared, sight, True, self.sums, self._labels)
-            over_rows(kernels.add_images, height, width, *arguments)
+        scores, images = views.placed(scores.detach().float(), self.shape)
+        owner = self._owners(images)
+        if self._on_device is not None:
+            self._on_device.add(scores, images, owner if len(owner) else None)
+            return
+        array = scores.contiguous().cpu().numpy()
+        if self._averaged:
+            everywhere = self.shape, slice(0, self.shape[0])
+            add_to_canvas(array, images, *everywhere, owner, self.sums, softmax=True)
         else:
-            over_rows(kernels.label_images, height, width, prepared, sight, self._labels)
+            label_canvas(array, images, owner, self._labels)
 
-    def labels(self) -> NDArray[np.unsignedinteger]:
-        """``(H, W)`` places of the best classes, of equal ones the first; K where unsure."""
-        if len(self.sums):
-            least = self._min_confidence
-            arguments = (self.sums, self._num_classes, least, self._labels)
+    def labels(self) -> Tensor:
+        """``(H, W)`` indices of the best classes, of equal ones the first; K where unsure."""
+        if self._on_device is not None:
+            return self._on_device.labels(self._min_confidence)
+        if self._averaged:
+            arguments = (self.sums, self._num_classes, self._min_confidence, self._labels)
             over_rows(kernels.best_classes, *self.shape, *arguments)
-        return self._labels
+        return torch.from_numpy(self._labels)
 
-    def probabilities(self, rows: slice | NDArray[np.intp]) -> NDArray[np.float32]:
+    def probabilities(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
-        total = self.sums[rows][..., : self._num_classes]
-        return total / np.maximum(total.sum(axis=-1, keepdims=True), np.float32(1e-37))
+        if self._on_device is not None:
+            index = rows if isinstance(rows, slice) else rows.tolist()
+            total = self._on_device.sums[:, index].movedim(0, -1)
+        else:
+            total = torch.from_numpy(self.sums[rows][..., : self._num_classes])
+        return total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)
 
-    def _owners(
-        self, images: object, build: Callable[[], NDArray[np.integer]]
-    ) -> NDArray[np.integer]:
+    def _owners(self, images: Placement) -> Any:
         """Owner of each pixel, kept until images of another set are added."""
-        if self.blend == "feather":
+        if blend_of(self.blend, images) == "feather":
             return NO_OWNERS
-        if self._owned[0] is not images:
-            self._owned = images, build()
+        if self._owned[0] is not images.all_images:
+            owner: Any = images.owners(self.shape)
+            if self._on_device is not None:
+                owner = torch.from_numpy(owner).to(self._on_device.sums.device)
+            self._owned = images.all_images, owner
         return self._owned[1]
-
-
-def _on_cpu(scores: Tensor) -> NDArray[np.float32]:
-    result: NDArray[np.float32] = scores.detach().float().contiguous().cpu().numpy()
-    return result

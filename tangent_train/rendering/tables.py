@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Sequence
-from contextlib import suppress
+from os import register_at_fork
+from threading import Lock
 from typing import Any, TypeVar
 
 import numpy as np
@@ -31,8 +32,7 @@ Value = TypeVar("Value", bound=tuple[Any, ...])
 class TableCache:
     """The most recently used tables, as many as fit into a number of bytes.
 
-    Without a lock: every step is one operation on a dictionary. Two threads that miss a table at
-    once both build it.
+    Two threads that miss a table at once both build it, outside of the lock; one is kept.
 
     Args:
         limit: Maximum number of bytes held.
@@ -42,6 +42,8 @@ class TableCache:
         self.limit = limit
         self.nbytes = 0
         self._tables: OrderedDict[Hashable, tuple[Any, ...]] = OrderedDict()
+        self._lock = Lock()
+        register_at_fork(after_in_child=self._new_lock)
 
     def get(self, key: Hashable, build: Callable[[], Value]) -> Value:
         """The table of a key, built if it is not held.
@@ -50,23 +52,32 @@ class TableCache:
             key: Everything the table depends on.
             build: Makes the table, a tuple of arrays or tensors.
         """
-        held: Any = self._tables.get(key)
-        if held is not None:
-            with suppress(KeyError):  # dropped by another thread
+        with self._lock:
+            held: Any = self._tables.get(key)
+            if held is not None:
                 self._tables.move_to_end(key)
-            return held
+                return held
         table = build()
-        if _nbytes(table) <= self.limit and key not in self._tables:
-            self._tables[key] = table
-            self.nbytes += _nbytes(table)
-            self.set_limit(self.limit)
+        with self._lock:
+            if _nbytes(table) <= self.limit and key not in self._tables:
+                self._tables[key] = table
+                self.nbytes += _nbytes(table)
+                self._drop()
         return table
 
     def set_limit(self, limit: int) -> None:
         """Change the limit, dropping what no longer fits."""
-        self.limit = limit
-        while self.nbytes > limit and self._tables:
+        with self._lock:
+            self.limit = limit
+            self._drop()
+
+    def _drop(self) -> None:
+        while self.nbytes > self.limit:
             self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
+
+    def _new_lock(self) -> None:
+        """A process that was forked while another thread held the lock would wait forever."""
+        self._lock = Lock()
 
 
 def _nbytes(table: tuple[Any, ...]) -> int:
@@ -175,22 +186,22 @@ def find_owners(
         rows: From `sphere_rays`.
         face: ``(H, W)`` owners, written.
     """
-    own = 0
+    nearest = 0
     for i in range(start, stop):
         z = rows[i, 1]
         for j in range(columns.shape[1]):
             x, y = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
-            best = centers[own, 0] * x + centers[own, 1] * y + centers[own, 2] * z
+            best = centers[nearest, 0] * x + centers[nearest, 1] * y + centers[nearest, 2] * z
             while best < inner:
-                nearer = own
-                for other in neighbors[own]:
+                nearer = nearest
+                for other in neighbors[nearest]:
                     dot = centers[other, 0] * x + centers[other, 1] * y + centers[other, 2] * z
                     if dot > best:
                         best, nearer = dot, other
-                if nearer == own:
+                if nearer == nearest:
                     break
-                own = nearer
-            face[i, j] = own
+                nearest = nearer
+            face[i, j] = nearest
 
 
 def image_table(
@@ -215,7 +226,7 @@ def image_table(
         add up to 1.
     """
     part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
-    sight = sight_of(grid, grid.face_indices(), shape, rows, part)
+    geometry = canvas_geometry(grid, grid.face_indices(), shape, rows, part)
     size = (rows.stop - rows.start, shape[1])
 
     def fill(ranks: int) -> tuple[NDArray[Any], ...]:
@@ -223,7 +234,7 @@ def image_table(
         face = np.zeros((ranks, *size), np.int16 if grid.num_images < 2**15 else np.int32)
         u, v, weight = np.zeros((3, ranks, *size), dtype)
         table = (count, face, u, v, weight)
-        over_rows(kernels.seen_table, *size, (grid.dim, grid.dim), sight, *table)
+        over_rows(kernels.seen_table, *size, (grid.dim, grid.dim), geometry, *table)
         return table
 
     count, face, u, v, weight = fill(1 if blend == "nearest" else int(fill(0)[0].max()))
@@ -233,39 +244,46 @@ def image_table(
     return face, u, v, weight / weight.sum(axis=0)
 
 
-def sight_of(
+def canvas_geometry(
     grid: PinholeGrid,
     faces: NDArray[np.int64],
     shape: tuple[int, int],
     rows: slice,
     owner: NDArray[np.integer],
-) -> kernels.Sight:
+) -> kernels.CanvasGeometry:
     """Geometry of images of a grid and rows of a panorama, for the kernels.
 
     Args:
-        grid: The images.
-        faces: ``(n,)`` those meant.
+        grid: Geometry of all images.
+        faces: ``(n,)`` numbers of the images.
         shape: ``(H, W)`` of the panorama.
-        rows: Rows of it, without a step.
-        owner: Of these rows; empty to feather.
+        rows: Rows of the panorama, without a step.
+        owner: Owners of these rows; empty for feathering.
     """
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
     columns, lines = sphere_rays(shape)
+    spans = np.empty((0, 0, 2), np.int32) if owner.size else find_spans(grid, faces, shape, rows)
+    return kernels.CanvasGeometry(faces, matrices, spans, columns, lines[rows], owner)
+
+
+def find_spans(
+    grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int], rows: slice
+) -> NDArray[np.int32]:
+    """``(n, rows, 2)`` spans, see `kernels.CanvasGeometry`; arguments as of `canvas_geometry`."""
 
     def build() -> tuple[NDArray[np.int32]]:
         spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)
+        matrices = grid.camera_matrix @ grid.world_from_camera[faces].transpose(0, 2, 1)
         u, v, w = matrices[:, None].transpose(2, 0, 1, 3)
         last = grid.dim - 0.5
         edges = np.concatenate([u + w / 2, last * w - u, v + w / 2, last * w - v], axis=1)
-        over_rows(find_spans, spans.shape[1], len(faces), edges, lines[rows], shape[1], spans)
+        lines = sphere_rays(shape)[1][rows]
+        over_rows(write_spans, spans.shape[1], len(faces), edges, lines, shape[1], spans)
         return (spans,)
 
-    spans = np.empty((0, 0, 2), np.int32)
-    if owner.size == 0:
-        key = "spans", shape, rows.start, rows.stop, *map(int, faces)
-        (spans,) = _cached(grid, key, build)
-    return kernels.Sight(faces, matrices, spans, columns, lines[rows], owner)
+    key = "spans", shape, rows.start, rows.stop, *map(int, faces)
+    return _cached(grid, key, build)[0]
 
 
 @njit_exact
@@ -278,7 +296,7 @@ def _inside(normals: Array, x: float, y: float, z: float) -> bool:
 
 
 @njit_exact
-def find_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
+def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
     """Find the columns of ERP rows ``start:stop`` that may see something of images.
 
     An image is seen between four planes through the centre of the sphere. What a row sees of it
@@ -290,7 +308,7 @@ def find_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spa
         edges: ``(n, 4, 3)`` normals of the planes, inwards.
         rows: From `sphere_rays`.
         width: W.
-        spans: ``(n, H, 2)`` see `kernels.Sight`, written.
+        spans: ``(n, H, 2)`` see `kernels.CanvasGeometry`, written.
     """
     for m in range(len(edges)):
         forward = edges[m, 0] + edges[m, 1]

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from tangent_train.results.record import SCORES
+from tangent_train.results.record import Heading
 from tangent_train.results.rows import Row, Statistic
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
@@ -29,32 +29,46 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
 
     Args:
         title: Of the chart.
-        rows: Of one kind and with the same classes.
+        rows: Rows of the same scores and classes.
 
     Returns:
         A PNG file.
     """
-    scores, names = SCORES[rows[0].records[0].kind], rows[0].records[0].class_names
-    means = [[row.score(name) for name in scores.means] for row in rows]
-    classes = [[row.score(scores.charted, name) for name in names] for row in rows]
-    second = _Panel(f"{scores.per_class[scores.charted]} of each class", names, classes)
-    return _png(rows, _Panel(title, list(scores.means.values()), means), second)
+    record = rows[0].records[0]
+    headings, names = record.headings, record.class_names
+    panels: list[_Panel] = []
+    for unit in dict.fromkeys(heading.unit for heading in headings.values()):
+        shown = [name for name, heading in headings.items() if heading.unit == unit]
+        means = [[row.score(name) for name in shown] for row in rows]
+        ticks = [headings[name].text for name in shown]
+        panels.append(_Panel("" if panels else title, ticks, means, unit))
+    if names:
+        score = record.main_of_class
+        heading = headings[record.class_means[score]]
+        classes = [[row.score(score, name) for name in names] for row in rows]
+        title = f"{heading.class_text} of each class"
+        panels.append(_Panel(title, names, classes, heading.unit))
+    return _png(rows, *panels)
 
 
-def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str) -> bytes:
+def grid_png(
+    title: str, grid: Mapping[str, Mapping[str, Row]], heading: Heading, score: str
+) -> bytes:
     """Bars of one score of every view, in groups of one condition.
 
     Args:
         title: Of the chart.
         grid: Rows by view, every one with all conditions.
-        score: Over all classes.
+        heading: Heading of the score.
+        score: Name of the score over all images.
 
     Returns:
         A PNG file.
     """
     scores = [[row.score(score) for row in found.values()] for found in grid.values()]
     conditions = list(next(iter(grid.values())))
-    return _png([Row(view, ()) for view in grid], _Panel(title, conditions, scores))
+    panel = _Panel(f"{title}: {heading.text}", conditions, scores, heading.unit)
+    return _png([Row(view, ()) for view in grid], panel)
 
 
 class _Panel(NamedTuple):
@@ -63,6 +77,11 @@ class _Panel(NamedTuple):
     title: str
     ticks: Sequence[str]
     scores: Sequence[Sequence[Statistic]]
+    unit: str
+
+    def shown(self, values: Sequence[float | None]) -> list[float]:
+        """Numbers in the unit; NaN, which draws nothing, for None."""
+        return _in_unit(values, self.unit)
 
 
 def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
@@ -74,11 +93,13 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     plots = figure.subplots(count, 1, squeeze=False)[:, 0]
     for axes, panel in zip(plots, panels, strict=False):
         axes.set_title(panel.title, loc="left")
-        _bars(axes, rows, panel.ticks, panel.scores)
+        _bars(axes, rows, panel)
     plots[0].set_title(f"{panels[0].title}\n{_ERROR_BARS}", loc="left")
     if banded:
-        plots[-1].set_title("mIoU by latitude", loc="left")
-        _band_lines(plots[-1], rows)
+        record = next(row for row in rows if row.bands).records[0]
+        heading = record.headings[record.main]
+        plots[-1].set_title(f"{heading.text} by latitude", loc="left")
+        _band_lines(plots[-1], rows, record.main, heading.unit)
     handles, labels = plots[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
@@ -88,35 +109,33 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     return file.getvalue()
 
 
-def _bars(
-    axes: Axes, rows: Sequence[Row], ticks: Sequence[str], scores: Sequence[Sequence[Statistic]]
-) -> None:
-    width = 0.8 / len(rows)
-    for k, (row, number, found) in enumerate(zip(rows, _numbers(rows), scores, strict=True)):
+def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
+    width, ticks = 0.8 / len(rows), panel.ticks
+    for k, (row, number, found) in enumerate(zip(rows, _numbers(rows), panel.scores, strict=True)):
         again = number >= len(_COLORS)  # a second row of a colour
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
-            _percents([score.mean for score in found]),
+            panel.shown([score.mean for score in found]),
             0.92 * width,
-            yerr=np.transpose([_error_bar(score) for score in found]),
+            yerr=np.transpose([panel.shown(_error_bar(score)) for score in found]),
             color=_COLORS[number % len(_COLORS)],
             hatch="//" if row.published else "xx" if again else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
         )
     axes.set_xticks(np.arange(len(ticks)), ticks)
-    _percent_axis(axes)
+    _score_axis(axes, panel.unit)
 
 
-def _band_lines(axes: Axes, rows: Sequence[Row]) -> None:
+def _band_lines(axes: Axes, rows: Sequence[Row], score: str, unit: str) -> None:
     for row, number in zip(rows, _numbers(rows), strict=True):
         bands = sorted(row.bands)
         centers = [(south + north) / 2 for south, north in bands]
-        shares = _percents([row.score("miou", band).mean for band in bands])
+        shown = _in_unit([row.score(score, band).mean for band in bands], unit)
         line = "--" if number >= len(_COLORS) else "-"
-        axes.plot(centers, shares, line, color=_COLORS[number % len(_COLORS)], marker=".")
+        axes.plot(centers, shown, line, color=_COLORS[number % len(_COLORS)], marker=".")
     axes.set_xticks(range(-90, 91, 30), [f"{k}°" for k in range(-90, 91, 30)])
-    _percent_axis(axes)
+    _score_axis(axes, unit)
     axes.set_xlim(-90, 90)
 
 
@@ -126,24 +145,25 @@ def _numbers(rows: Sequence[Row]) -> list[int]:
     return [names.index(row.label.removesuffix(" (paper)")) for row in rows]
 
 
-def _error_bar(score: Statistic) -> list[float]:
-    """Percent below and above the mean."""
+def _error_bar(score: Statistic) -> list[float | None]:
+    """Lengths below and above the mean."""
     spread = score.over_seeds if score.over_folds is None else score.over_folds
     if spread is not None or score.mean is None or score.interval is None:
-        return _percents([spread, spread])
+        return [spread, spread]
     low, high = score.interval
     # The mean of few images may lie outside.
-    return _percents([max(score.mean - low, 0), max(high - score.mean, 0)])
+    return [max(score.mean - low, 0), max(high - score.mean, 0)]
 
 
-def _percents(shares: Sequence[float | None]) -> list[float]:
-    """Shares of 1 in percent; NaN, which draws nothing, for None."""
-    return [np.nan if share is None else 100 * share for share in shares]
+def _in_unit(values: Sequence[float | None], unit: str) -> list[float]:
+    scale = 100 if unit == "%" else 1
+    return [np.nan if value is None else scale * value for value in values]
 
 
-def _percent_axis(axes: Axes) -> None:
-    axes.set_ylim(0, 105)
-    axes.set_ylabel("%")
+def _score_axis(axes: Axes, unit: str) -> None:
+    if unit == "%":
+        axes.set_ylim(0, 105)
+    axes.set_ylabel(unit)
     axes.margins(x=0.01)
     axes.grid(axis="y", color="#dddddd")
     axes.set_axisbelow(True)

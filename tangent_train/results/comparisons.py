@@ -15,16 +15,11 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib.resources import files
-from typing import Any
 
 from tangent_train.results.record import Record
 from tangent_train.results.report import Cell, Report
 from tangent_train.results.rows import Row, check_alike, group_runs
 
-_MEANS = {
-    "segmentation": {"accuracy": "macc", "iou": "miou"},
-    "classification": {"accuracy": "accuracy"},
-}
 _KEY = ("data", "stage", "method", "level", "base_level", "inputs")
 
 _REPRESENTATIONS = {
@@ -127,14 +122,16 @@ def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) 
 
 def _facts(records: Sequence[Record]) -> dict[str, str]:
     record = records[0]
-    rotations = [record.settings.get(n) for n in ("representation.rotation", "data.test_rotation")]
+    rotations = [
+        record.settings.get(n) for n in ("representation.random_rotation", "data.test_rotation")
+    ]
     facts = {
         "data": record.data,
         "s": str(record.settings.get("level") or "–"),
-        "input": _inputs(record) if record.kind == "segmentation" else "–",
+        "input": _inputs(record),
         "b": _base_level(record),
     }
-    if record.kind == "classification":
+    if "data.test_rotation" in record.settings and "data.inputs" not in record.settings:  # shapes
         facts["rotated in training / test"] = " / ".join(
             _ROTATIONS.get(name, str(name)) for name in rotations
         )
@@ -145,8 +142,10 @@ def _facts(records: Sequence[Record]) -> dict[str, str]:
 
 
 def _inputs(record: Record) -> str:
-    """RGB or RGB-D, as the paper writes it, and further inputs."""
-    names = record.settings.get("data.inputs") or ()
+    """RGB or RGB-D, as the paper writes it, and further inputs; a dash for shapes."""
+    names = record.settings.get("data.inputs")
+    if names is None:
+        return "–"
     further = [name for name in names if name not in ("rgb", "depth")]
     return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
 
@@ -200,14 +199,18 @@ def _row(like: Record, key: dict[str, str], lines: list[dict[str, str]]) -> Row:
 
 
 def _record(like: Record, fold: str, lines: Sequence[dict[str, str]]) -> Record:
-    means: dict[str, float | None] = {}
-    classes: dict[str, dict[str, Any]] = {name: {"class": name} for name in like.class_names}
-    for line in lines:
-        means[_MEANS[like.kind][line["score"]]] = _share(line["mean"])
-        for name, entry in classes.items():
-            entry[line["score"]] = _share(line.get(name, ""))
+    by_score = {line["score"]: line for line in lines}
+    means = {n: _share(by_score[n]["mean"]) if n in by_score else None for n in like.means}
+    classes = [
+        {"class": name}
+        | {
+            of_class: _share(by_score[mean].get(name, "")) if mean in by_score else None
+            for of_class, mean in like.class_means.items()
+        }
+        for name in like.class_names
+    ]
     settings = {"data.fold": int(fold) if fold else None}
-    return Record(like.kind, "", 0, means, list(classes.values()), settings=settings)
+    return Record("", 0, like.headings, means, classes, settings=settings)
 
 
 def _share(percent: str) -> float | None:

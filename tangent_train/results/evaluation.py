@@ -1,4 +1,4 @@
-"""Record, tables and files of an evaluation, from its confusion matrices."""
+"""Tables and files of one evaluation, and the parts of its record."""
 
 from __future__ import annotations
 
@@ -12,96 +12,32 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
-from tangent_train.metrics.classification import classification_scores
-from tangent_train.metrics.segmentation import (
-    BAND_EDGES_DEG,
-    AbsentClass,
-    ConfusionMatrices,
-    bootstrap_intervals,
-    segmentation_scores,
-)
-from tangent_train.results.record import RESULTS_FILE, SCORES, Record, with_solid_angle
-from tangent_train.results.tables import Table, percent
+from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Record
+from tangent_train.results.tables import Table, score_text
 
-_HEADINGS = {
+_OTHER_COLUMNS = {
     "images": "images",
     "share": "pixels %",
     "taken_for": "most often taken for",
     "taken_for_share": "%",
 }
-"""Of the columns per class that are no scores."""
+"""Headings of the columns per class that are not scores."""
 
 
-def segmentation_record(
-    matrices: ConfusionMatrices,
-    class_names: Sequence[str],
-    absent_class: AbsentClass,
-    noun: str = "panoramas",
-) -> Record:
-    """The record of a segmentation.
-
-    Args:
-        matrices: Counts over the data set.
-        class_names: K + 1 names, the unknown class first.
-        absent_class: Treatment of classes absent from the ground truth in the means.
-        noun: Plural name of the images. Photos have neither solid angles nor latitude bands.
-    """
-    on_sphere = bool(matrices.solid_angle.any())
-    absent = absent_class, absent_class if on_sphere else "skip"
-    both = list(map(segmentation_scores, (matrices.pixels, matrices.solid_angle), absent))
-    means = with_solid_angle(*({"miou": s.miou, "macc": s.macc} for s in both))
-    of_class = with_solid_angle(*({"iou": s.iou, "accuracy": s.accuracy} for s in both))
-    bands = [segmentation_scores(band, absent_class) for band in matrices.bands if on_sphere]
-    of_images = matrices.of_images.swapaxes(0, 1)
-    return Record(
-        "segmentation",
-        noun,
-        matrices.images,
-        _plain(means),
-        _entries(of_class | {"share": both[0].share}, matrices.pixels, class_names, first=1),
-        [
-            {"latitude_deg": [south, north], **_plain({"miou": band.miou, "macc": band.macc})}
-            for north, south, band in zip(BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False)
-        ],
-        matrices.pixels.tolist(),
-        absent_class,
-        with_solid_angle(*map(bootstrap_intervals, of_images, absent)),
-    )
-
-
-def classification_record(
-    confusion: NDArray[np.int64], class_names: Sequence[str], noun: str = "shapes"
-) -> Record:
-    """The record of a classification.
-
-    Args:
-        confusion: ``(K, K)`` counts, rows truth, columns prediction.
-        class_names: K names.
-        noun: Plural name of the images.
-    """
-    scores = classification_scores(confusion)
-    means = {"accuracy": scores.accuracy, "class_accuracy": scores.class_accuracy}
-    of_class = {"images": scores.counts, "accuracy": scores.of_class}
-    return Record(
-        "classification",
-        noun,
-        int(confusion.sum()),
-        _plain(means),
-        _entries(of_class, confusion, class_names),
-        confusion=confusion.tolist(),
-    )
-
-
-def _entries(
-    scores: Mapping[str, NDArray[Any]],
-    confusion: NDArray[np.int64],
-    class_names: Sequence[str],
-    first: int = 0,
+def class_entries(
+    scores: Mapping[str, NDArray[Any]], confusion: NDArray[np.int64], class_names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """For each class from the first its name and scores, and what it was most often taken for."""
+    """Return name, scores and most frequent confusion of every class, see `Record.classes`.
+
+    Args:
+        scores: ``(K,)`` scores of the classes by name.
+        confusion: Counts, rows truth, columns prediction, perhaps with unknown as class 0.
+        class_names: As many names as the confusion matrix has rows.
+    """
+    first = len(class_names) - len(next(iter(scores.values())))
     return [
         {"class": class_names[k]}
-        | _plain({name: values[k - first].item() for name, values in scores.items()})
+        | plain_scores({name: values[k - first].item() for name, values in scores.items()})
         | _taken_for(confusion[k], k, class_names)
         for k in range(first, len(class_names))
     ]
@@ -117,70 +53,93 @@ def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> 
     return {"taken_for": class_names[other], "taken_for_share": float(missed[other] / row.sum())}
 
 
-def _plain(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """None for NaN, which JSON does not have."""
+def plain_scores(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace NaN, which JSON does not have, by None."""
     return {name: None if math.isnan(value) else value for name, value in scores.items()}
 
 
 def headline(record: Record) -> str:
-    """The scores over all classes in one line."""
+    """Return the scores over all images in one line."""
     means = [
-        f"{heading} {percent(record.means[name], record.intervals.get(name))}\u00a0%"
-        for name, heading in SCORES[record.kind].means.items()
-        if record.means[name] is not None
+        f"{h.text} {score_text(value, h.unit, record.intervals.get(name))}\u00a0{h.unit}".strip()
+        for name, h in record.headings.items()
+        if (value := record.means.get(name)) is not None
     ]
     absent = record.absent
     some = f", {len(record.classes) - len(absent)} of {len(record.classes)} classes"
-    told = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
+    explained = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
     over = counted(record.images, record.noun) + (some if absent else "")
-    return f"{', '.join(means)} over {over}".strip() + told
+    return f"{', '.join(means)} over {over}".strip() + explained
 
 
 def result_tables(record: Record) -> list[Table]:
-    """The scores per class, with their means, and per latitude band.
+    """Return the scores per class, with their means, or over all images; and per latitude band.
 
     Classes that neither the labels nor the predictions have are left out, if their scores are.
 
     Args:
-        record: Of an evaluation.
+        record: The evaluation.
     """
-    scores = SCORES[record.kind]
-    columns = [
-        name
-        for name in record.classes[0]
-        if name != "class" and (record.latitude_bands or not name.endswith("_solid_angle"))
-    ]
-    headings = {**_HEADINGS, **{name: f"{text} %" for name, text in scores.per_class.items()}}
-    counts = np.asarray(record.confusion, np.float64)[-len(record.classes) :]
-    predicted = counts.sum(axis=0)[-len(record.classes) :]
-    rows = [
-        [e["class"], *(_cell(e[name]) for name in columns)]
-        for e, count in zip(record.classes, predicted, strict=True)
-        if count or e["accuracy"] is not None
-    ]
-    names = map(scores.mean_of.get, columns)
-    means = (percent(record.means[n], record.intervals.get(n)) if n else "" for n in names)
-    rows.append(["mean", *means])
-    texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
-    header = ["class", *(headings[name] for name in columns)]
-    note = f"Means without classes that no label has: {', '.join(record.absent)}."
-    tables = [Table("Per class", header, rows, note if record.absent else "", text_columns=texts)]
+    headings = record.headings
+    tables = [_per_class(record) if record.classes else _over_all(record)]
     if record.latitude_bands:
+        names = [name for name in record.latitude_bands[0] if name in headings]
         rows = [
-            ["{}° … {}°".format(*b["latitude_deg"]), _cell(b["miou"]), _cell(b["macc"])]
-            for b in record.latitude_bands
+            [
+                "{}° … {}°".format(*band["latitude_deg"]),
+                *(score_text(band[name], headings[name].unit) for name in names),
+            ]
+            for band in record.latitude_bands
         ]
-        tables.append(Table("By latitude", ("latitude", "mIoU %", "mAcc %"), rows))
+        header = ["latitude", *(headings[name].column for name in names)]
+        tables.append(Table("By latitude", header, rows))
     return tables
 
 
-def _cell(value: Any) -> str:
-    return percent(value) if value is None or isinstance(value, float) else str(value)
+def _mean(record: Record, name: str) -> str:
+    unit = record.headings[name].unit
+    return score_text(record.means[name], unit, record.intervals.get(name))
+
+
+def _over_all(record: Record) -> Table:
+    rows = [[h.column, _mean(record, name)] for name, h in record.headings.items()]
+    return Table("Scores", ("score", f"over all {record.noun}"), rows)
+
+
+def _per_class(record: Record) -> Table:
+    mean_of, headings = record.class_means, dict(_OTHER_COLUMNS)
+    headings |= {name: record.headings[mean].class_column for name, mean in mean_of.items()}
+    units = {name: record.headings[mean].unit for name, mean in mean_of.items()}
+    columns = [
+        name
+        for name in record.classes[0]
+        if name != "class" and (record.latitude_bands or not name.endswith(SOLID_ANGLE))
+    ]
+    predicted = np.sum(record.confusion, axis=0)[-len(record.classes) :]
+    rows = [
+        [entry["class"], *(_cell(entry[name], units.get(name, "%")) for name in columns)]
+        for entry, count in zip(record.classes, predicted, strict=True)
+        if count or entry[record.main_of_class] is not None
+    ]
+    means = (_mean(record, mean_of[name]) if name in mean_of else "" for name in columns)
+    texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
+    note = f"Means without classes that no label has: {', '.join(record.absent)}."
+    return Table(
+        "Per class",
+        ["class", *(headings[name] for name in columns)],
+        [*rows, ["mean", *means]],
+        note if record.absent else "",
+        text_columns=texts,
+    )
+
+
+def _cell(value: Any, unit: str) -> str:
+    return score_text(value, unit) if value is None or isinstance(value, float) else str(value)
 
 
 def confusion_table(record: Record) -> Table:
-    """The confusion matrix as a heat map: percent of the true class."""
-    first = int(record.kind == "segmentation")  # without the unknown class
+    """Return the confusion matrix as a heat map: percent of the true class."""
+    first = len(record.confusion) - len(record.classes)  # without the unknown class
     counts = np.asarray(record.confusion, np.float64)[first:]
     shares = counts[:, first:] / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     rows = [
@@ -195,13 +154,13 @@ def write_results(record: Record, folder: Path, notes: Sequence[str] = ()) -> No
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
-        record: Of an evaluation.
+        record: The evaluation.
         folder: Output folder.
         notes: Paragraphs of ``.md`` below the headline.
     """
     write_text(folder / RESULTS_FILE, record.json())
     network = {"checkpoint": record.checkpoint, "class_map": record.class_map}
-    lines = [{**entry, **network} for entry in record.classes]
+    lines = [{**entry, **network} for entry in record.classes or [record.means]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in result_tables(record))
     text = "\n\n".join(["# Results", headline(record), *notes, tables])

@@ -96,8 +96,9 @@ def shown_arrays(
     truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
     rgb = image.rgb
     if truth.ndim != _PANORAMA_DIMENSIONS:
-        crops = image.sampler(representation).whole().render(image.rgb, "bilinear")
-        rgb, truth, labels = map(np.hstack, (crops, truth, labels))
+        (crops,) = image.sampler(representation).view_sets()
+        shown = crops.render(image.rgb, "bilinear")
+        rgb, truth, labels = map(np.hstack, (shown, truth, labels))
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
     part = slice(step // 2, None, step)
     return rgb[part, part], truth[part, part], labels[part, part]

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from datamodules.images.gpano import PanoramaArea
-    from tangent_train.inference.views import InputImage
+    from tangent_train.inference.images import InputImage
     from tangent_train.rendering.mosaic import ScoreMosaic
 
 
@@ -254,7 +254,8 @@ class PredictionFolder:
         with array_file(file, shape, np.float16) as array:
             for start in range(0, len(rows), _ROWS_AT_ONCE):
                 part = slice(start, start + _ROWS_AT_ONCE)
-                array[part] = scores.probabilities(rows[part])[:, columns, : shape[-1]]
+                probabilities = scores.probabilities(rows[part]).cpu().numpy()
+                array[part] = probabilities[:, columns, : shape[-1]]
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).

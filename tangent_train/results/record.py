@@ -7,71 +7,68 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.metrics.segmentation import AbsentClass, Interval
+from tangent_train.metrics.segmentation import Interval
 from tangent_train.registry import Text, check_fields
 from tangent_train.setting_rules import flat_settings
 
 RESULTS_FILE = "results.json"
 
-Kind = Literal["segmentation", "classification"]
 Band = tuple[float, ...]
 """South and north of a latitude band, in degrees."""
 
+SOLID_ANGLE = "_solid_angle"
+"""Ends the name of a score by solid angle; the same score by pixels has the name without it."""
 
-class Scores(NamedTuple):
-    """The scores of a kind of task, by name, with their headings.
+
+class Heading(NamedTuple):
+    """How reports show a score.
 
     Attributes:
-        means: Over all classes.
-        per_class: Of one class.
-        mean_of: The mean over the classes of each score of one class.
-        per_band: Of a latitude band.
-        charted: The score per class that a chart shows.
+        text: Name of the score.
+        unit: ``%`` for a share of 1, which is shown in percent; else a unit, or "".
+        of_class: Name of the score of one class that it is the mean of; "" if there is none.
+        class_text: Name of that score in reports.
     """
 
-    means: Mapping[str, str]
-    per_class: Mapping[str, str]
-    mean_of: Mapping[str, str]
-    per_band: Sequence[str]
-    charted: str
+    text: str
+    unit: str = "%"
+    of_class: str = ""
+    class_text: str = ""
+
+    @property
+    def column(self) -> str:
+        """Heading of a column with the score."""
+        return f"{self.text} {self.unit}".strip()
+
+    @property
+    def class_column(self) -> str:
+        """Heading of a column with the score of one class."""
+        return f"{self.class_text} {self.unit}".strip()
 
 
-def with_solid_angle(
-    by_pixels: Mapping[str, Any], by_angle: Mapping[str, Any] | None = None
-) -> dict[str, Any]:
-    """Scores by pixels, and those by solid angle under their names; or the headings of both."""
-    if by_angle is None:
-        by_angle = {name: f"{heading} by solid angle" for name, heading in by_pixels.items()}
-    return {**by_pixels, **{f"{name}_solid_angle": value for name, value in by_angle.items()}}
+def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
+    """Add the headings of the same scores by solid angle.
 
+    Args:
+        headings: Headings of scores by pixels.
+    """
+    return dict(headings) | {
+        name + SOLID_ANGLE: Heading(
+            f"{heading.text} by solid angle",
+            heading.unit,
+            heading.of_class and heading.of_class + SOLID_ANGLE,
+            heading.class_text and f"{heading.class_text} by solid angle",
+        )
+        for name, heading in headings.items()
+    }
 
-SCORES: Mapping[str, Scores] = {
-    "segmentation": Scores(
-        with_solid_angle({"macc": "mAcc", "miou": "mIoU"}),
-        with_solid_angle({"accuracy": "accuracy", "iou": "IoU"}),
-        with_solid_angle(
-            {"accuracy": "macc", "iou": "miou"},
-            {"accuracy": "macc_solid_angle", "iou": "miou_solid_angle"},
-        ),
-        ("macc", "miou"),
-        "iou",
-    ),
-    "classification": Scores(
-        {"accuracy": "accuracy", "class_accuracy": "mean of the classes"},
-        {"accuracy": "accuracy"},
-        {"accuracy": "class_accuracy"},
-        (),
-        "accuracy",
-    ),
-}
-"""By kind of task."""
 
 _SHOWN = {
     "data.fold": int | None,
@@ -83,53 +80,56 @@ _SHOWN = {
 """Types of the settings that reports show."""
 
 _FIELDS = {
-    "kind": Kind,
     "noun": Text,
     "images": int,
+    "headings": dict[str, dict[str, Text]],
     "classes": list,
     "latitude_bands": list,
     "confusion": list[list[int]],
-    "absent_class": AbsentClass | None,
     "intervals": dict[str, list[float]],
     "checkpoint": Text,
     "class_map": Text | None,
 }
+_HEADING: dict[str, Any] = dict.fromkeys(Heading._fields, Text)
 _EXPECTED = "results written by tangent-train or tangent-evaluate"
 
 
 @dataclass(frozen=True)
 class Record:
-    """One evaluation. Scores are shares of 1, not percent; None where they are undefined.
+    """One evaluation. Scores are numbers, shares of 1 or of another unit; None where undefined.
 
     Attributes:
-        kind: Kind of the task.
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
-        means: Scores over all classes, see `SCORES`.
-        classes: For every class its name (``class``) and scores.
-        latitude_bands: For every band ``latitude_deg`` (south, north) and scores; none for photos.
-        confusion: Integer counts, rows truth, columns prediction.
-        absent_class: Treatment of classes absent from the ground truth in the means.
+        headings: Headings of all scores, in the order of the tables.
+        means: Scores over all images, the main score first: charts and latitudes show it.
+        classes: For every class its name (``class``) and scores; empty without classes.
+        latitude_bands: For every band ``latitude_deg`` (south, north) and scores; empty for photos.
+        confusion: Integer counts, rows truth, columns prediction; empty without classes.
         intervals: 95 % bootstrap intervals over the images, of those means that have one.
         checkpoint: File of the network; that of a run itself is relative to its folder.
         class_map: What gave the network the classes of the data; None for its own classes.
         settings: The resolved config of the run, as ``section.setting``.
-        folder: Of the run.
+        folder: Folder of the run.
     """
 
-    kind: Kind
     noun: str
     images: int
+    headings: Mapping[str, Heading]
     means: Mapping[str, float | None]
-    classes: Sequence[Mapping[str, Any]]
+    classes: Sequence[Mapping[str, Any]] = ()
     latitude_bands: Sequence[Mapping[str, Any]] = ()
     confusion: Sequence[Sequence[int]] = ()
-    absent_class: str | None = None
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     checkpoint: str = ""
     class_map: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
+
+    def __post_init__(self) -> None:
+        """Refuse a score that would hide a field of the file."""
+        if clash := self.means.keys() & _FIELDS.keys():
+            raise ValueError(f"a score cannot have the name {', '.join(sorted(clash))}")
 
     @property
     def class_names(self) -> tuple[str, ...]:
@@ -137,9 +137,24 @@ class Record:
         return tuple(entry["class"] for entry in self.classes)
 
     @property
+    def main(self) -> str:
+        """Name of the main score."""
+        return next(iter(self.means))
+
+    @property
+    def main_of_class(self) -> str:
+        """Name of the main score of a class; "" without classes."""
+        return next(filter(None, (self.headings[name].of_class for name in self.means)), "")
+
+    @property
+    def class_means(self) -> dict[str, str]:
+        """Names of the scores of one class, in the order of the tables, with those of the means."""
+        return {h.of_class: name for name, h in self.headings.items() if h.of_class}
+
+    @property
     def absent(self) -> tuple[str, ...]:
-        """Classes that no label has, so that the means leave them out."""
-        return tuple(entry["class"] for entry in self.classes if entry["accuracy"] is None)
+        """Classes that do not occur in the labels, so that the means leave them out."""
+        return tuple(e["class"] for e in self.classes if e[self.main_of_class] is None)
 
     @property
     def bands(self) -> tuple[Band, ...]:
@@ -151,7 +166,7 @@ class Record:
         """The data set, and how the test images were rotated, and turned upright."""
         name = str(self.settings.get("data._target_")).rpartition(".")[2]
         rotation = self.settings.get("data.test_rotation")
-        if rotation is None or self.kind != "segmentation":
+        if rotation is None or self.settings.get("data.inputs") is None:  # shapes
             return name
         upright = self.settings.get("data.upright")
         aligned = "" if upright is None else f", upright: {upright}"
@@ -171,11 +186,11 @@ class Record:
         """A score over all classes, of a class, or of a latitude band.
 
         Args:
-            name: See `SCORES`.
+            name: Name of the score.
             part: Name of a class, or a band.
 
         Returns:
-            A share of 1; None where it is undefined, or there is no such part.
+            None where it is undefined, or there is no such part.
         """
         parts: dict[Any, Mapping[str, Any]] = {None: self.means}
         parts |= zip(self.class_names, self.classes, strict=True)
@@ -184,7 +199,8 @@ class Record:
 
     def json(self) -> str:
         """The content of ``results.json``."""
-        content = {f.name: getattr(self, f.name) for f in fields(self) if f.name in _FIELDS}
+        content = {name: getattr(self, name) for name in _FIELDS}
+        content["headings"] = {name: h._asdict() for name, h in self.headings.items()}
         return json.dumps({**self.means, **content}, indent=1) + "\n"
 
 
@@ -200,20 +216,22 @@ def load_record(folder: Path) -> Record:
     path = folder / RESULTS_FILE
     content = read_json(path, _EXPECTED)
     found = check_fields(path, content, _FIELDS, _EXPECTED)
-    scores = SCORES[found["kind"]]
-    kinds_of: dict[str, dict[str, Any]] = {
-        "classes": {"class": Text, **dict.fromkeys(scores.per_class, float | None)},
-        "latitude_bands": {
-            "latitude_deg": list[float],
-            **dict.fromkeys(scores.per_band, float | None),
-        },
+    found["headings"] = headings = {
+        name: Heading(**check_fields(path, entry, _HEADING, _EXPECTED, f"headings.{name}"))
+        for name, entry in found["headings"].items()
     }
-    for part, kinds in kinds_of.items():
+    of_class = (heading.of_class for heading in headings.values())
+    parts: dict[str, dict[str, Any]] = {
+        "classes": {**dict.fromkeys(of_class, float | None), "class": Text},
+        "latitude_bands": {**dict.fromkeys(headings, float | None), "latitude_deg": list[float]},
+    }
+    for part, kinds in parts.items():
         for entry in found[part]:
             check_fields(path, entry, kinds, _EXPECTED, part)
-    found["means"] = check_fields(
-        path, content, dict.fromkeys(scores.means, float | None), _EXPECTED
-    )
+    kinds = {name: float | None for name in content if name in headings}  # the main one first
+    found["means"] = check_fields(path, content, kinds, _EXPECTED)
+    if not kinds:
+        raise DataError(path, found="no score with a heading", expected=_EXPECTED)
     path = folder / "config.yaml"
     settings = dict(flat_settings(read_settings(path)))
     check_fields(path, settings, _SHOWN, "the settings of a run")

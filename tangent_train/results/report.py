@@ -5,23 +5,22 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.results.chart import grid_png, report_png
-from tangent_train.results.record import SCORES, Band
-from tangent_train.results.rows import Row, Statistic
-from tangent_train.results.tables import Table, percent
+from tangent_train.results.record import SOLID_ANGLE, Band, Heading
+from tangent_train.results.rows import Row
+from tangent_train.results.tables import Table, score_text
 
 Cell = tuple[str, str]
 """View and condition: row and column of the first table."""
 
-_OF_CELLS = "miou_solid_angle"
-
 _LEGEND = (
-    "Percent. Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
+    "Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
     "in brackets that over seeds within a fold."
 )
 _LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its images."
@@ -29,7 +28,7 @@ _LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its 
 
 @dataclass(frozen=True)
 class Report:
-    """Rows of scores, all of one kind and over the same classes.
+    """Rows of the same scores over the same classes.
 
     Attributes:
         title: Of the report.
@@ -68,42 +67,51 @@ class Report:
         return self.rows[0].records[0].class_names
 
     @property
-    def kind(self) -> str:
-        """Kind of the tasks."""
-        return self.rows[0].records[0].kind
+    def headings(self) -> Mapping[str, Heading]:
+        """Headings of the scores."""
+        return self.rows[0].records[0].headings
+
+    @property
+    def main(self) -> str:
+        """Name of the main score."""
+        return self.rows[0].records[0].main
+
+    @property
+    def cell_score(self) -> str:
+        """Name of the score in the cells: the main one, by solid angle if there is one."""
+        by_angle = self.main + SOLID_ANGLE
+        return by_angle if by_angle in self.headings else self.main
 
     def tables(self) -> list[Table]:
         """Views in conditions, all classes, every class, and latitude bands."""
         banded = [row for row in self.rows if row.bands]
         tables = [*self._views(), self._overall(), *self._per_class()]
         if banded:
-            bands = banded[0].bands
-            rows = [
-                (row.label, *(percent(row.score("miou", band).mean) for band in bands))
-                for row in banded
-            ]
+            bands, heading = banded[0].bands, self.headings[self.main]
+            means = ((row, (row.score(self.main, band).mean for band in bands)) for row in banded)
+            rows = [(row.label, *(score_text(m, heading.unit) for m in of)) for row, of in means]
             header = ("", *(f"{south:g}° … {north:g}°" for south, north in bands))
-            tables.append(Table("mIoU % by latitude", header, rows))
+            tables.append(Table(f"{heading.column} by latitude", header, rows))
         return tables
 
     def _views(self) -> Iterator[Table]:
         grid = self.grid
         if not grid:
             return
-        conditions = next(iter(grid.values()))
+        conditions, name = next(iter(grid.values())), self.cell_score
         rows = [
-            (view, *(_cell(row.score(_OF_CELLS), 0) for row in found.values()))
+            (view, *(self._cell(row, name, 0) for row in found.values()))
             for view, found in grid.items()
         ]
-        note = f"{_LEGEND} {_LEGEND_OF_INTERVALS}"
-        yield Table(f"{self._title_of_cells} %", ("", *conditions), rows, note)
+        title = f"{self.title}: {self.headings[name].column}"
+        yield Table(title, ("", *conditions), rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
 
     @property
-    def _title_of_cells(self) -> str:
-        return f"{self.title}: {SCORES[self.kind].means[_OF_CELLS]}"
+    def _legend(self) -> str:
+        return "Percent. " * all(h.unit == "%" for h in self.headings.values()) + _LEGEND
 
     def _overall(self) -> Table:
-        scores = SCORES[self.kind].means
+        scores = self.headings
         names = dict.fromkeys(name for row in self.rows for name in row.facts)
         facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
         alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]
@@ -111,27 +119,40 @@ class Report:
         columns += [(name, cells) for name, cells in facts.items() if len(set(cells)) > 1]
         texts = range(len(columns))
         for name, heading in scores.items():
-            cells = [_cell(row.score(name), len(row.folds)) for row in self.rows]
-            columns.append((f"{heading} %", cells))
-            if self.compared and not name.endswith("_solid_angle"):
+            cells = [self._cell(row, name, len(row.folds)) for row in self.rows]
+            columns.append((heading.column, cells))
+            if self.compared and not name.endswith(SOLID_ANGLE):
                 columns.append(("change", [_change(row.kept(name).mean) for row in self.rows]))
         header, cells_of = zip(*columns, strict=True)
         common = f"{'; '.join(alike)}." if alike else ""
         shown = any(row.score(name).interval for row in self.rows for name in scores)
-        told = _LEGEND_OF_INTERVALS if shown else ""
-        note = " ".join(filter(None, (common, _LEGEND, told, self.compared)))
+        explained = _LEGEND_OF_INTERVALS if shown else ""
+        note = " ".join(filter(None, (common, self._legend, explained, self.compared)))
         return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
 
     def _per_class(self) -> Iterator[Table]:
-        for name, heading in SCORES[self.kind].per_class.items():
+        for name, mean in self.rows[0].records[0].class_means.items():
             rows = [
-                (row.label, *(_cell(row.score(name, c), len(row.folds)) for c in self.classes))
+                (row.label, *(self._cell(row, name, len(row.folds), c) for c in self.classes))
                 for row in self.rows
-                if not name.endswith("_solid_angle")
+                if not name.endswith(SOLID_ANGLE)
                 and any(row.score(name, c).mean is not None for c in self.classes)
             ]
             if rows:
-                yield Table(f"{heading[0].upper()}{heading[1:]} %", ("", *self.classes), rows)
+                title = self.headings[mean].class_column
+                yield Table(f"{title[:1].upper()}{title[1:]}", ("", *self.classes), rows)
+
+    def _cell(self, row: Row, name: str, folds: int, part: str | None = None) -> str:
+        """A score with its spreads; "of 2" where it is over fewer folds than the row."""
+        found = row.score(name, part)
+        if found.mean is None:
+            return "–"
+        mean = name if part is None else self.rows[0].records[0].class_means[name]
+        text = partial(score_text, unit=self.headings[mean].unit)
+        over_folds = "" if found.over_folds is None else f" ± {text(found.over_folds)}"
+        over_seeds = "" if found.over_seeds is None else f" (± {text(found.over_seeds)})"
+        lacking = f" of {found.folds}" if found.folds < folds else ""
+        return text(found.mean, interval=found.interval) + over_folds + over_seeds + lacking
 
     def all_notes(self) -> list[str]:
         """Notes needed to read the scores correctly."""
@@ -159,22 +180,22 @@ class Report:
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
         write_text(folder / f"{name}.csv", csv_text(columns, figures))
         if self.grid:
-            png = grid_png(self._title_of_cells, self.grid, _OF_CELLS)
+            png = grid_png(self.title, self.grid, self.headings[self.cell_score], self.cell_score)
         else:
             png = report_png(self.title, self.rows)
         write_bytes(folder / f"{name}.png", png)
 
     def figures(self) -> Iterator[dict[str, Any]]:
         """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""
-        scores = SCORES[self.kind]
+        like = self.rows[0].records[0]
         for row in self.rows:
             scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
             for fold, part in [*scopes, ("mean", row)]:
                 facts = {"row": row.label, **row.facts, "fold": fold}
                 entries: list[tuple[str, str | Band | None, str]]
-                entries = [("mean", None, name) for name in scores.means]
-                entries += [(c, c, name) for c in self.classes for name in scores.per_class]
-                entries += [("mean", band, name) for band in row.bands for name in scores.per_band]
+                entries = [("mean", None, name) for name in like.headings]
+                entries += [(c, c, name) for c in self.classes for name in like.class_means]
+                entries += [("mean", band, name) for band in row.bands for name in row.band_scores]
                 for class_name, where, name in entries:
                     south, north = where if isinstance(where, tuple) else (None, None)
                     yield {
@@ -198,16 +219,6 @@ class Report:
         ]
         table = Table("Runs", ("", "fold", "seed", "run"), runs, text_columns=(0, 3))
         return "\n".join([f"# {first[3:]}", notes, *others, table.markdown()])
-
-
-def _cell(found: Statistic, folds: int) -> str:
-    """A score with its spreads; "of 2" where it is over fewer folds than the row."""
-    if found.mean is None:
-        return "–"
-    over_folds = "" if found.over_folds is None else f" ± {percent(found.over_folds)}"
-    over_seeds = "" if found.over_seeds is None else f" (± {percent(found.over_seeds)})"
-    lacking = f" of {found.folds}" if found.folds < folds else ""
-    return percent(found.mean, found.interval) + over_folds + over_seeds + lacking
 
 
 def _change(kept: float | None) -> str:

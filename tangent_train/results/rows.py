@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 from tangent_train.errors import DataError
 from tangent_train.metrics.segmentation import Interval
-from tangent_train.results.record import RESULTS_FILE, Band, Record
+from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Band, Record
 from tangent_train.setting_rules import may_differ
 
 
@@ -76,6 +76,13 @@ class Row:
         """Its latitude bands."""
         return tuple(dict.fromkeys(band for record in self.records for band in record.bands))
 
+    @property
+    def band_scores(self) -> tuple[str, ...]:
+        """Names of the scores of its latitude bands, in the order of the tables."""
+        record = self.records[0]
+        bands = record.latitude_bands
+        return tuple(name for name in record.headings if bands and name in bands[0])
+
     def of_fold(self, fold: int | None) -> Row:
         """Its part of a fold, with its partner's."""
         records = tuple(record for record in self.records if record.fold == fold)
@@ -111,7 +118,7 @@ class Row:
         """
         if self.partner is None:
             return average([])
-        by_pixels = name.removesuffix("_solid_angle")
+        by_pixels = name.removesuffix(SOLID_ANGLE)
         base = dict(self.partner._values(name, part) or self.partner._values(by_pixels, part))
         pairs = [(key[0], own, base[key]) for key, own in self._values(name, part) if key in base]
         before = average((fold, base) for fold, _, base in pairs).mean
@@ -153,21 +160,25 @@ def average(values: Iterable[tuple[int | None, float]]) -> Statistic:
 
 
 def check_alike(records: Sequence[Record]) -> None:
-    """Check that evaluations are of one kind and have the same classes.
+    """Check that evaluations have the same scores and the same classes.
 
     Raises:
         DataError: They are not.
     """
     first = records[0]
     for record in records:
-        if (record.kind, record.class_names) != (first.kind, first.class_names):
+        if (record.headings, record.class_names) != (first.headings, first.class_names):
             raise DataError(
                 record.folder / RESULTS_FILE,
-                found=f"{record.kind}, classes {', '.join(record.class_names)}",
-                expected=f"{first.kind}, classes {', '.join(first.class_names)}, as in "
-                f"{first.folder / RESULTS_FILE}",
+                found=_contents(record),
+                expected=f"{_contents(first)}, as in {first.folder / RESULTS_FILE}",
                 remedy="Report them separately.",
             )
+
+
+def _contents(record: Record) -> str:
+    classes = f", classes {', '.join(record.class_names)}" * bool(record.classes)
+    return f"scores {', '.join(record.headings)}{classes}"
 
 
 def group_runs(records: Sequence[Record]) -> list[Row]:

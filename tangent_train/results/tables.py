@@ -122,5 +122,16 @@ def percent(share: float | None, interval: tuple[float, float] | None = None) ->
     >>> percent(0.4562), percent(None), percent(0.4562, (0.42, 0.5))
     ('45.6', '–', '45.6 [42.0, 50.0]')
     """
-    ends = "" if interval is None else f" [{percent(interval[0])}, {percent(interval[1])}]"
-    return ("–" if share is None else f"{100 * share:.1f}") + ends
+    return score_text(share, "%", interval)
+
+
+def score_text(value: float | None, unit: str, interval: tuple[float, float] | None = None) -> str:
+    """Return a score without its unit; a dash where it is undefined.
+
+    >>> score_text(0.4562, "%"), score_text(0.45623, "m", (0.42, 0.5)), score_text(None, "m")
+    ('45.6', '0.456 [0.42, 0.5]', '–')
+    """
+    if value is None:
+        return "–"
+    ends = "" if interval is None else " [{}, {}]".format(*(score_text(v, unit) for v in interval))
+    return (f"{100 * value:.1f}" if unit == "%" else f"{value:.3g}") + ends

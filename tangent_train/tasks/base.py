@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -14,16 +13,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim import Optimizer
-from torch.optim.lr_scheduler import LRScheduler
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
+from tangent_train.results.evaluation import plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
-from tangent_train.results.record import Record
+from tangent_train.results.record import Heading, Record
 from tangent_train.tasks.divergence import check_weights, refuse_loss
-from tangent_train.tasks.fine_tuning import freeze, groups_of, rates_of
-from tangent_train.tasks.schedules import ends_at
+from tangent_train.tasks.parameter_groups import freeze, groups_of
+from tangent_train.tasks.schedules import Schedule
 
 Part = tuple[tuple[Tensor, ...], Tensor]
 """Inputs of the network and their labels."""
@@ -43,9 +43,8 @@ class Task(lightning.LightningModule, ABC):
         representation: Representation of its images.
         class_names: Names of the classes.
         optimizer: Makes the optimizer from parameters.
-        scheduler: Makes a learning rate scheduler from the optimizer, or None. One that takes
-            `total_steps` gets the length of the training and is stepped every step, others every
-            epoch.
+        scheduler: A `Schedule`, or builds a learning rate scheduler from the optimizer, which is
+            stepped every epoch; None for a constant rate.
         label_smoothing: Fraction of the target that is spread over all classes.
         images_per_chunk: Most images per forward pass in training, which bounds memory; None for
             the whole batch. Batch normalization sees one chunk at a time; chunks are even.
@@ -53,7 +52,7 @@ class Task(lightning.LightningModule, ABC):
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
         frozen: Names of modules and parameters of the network that are not trained; such modules
             stay in evaluation mode.
-        backbone_lr_factor: Of the learning rate of the parameters that are not `fresh`.
+        backbone_lr_factor: Factor of the learning rate of parameters that are not `fresh`.
 
     Attributes:
         labels: Labels that a data set must have, see `datamodules.core.labels`.
@@ -62,6 +61,7 @@ class Task(lightning.LightningModule, ABC):
         monitor: The score on the validation split that selects the best epoch.
         monitor_mode: ``max`` or ``min``: the better value of that score.
         takes: Input and output of a network for this task, for messages.
+        headings: Headings of the scores over a split, in the order of the tables.
         metric: The metric of a split, see `build_metric`.
         result: What `metric` computed in the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
@@ -77,6 +77,7 @@ class Task(lightning.LightningModule, ABC):
     monitor: ClassVar[str]
     monitor_mode: ClassVar[Literal["max", "min"]] = "max"
     takes: ClassVar[str]
+    headings: ClassVar[Mapping[str, Heading]]
     result: Any
     evaluated: int
 
@@ -86,7 +87,7 @@ class Task(lightning.LightningModule, ABC):
         representation: Any,
         class_names: Sequence[str],
         optimizer: Callable[..., Optimizer],
-        scheduler: Callable[..., LRScheduler] | None = None,
+        scheduler: Schedule | Callable[..., LRScheduler] | None = None,
         label_smoothing: float = 0.0,
         images_per_chunk: int | None = None,
         channels_last: bool = False,
@@ -101,7 +102,7 @@ class Task(lightning.LightningModule, ABC):
             raise SettingError("task.images_per_chunk", found=images_per_chunk, expected="from 1")
         if not (isinstance(backbone_lr_factor, int | float) and 0 < backbone_lr_factor < math.inf):
             raise SettingError(
-                "optimizer.backbone_lr_factor",
+                "task.backbone_lr_factor",
                 found=backbone_lr_factor,
                 expected="a number greater than 0",
                 remedy="What is not to be trained at all: task.frozen=[…].",
@@ -113,7 +114,8 @@ class Task(lightning.LightningModule, ABC):
         self.representation = representation
         self.class_names = tuple(class_names)
         self.make_optimizer = optimizer
-        self.make_scheduler = scheduler
+        is_complete = scheduler is None or isinstance(scheduler, Schedule)
+        self.schedule: Any = scheduler if is_complete else Schedule(scheduler)  # type: ignore[arg-type]
         self.label_smoothing = label_smoothing
         self.images_per_chunk = images_per_chunk
         self.backbone_lr_factor = backbone_lr_factor
@@ -125,6 +127,15 @@ class Task(lightning.LightningModule, ABC):
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
         self._trained_length: Mapping[str, int] | None = None
+
+    @staticmethod
+    def num_outputs(num_classes: int) -> int:
+        """Outputs of a network whose ``num_classes`` is null; by default one for each class.
+
+        Args:
+            num_classes: Classes of the data.
+        """
+        return num_classes
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
@@ -152,7 +163,9 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def logged_scores(self, result: Any) -> dict[str, float]:
-        """Scores over the whole split by name, such as ``miou``; logged as ``val/miou``.
+        """Scores over the whole split by name, the main one first.
+
+        A score ``miou`` is logged as ``val/miou`` and ``test/miou``.
 
         Args:
             result: A result of `metric`.
@@ -166,14 +179,16 @@ class Task(lightning.LightningModule, ABC):
         """
         return {}
 
-    @abstractmethod
     def record(self, result: Any, noun: str) -> Record:
-        """The record of an evaluation.
+        """The record of the last evaluation, with the `logged_scores` under their `headings`.
 
         Args:
             result: A result of `metric`.
             noun: Plural name of the images: panoramas, photos, shapes.
         """
+        scores = plain_scores(self.logged_scores(result))
+        means = scores | {name: None for name in self.headings if name not in scores}
+        return Record(noun, self.evaluated, self.headings, means)
 
     def targets(self, batch: Any) -> Tensor:
         """The true labels of an evaluated batch, as many as there are predictions."""
@@ -244,18 +259,15 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: The length has changed.
         """
-        then, now, scheduler = self._trained_length, self._length(), self.make_scheduler
-        if then is None or scheduler is None:
+        then, now, schedule = self._trained_length, self._length(), self.schedule
+        if then is None or schedule is None or then[schedule.interval] == now[schedule.interval]:
             return
-        by_step = self._is_stepped_every_step
-        unit = "steps" if by_step else "epochs"
-        if then[unit] != now[unit] and (
-            by_step or ends_at(then[unit], self.make_optimizer, scheduler)
-        ):
-            others = ", trainer.devices and data.…_per_step" * by_step
+        unit = schedule.interval
+        if schedule.has_length_of_training or schedule.ends_at(then[unit], self.make_optimizer):
+            others = ", trainer.devices and data.…_per_step" * (unit == "step")
             raise SettingError(
                 f"trainer.max_epochs, trainer.max_steps{others}",
-                found=f"{now[unit]} training {unit}",
+                found=f"{now[unit]} training {unit}s",
                 expected=f"{then[unit]}, which the schedule of the resumed run was made for",
                 remedy="Resume with the same. To train for longer, start a new run with a schedule "
                 "of its own from the weights: init_from=<run>/checkpoints/last.ckpt",
@@ -336,7 +348,7 @@ class Task(lightning.LightningModule, ABC):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Take `fresh`, before the optimizer is made, and the length of the training."""
         length = checkpoint["length"]
-        self._trained_length = {unit: int(length[unit]) for unit in ("steps", "epochs")}
+        self._trained_length = {unit: int(length[unit]) for unit in ("step", "epoch")}
         fresh = checkpoint.get("fresh")
         self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
@@ -355,20 +367,48 @@ class Task(lightning.LightningModule, ABC):
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
         self._counted.reset()
+        # Every process has the same numbers: the mean over processes changes nothing.
         for name, score in self.logged_scores(self.result).items():
             key = f"{stage}/{name}"
-            # Every process has the same number: the mean over processes changes nothing.
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
+        for name, score in self.class_scores(self.result).items():
+            if not math.isnan(score):
+                self.log(f"{stage}_{name}", score, sync_dist=True)
 
     test_step = validation_step
     on_test_epoch_end = on_validation_epoch_end
 
+    def on_train_epoch_end(self) -> None:
+        """Step `ReduceLROnPlateau` before the checkpoint of the epoch, in which Lightning's is not.
+
+        Raises:
+            SettingError: The monitored value is not logged.
+        """
+        for config in self.trainer.lr_scheduler_configs:
+            is_due = (self.current_epoch + 1) % config.frequency == 0
+            if not (is_due and isinstance(config.scheduler, ReduceLROnPlateau)):
+                continue
+            logged = self.trainer.callback_metrics
+            if config.monitor not in logged:
+                raise SettingError(
+                    "scheduler.monitor",
+                    found=f"{config.monitor} after epoch {self.current_epoch + 1}",
+                    expected=f"one of {', '.join(logged)}",
+                    remedy="Of scores: scheduler.frequency=${trainer.check_val_every_n_epoch}",
+                )
+            config.scheduler.step(logged[str(config.monitor)])
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """Step other schedulers as Lightning does."""
+        if not isinstance(scheduler, ReduceLROnPlateau):
+            super().lr_scheduler_step(scheduler, metric)
+
     def configure_optimizers(self) -> Any:
         """Optimizer, and scheduler if there is one."""
-        return self.optimization(lambda: int(self.trainer.estimated_stepping_batches))
+        return self.optimization(self._length)
 
-    def optimization(self, count_steps: Callable[[], int]) -> Any:
-        """Optimizer and scheduler for any number of steps, asked for only if it is needed."""
+    def optimization(self, length: Callable[[], Mapping[str, int]]) -> Any:
+        """Optimizer and scheduler for any length of the training, see `Schedule.configure`."""
         factor = self.backbone_lr_factor
         trained = {n: p for n, p in self.network.named_parameters() if p.requires_grad}
         if factor == 1:
@@ -379,23 +419,11 @@ class Task(lightning.LightningModule, ABC):
         factors = [factor if group.get("name") == "backbone" else 1 for group in groups]
         for group, of_group in zip(optimizer.param_groups, factors, strict=True):
             group["lr"] *= of_group
-        if self.make_scheduler is None:
+        if self.schedule is None:
             return optimizer
-        by_step = self._is_stepped_every_step
-        settings: dict[str, Any] = {"total_steps": count_steps()} if by_step else {}
-        if factor != 1:
-            settings |= rates_of(self.make_scheduler, factors)
-        scheduler = {
-            "scheduler": self.make_scheduler(optimizer, **settings),
-            "interval": "step" if by_step else "epoch",
-        }
-        return {"optimizer": optimizer, "lr_scheduler": scheduler}
-
-    @property
-    def _is_stepped_every_step(self) -> bool:
-        """True if the scheduler gets the number of steps; others are stepped every epoch."""
-        scheduler = self.make_scheduler
-        return scheduler is not None and "total_steps" in inspect.signature(scheduler).parameters
+        monitor = self.monitor, self.monitor_mode
+        configured = self.schedule.configure(optimizer, length, factors, monitor)
+        return {"optimizer": optimizer, "lr_scheduler": configured}
 
     def _length(self) -> dict[str, int]:
         """Planned steps and epochs of the training; −1 without an end."""
@@ -404,8 +432,8 @@ class Task(lightning.LightningModule, ABC):
         each = trainer.num_training_batches / trainer.accumulate_grad_batches
         each = math.ceil(each) if math.isfinite(each) else each  # of data without an end
         if not math.isfinite(steps):
-            return {"steps": -1, "epochs": -1}
-        return {"steps": int(steps), "epochs": math.ceil(steps / max(each, 1))}
+            return {"step": -1, "epoch": -1}
+        return {"step": int(steps), "epoch": math.ceil(steps / max(each, 1))}
 
     def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
         """The network's scores.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import torch
@@ -10,10 +12,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from datamodules.core.labels import IMAGE_CLASS
-from tangent_train.metrics.classification import ClassCounts, classification_scores
+from tangent_train.metrics.classification import ClassificationMetric, classification_scores
 from tangent_train.registry import registered
-from tangent_train.results.evaluation import classification_record
-from tangent_train.results.record import Record
+from tangent_train.results.evaluation import class_entries
+from tangent_train.results.record import Heading, Record
 from tangent_train.tasks.base import Task
 
 
@@ -31,6 +33,10 @@ class ClassificationTask(Task):
 
     labels: ClassVar[str] = IMAGE_CLASS
     predicts: ClassVar[str] = IMAGE_CLASS
+    headings: ClassVar[Mapping[str, Heading]] = {
+        "accuracy": Heading("accuracy"),
+        "class_accuracy": Heading("mean of the classes", "%", "accuracy", "accuracy"),
+    }
     monitor: ClassVar[str] = "val/accuracy"
     takes: ClassVar[str] = "views of shapes (B, N, C, h, w) to scores of classes (B, K)"
 
@@ -77,9 +83,9 @@ class ClassificationTask(Task):
         labels: Tensor = batch.label
         return labels
 
-    def build_metric(self) -> ClassCounts:
+    def build_metric(self) -> ClassificationMetric:
         """The confusion matrix of whole shapes."""
-        return ClassCounts(len(self.class_names))
+        return ClassificationMetric(len(self.class_names))
 
     def logged_scores(self, result: Any) -> dict[str, float]:
         """Accuracy over shapes, and its mean over classes."""
@@ -92,5 +98,11 @@ class ClassificationTask(Task):
         return {f"accuracy/{n}": s for n, s in zip(self.class_names, scores, strict=True)}
 
     def record(self, result: Any, noun: str) -> Record:
-        """The record with the scores of every class and the confusion matrix."""
-        return classification_record(result, self.class_names, noun)
+        """The record, with the accuracy of every class and the confusion matrix."""
+        scores = classification_scores(result)
+        of_class = {"images": scores.counts, "accuracy": scores.of_class}
+        return replace(
+            super().record(result, noun),
+            classes=class_entries(of_class, result, self.class_names),
+            confusion=result.tolist(),
+        )

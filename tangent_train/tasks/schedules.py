@@ -1,36 +1,159 @@
-"""Learning rate schedules: which of them were made for one length of training."""
+"""Learning rate schedules: their steps, and which of them are made for one length of training."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import torch
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import (
+    CosineAnnealingLR,
+    LinearLR,
+    ReduceLROnPlateau,
+    SequentialLR,
+)
+
+from tangent_train.errors import SettingError, at_least
+from tangent_train.registry import registered
+from tangent_train.tasks.parameter_groups import rates_of
 
 
-def ends_at(epochs: int, make_optimizer: Callable[..., Any], make_scheduler: Any) -> bool:
-    """Return True if a schedule was made for a number of epochs, whatever its settings are called.
+@dataclass(frozen=True)
+class Schedule:
+    """A learning rate scheduler and Lightning's settings for it.
 
-    Its learning rate then changes in every epoch up to the last one or the one after it, and from
-    there on it stays, or turns back.
+    Attributes:
+        build: Builds the scheduler from the optimizer. Arguments that a `functools.partial` sets
+            to None are taken from the run: `total_steps` and, of `ReduceLROnPlateau`, `mode`.
+        interval: Unit after which it is stepped: ``epoch`` or ``step``.
+        frequency: Number of epochs or steps between its steps.
+        monitor: Logged value for `ReduceLROnPlateau`; None for the score of the best epoch.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    build: Callable[..., Any]
+    interval: Literal["epoch", "step"] = "epoch"
+    frequency: int = 1
+    monitor: str | None = None
+
+    def __post_init__(self) -> None:
+        at_least("scheduler.frequency", self.frequency, 1)
+        if self.interval not in ("epoch", "step"):
+            expected = "epoch or step"
+            raise SettingError("scheduler.interval", found=self.interval, expected=expected)
+
+    @property
+    def has_length_of_training(self) -> bool:
+        """True if `total_steps` is taken from the run."""
+        return self._is_null("total_steps")
+
+    def configure(
+        self,
+        optimizer: Optimizer,
+        length: Callable[[], Mapping[str, int]],
+        factors: Sequence[float],
+        monitor: tuple[str, str],
+    ) -> dict[str, Any]:
+        """Build the scheduler, in Lightning's form.
+
+        Args:
+            optimizer: The optimizer.
+            length: Returns the number of epochs and steps of the training.
+            factors: Factors of the learning rates of the optimizer's groups.
+            monitor: Score of the best epoch, and ``max`` or ``min``.
+
+        Raises:
+            SettingError: The training has no end, or `ReduceLROnPlateau` is stepped every step.
+        """
+        filled: dict[str, Any] = {}
+        if set(factors) != {1}:
+            filled |= rates_of(self.build, factors)
+        if self.has_length_of_training:
+            filled["total_steps"] = length()[self.interval] // self.frequency
+            if filled["total_steps"] < 1:
+                remedy = "Or give scheduler.total_steps."
+                raise SettingError(
+                    "trainer.max_epochs", found="no end", expected="a number", remedy=remedy
+                )
+        monitored = self.monitor or monitor[0]
+        if self._is_null("mode"):
+            filled["mode"] = "min" if monitored.endswith("loss") else monitor[1]
+        scheduler = self.build(optimizer, **filled)
+        if isinstance(scheduler, ReduceLROnPlateau) and self.interval == "step":
+            expected = "epoch for ReduceLROnPlateau: a resumed run has no value of the last step"
+            raise SettingError("scheduler.interval", found="step", expected=expected)
+        return {
+            "scheduler": scheduler,
+            "interval": self.interval,
+            "frequency": self.frequency,
+            "monitor": monitored,
+            # The task steps it, see `Task.on_train_epoch_end`.
+            "reduce_on_plateau": False,
+        }
+
+    def ends_at(self, length: int, make_optimizer: Callable[..., Any]) -> bool:
+        """Return True if the schedule was made for a length, whatever its settings are called.
+
+        Its learning rate then changes in every epoch up to the last one or the one after it, and
+        from there on it stays, or turns back.
+
+        Args:
+            length: Number of epochs (or steps); negative for a training without an end.
+            make_optimizer: Builds the optimizer from parameters.
+        """
+        optimizer = make_optimizer([{"params": [torch.zeros(1, requires_grad=True)]}])
+        scheduler = self.build(optimizer)
+        if isinstance(scheduler, ReduceLROnPlateau):
+            return False
+        count = length // self.frequency
+        rates = [optimizer.param_groups[0]["lr"]]
+        for _ in range(2 * count + 1):
+            optimizer.step(lambda: 0.0)  # some optimizers need a closure
+            scheduler.step()
+            rates.append(optimizer.param_groups[0]["lr"])
+        changes = [after - before for before, after in itertools.pairwise(rates)]
+        return any(
+            all(changes[max(end - 2, 0) : end])
+            and (not any(changes[end:]) or changes[end - 1] * changes[end] < 0)
+            for end in (count - 1, count)
+            if end > 0
+        )
+
+    def _is_null(self, name: str) -> bool:
+        return getattr(self.build, "keywords", {}).get(name, "") is None
+
+
+@registered
+def warmup_cosine(
+    optimizer: Any,
+    total_steps: int,
+    warmup_share: float = 0.1,
+    start_factor: float = 0.01,
+    eta_min: float = 0.0,
+) -> SequentialLR:
+    """Build a schedule that rises linearly and then falls along half a cosine.
 
     Args:
-        epochs: Number of epochs; negative for a training without an end.
-        make_optimizer: Makes the optimizer from parameters.
-        make_scheduler: Makes the scheduler, stepped every epoch, from the optimizer.
+        optimizer: The optimizer.
+        total_steps: Number of its steps.
+        warmup_share: Share of these steps in which the rate rises.
+        start_factor: Factor of the learning rate at the start.
+        eta_min: Learning rate at the end.
+
+    Raises:
+        SettingError: The share is not below 1.
     """
-    optimizer = make_optimizer([{"params": [torch.zeros(1, requires_grad=True)]}])
-    scheduler = make_scheduler(optimizer)
-    rates = [optimizer.param_groups[0]["lr"]]
-    for _ in range(2 * epochs + 1):
-        optimizer.step(lambda: 0.0)  # some optimizers need a closure
-        scheduler.step()
-        rates.append(optimizer.param_groups[0]["lr"])
-    changes = [after - before for before, after in itertools.pairwise(rates)]
-    return any(
-        all(changes[max(end - 2, 0) : end])
-        and (not any(changes[end:]) or changes[end - 1] * changes[end] < 0)
-        for end in (epochs - 1, epochs)
-        if end > 0
-    )
+    if not 0 <= warmup_share < 1:
+        expected = "from 0, less than 1"
+        raise SettingError("scheduler.warmup_share", found=warmup_share, expected=expected)
+    warmup = max(1, round(warmup_share * total_steps))
+    parts = [
+        LinearLR(optimizer, start_factor=start_factor, total_iters=warmup),
+        CosineAnnealingLR(optimizer, max(1, total_steps - warmup), eta_min=eta_min),
+    ]
+    return SequentialLR(optimizer, parts, milestones=[warmup])

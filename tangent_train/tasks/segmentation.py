@@ -3,30 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float, Integer
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError
-from tangent_train.inference.predictor import sees_rays, view_scores
+from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
 from tangent_train.metrics.segmentation import (
+    BAND_EDGES_DEG,
     AbsentClass,
-    ConfusionMatrices,
-    ConfusionMatrix,
+    SegmentationCounts,
+    SegmentationMetric,
+    bootstrap_intervals,
     segmentation_scores,
 )
 from tangent_train.registry import registered
-from tangent_train.rendering import Assembler, EquirectRepresentation
+from tangent_train.rendering import EquirectRepresentation
+from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import Representation
-from tangent_train.results.evaluation import segmentation_record
+from tangent_train.results.evaluation import class_entries, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
-from tangent_train.results.record import Record
+from tangent_train.results.record import SOLID_ANGLE, Heading, Record, with_solid_angle
 from tangent_train.results.tables import percent
 from tangent_train.tasks.base import RGB, Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
@@ -46,7 +51,7 @@ class SegmentationTask(Task):
             and optionally auxiliary scores under ``"aux"``; score k is that of label k + 1. One
             whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing rays of
             its images and bounds its memory itself (`models.SphereContext`).
-        representation: Representation of the images; it assembles the scores.
+        representation: Representation of the images.
         class_names: K + 1 names of the labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
@@ -58,15 +63,20 @@ class SegmentationTask(Task):
     """
 
     predicts: ClassVar[str] = PIXEL_CLASSES
+    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+        {
+            "macc": Heading("mAcc", "%", "accuracy", "accuracy"),
+            "miou": Heading("mIoU", "%", "iou", "IoU"),
+        }
+    )
     monitor: ClassVar[str] = "val/miou"
     takes: ClassVar[str] = "images (n, C, h, w) to scores of every pixel (n, K, h, w)"
     class_weights: Tensor
-    representation: Assembler
 
     def __init__(
         self,
         network: nn.Module,
-        representation: Assembler,
+        representation: Any,
         class_names: Sequence[str],
         *arguments: Any,
         class_weights: ClassWeights | Sequence[float] = "log",
@@ -140,11 +150,15 @@ class SegmentationTask(Task):
             at_once = self.images_per_chunk if self.training else self.images_per_forward
             returned = self.network(images, rays, at_once)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        # More than there are classes where an imported network also knows nothing, see `Groups`.
-        count = getattr(self.network, "num_scores", len(self.class_weights))
-        expected = (len(images), count, *images.shape[-2:])
+        expected = (len(images), self._num_scores, *images.shape[-2:])
         self.checked_scores(outputs["out"], expected)
         return outputs
+
+    @property
+    def _num_scores(self) -> int:
+        """One more than there are classes where an imported network has unknown ones too."""
+        count: int = getattr(self.network, "num_scores", len(self.class_weights))
+        return count
 
     def example(self, channels: int) -> Tensor:
         """One empty image ``(1, C, h, w)``."""
@@ -185,78 +199,97 @@ class SegmentationTask(Task):
         self,
         images: Float[Tensor, "images channels height width"],
         shape: tuple[int, ...],
-        rays: Float[Tensor, "images 3 3"] | None = None,
-        rotations: Float[Tensor, "rotations 3 3"] | None = None,
+        rotation: NDArray[np.float64] | None = None,
     ) -> Integer[Tensor, ...]:
         """Class index of every pixel of one panorama, or of the crops of a photo.
 
         Args:
-            images: The representation's views of the whole.
-            shape: Of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the crops.
-            rays: Of the views.
-            rotations: Of the views; none by default.
+            images: All view sets of the representation, one after the other.
+            shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
+                crops.
+            rotation: Rotation of the representation.
 
         Returns:
             Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
-        count = 1 if rotations is None else len(rotations)
-        of_turns = [None] * count if rays is None else rays.chunk(count)
-        scores = (self._scores(*part) for part in zip(images.chunk(count), of_turns, strict=True))
-        turns = None if rotations is None else rotations.cpu().double().numpy()
-        if turns is None or count == 1:
-            turn = None if turns is None else turns[0]
-            best = self.representation.to_labels(next(scores), shape, turn)
+        if len(shape) > 2:  # each crop by itself
+            parts = view_scores(self, images.__getitem__, len(images), self.images_per_forward)
+            best = torch.cat([scores.argmax(dim=1) for _, scores in parts])
         else:
-            representation: Any = self.representation  # one whose `whole` has several rotations
-            best = representation.to_averaged_labels(scores, shape, turns).to(images.device)
+            best = self._mosaic(images, (shape[0], shape[1]), rotation).labels().long()
+            best = best.to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
-    def _scores(self, images: Tensor, rays: Tensor | None) -> Tensor:
-        """Scores of all views of one rotation, see `view_scores`."""
-        of_sphere = rays if self.sees_rays and rays is not None and rays.numel() else None
-        parts = view_scores(
-            self, lambda part: images[part], len(images), self.images_per_forward, of_sphere
-        )
-        # Filled part by part: to concatenate them would hold them twice, and compiled networks may
-        # write every result to the same memory (mode=reduce-overhead).
-        all_scores = images.new_empty(0)
-        for part, scores in parts:
-            if part.start == 0:
-                all_scores = scores.new_empty((len(images), *scores.shape[1:]))
-            all_scores[part] = scores
-        return all_scores
+    def _mosaic(
+        self, images: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None
+    ) -> ScoreMosaic:
+        upright: Any = self.representation
+        seen = upright if rotation is None else upright.with_rotation(rotation)
+        sets = seen.view_sets()
+        counts = [len(views) for views in sets]
+        of_sets = (part.__getitem__ for part in torch.split(images, counts))
+        rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
+        count, several = self._num_scores, len(sets) > 1
+        mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
+        return fill(mosaic, self, zip(sets, of_sets, rays, strict=True), self.images_per_forward)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; returns the predictions."""
         predictions = []
-        for images, target, rays, rotations in zip(
-            batch.images, batch.target, batch.rays, batch.rotations, strict=True
+        for images, target, rotation in zip(
+            batch.images, batch.target, batch.rotation, strict=True
         ):
-            predictions.append(self.predict_labels(images, tuple(target.shape), rays, rotations))
-            self.metric.update(predictions[-1], target)
+            labels = self.predict_labels(images, tuple(target.shape), rotation.cpu().numpy())
+            predictions.append(labels)
+            self.metric.update(labels, target)
         return torch.stack(predictions)
 
-    def build_metric(self) -> ConfusionMatrix:
+    def build_metric(self) -> SegmentationMetric:
         """Confusion matrices of pixels, latitude bands and solid angles."""
-        return ConfusionMatrix(len(self.class_names))
+        return SegmentationMetric(len(self.class_names))
 
-    def logged_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+    def logged_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Means over classes, of panoramas also weighted by solid angle."""
         pixels = segmentation_scores(result.pixels, self.absent_class)
         scores = {"miou": pixels.miou, "macc": pixels.macc}
         if result.solid_angle.any():
             angles = segmentation_scores(result.solid_angle, self.absent_class)
-            scores |= {"miou_solid_angle": angles.miou, "macc_solid_angle": angles.macc}
+            scores |= {f"miou{SOLID_ANGLE}": angles.miou, f"macc{SOLID_ANGLE}": angles.macc}
         return scores
 
-    def class_scores(self, result: ConfusionMatrices) -> dict[str, float]:
+    def class_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Intersection over union of each class."""
         scores = segmentation_scores(result.pixels, self.absent_class).iou.tolist()
         return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
 
-    def record(self, result: ConfusionMatrices, noun: str) -> Record:
-        """The record with scores of classes, latitude bands and solid angles."""
-        return segmentation_record(result, self.class_names, self.absent_class, noun)
+    def record(self, result: SegmentationCounts, noun: str) -> Record:
+        """The record, with scores of classes and latitude bands, and intervals over the images."""
+        on_sphere, absent = bool(result.solid_angle.any()), self.absent_class
+        pixels = segmentation_scores(result.pixels, absent)
+        angles = segmentation_scores(result.solid_angle, absent if on_sphere else "skip")
+        of_class = {"iou": pixels.iou, "accuracy": pixels.accuracy}
+        of_class |= {f"iou{SOLID_ANGLE}": angles.iou, f"accuracy{SOLID_ANGLE}": angles.accuracy}
+        bands = [segmentation_scores(band, absent) for band in result.bands if on_sphere]
+        by_pixels, by_angle = result.of_images.swapaxes(0, 1)
+        intervals = bootstrap_intervals(by_pixels, absent)
+        if on_sphere:
+            by_name = bootstrap_intervals(by_angle, absent).items()
+            intervals |= {name + SOLID_ANGLE: ends for name, ends in by_name}
+        return replace(
+            super().record(result, noun),
+            classes=class_entries(
+                {**of_class, "share": pixels.share}, result.pixels, self.class_names
+            ),
+            latitude_bands=[
+                {"latitude_deg": [south, north]}
+                | plain_scores({"miou": band.miou, "macc": band.macc})
+                for north, south, band in zip(
+                    BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False
+                )
+            ],
+            confusion=result.pixels.tolist(),
+            intervals=intervals,
+        )
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None

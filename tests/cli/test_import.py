@@ -15,9 +15,10 @@ from models import UNet
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.photo_networks.importing import representation_of
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews
+from tangent_train.inference.representations import PanoramaViews
 from tests.cli.tiny_runs import Run
 from tests.models.onnx_files import write_linear
 from tests.tasks.small_networks import with_statistics

@@ -19,9 +19,9 @@ from PIL import Image
 
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import rotation_about
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import PERSPECTIVE, sphere, write_checkpoint

@@ -160,7 +160,7 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     path = _write_imported(tmp_path / "net.ckpt", 13)
     typed = [text for text in SETTINGS if "network" not in text]
     tuned = ["data.inputs=[rgb]", "trainer.max_epochs=1", "task.frozen=[stem,downs]"]
-    slower = ["optimizer.backbone_lr_factor=0.1", "scheduler=constant", f"init_from={path}"]
+    slower = ["task.backbone_lr_factor=0.1", "scheduler=constant", f"init_from={path}"]
     run("train", *typed, rooms, *tuned, *slower, "hydra.run.dir=tuned")
     assert "  of other classes in the file: head.weight, head.bias\n" in capsys.readouterr().out
     before = torch.load(path, weights_only=True)["state_dict"]

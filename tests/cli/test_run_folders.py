@@ -96,7 +96,7 @@ def test_a_lock_ends_with_its_process_though_its_workers_live(tmp_path: Path) ->
         ("train", ("representation.faces_per_panorama=99",)),
         ("train", ("data=folder", "data.root=nowhere")),
         ("train", ("data=folder", "data.root=.")),
-        ("train", ("experiment=rooms/demo", "optimizer.backbone_lr_factor=0.5")),
+        ("train", ("experiment=rooms/demo", "task.backbone_lr_factor=0.5")),
         ("train", ("init_from=nowhere", "hydra.run.dir=a/b/c")),
         ("evaluate", ("checkpoint=net.onnx", "data=folder", "data.root=nowhere")),
         ("transfer", ("data=folder", "data.root=nowhere")),

@@ -95,7 +95,7 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
     best = expected.argmax(1)
     wanted = np.where(best == 4, 0, best + 1)
     assert (wanted == 0).any() == bool(blank)
-    labels = trained.labels(found.argmax(1).numpy().astype(np.uint8))
+    labels = trained.labels(found.argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, wanted)
 
 

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
 from tangent_train.geometry import equirect_directions, random_rotation
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.views import InputImage
 from tests.inference.trained import TANGENT, trained_network
 
 if TYPE_CHECKING:

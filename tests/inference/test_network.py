@@ -55,9 +55,9 @@ def network(tmp_path: Path) -> Network:
         (TANGENT, None, [], {}),
         (TANGENT, None, ["levels=[4,5]", "rotations=2"], {"levels": (4, 5), "rotations": 2}),
         (CUBE, None, ["blend=nearest", "base_level=1"], {"blend": "nearest", "base_level": 1}),
-        (PERSPECTIVE, None, ["level=5"], {"level": 5}),
+        (PERSPECTIVE, None, ["levels=5"], {"levels": 5}),
         (TANGENT, None, ["min_confidence=0.6"], {"min_confidence": 0.6}),
-        (TANGENT, 120.5, ["level=5", "blend=nearest"], {"level": 5, "blend": "nearest"}),
+        (TANGENT, 120.5, ["levels=[5,4]", "blend=nearest"], {"levels": (5, 4), "blend": "nearest"}),
         (TANGENT, 65, ["base_level=1"], {"base_level": 1}),
     ],
 )
@@ -303,8 +303,6 @@ def test_settings_that_do_not_suit_the_image_are_refused(
 
 def test_impossible_settings_of_a_network_are_refused(tmp_path: Path) -> None:
     path = write_checkpoint(tmp_path / "net.ckpt", ERP)
-    with pytest.raises(SettingError, match="equirectangular images"):
-        tt.load(path).labels(_RGB, upright="auto")
     with pytest.raises(SettingError, match="unmapped: found '0'"):
         tt.load(path, unmapped="0")  # type: ignore[arg-type]
 

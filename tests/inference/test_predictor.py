@@ -21,8 +21,9 @@ from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews, PhotoViews
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage
+from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.registry import build_from_config
 from tangent_train.rendering import rotate_equirect
 from tangent_train.tasks.segmentation import SegmentationTask
@@ -48,7 +49,7 @@ def _labels(
     shares: list[float] = []
     scores = predictor.predict(image, shares.append)
     assert sum(shares) == pytest.approx(1)
-    return scores.labels()
+    return scores.labels().numpy()
 
 
 def _blocks(height: int, width: int) -> NDArray[np.uint8]:
@@ -62,10 +63,10 @@ def test_images_share_memory_only_one_after_the_other() -> None:
     bright, dark = _blocks(32, 64), _blocks(32, 64)[::-1].copy()
     predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
     first = predictor.predict(InputImage(bright))
-    expected = first.probabilities(slice(None))
+    expected = first.probabilities(slice(None)).numpy()
     second = predictor.predict(InputImage(dark))
     np.testing.assert_array_equal(first.probabilities(slice(None)), expected)
-    assert (second.probabilities(slice(None)) != expected).any()
+    assert (second.probabilities(slice(None)).numpy() != expected).any()
     address = second.sums.ctypes.data
     del second
     third = predictor.predict(InputImage(bright))
@@ -95,32 +96,43 @@ def test_memory_of_another_size_or_on_a_disk_is_given_back(
 
 
 @pytest.mark.parametrize(
-    ("representation", "blend", "channels", "rotations"),
+    ("representation", "settings", "channels"),
     [
-        (TANGENT, "nearest", 4, 1),
-        (TANGENT | {"blend": "feather"}, "feather", 3, 1),
-        (TANGENT | {"crop_multiple": 2}, "nearest", 3, 1),
-        (ERP, "feather", 3, 1),  # there is nothing to blend
-        (CUBE, "feather", 4, 1),  # its faces do not overlap
-        (TANGENT | {"average_rotations": 3}, "nearest", 4, 3),
-        (ERP | {"average_rotations": 3}, "nearest", 4, 3),
+        (TANGENT, {"blend": "nearest"}, 4),
+        (TANGENT, {"blend": "feather"}, 3),
+        (TANGENT | {"crop_multiple": 2}, {"blend": "nearest"}, 3),
+        (ERP, {}, 3),  # a single image
+        (CUBE, {"blend": "feather"}, 4),  # its faces do not overlap
+        (CUBE | {"margin": 4}, {"blend": "feather", "rotations": 2}, 3),
+        (TANGENT, {"blend": "nearest", "rotations": 3}, 4),
+        (TANGENT, {"blend": "feather", "levels": [4, 3]}, 4),
+        (ERP, {"rotations": 3}, 4),
+        (ERP | {"rows": 24}, {"rotations": 2}, 3),
     ],
 )
+@pytest.mark.parametrize("upright", [None, "auto"])
 def test_labels_are_those_of_an_evaluation(
-    stanford_root: Path, representation: dict[str, Any], blend: str, channels: int, rotations: int
+    stanford_root: Path,
+    representation: dict[str, Any],
+    settings: dict[str, Any],
+    channels: int,
+    upright: Any,
 ) -> None:
     trained = trained_network(representation, channels)
-    made = build_from_config(representation, "representation")
-    data = Stanford2D3DS(root=stanford_root, representation=made, inputs=trained.inputs, fold=1)
+    made = build_from_config(representation | settings, "representation")
+    data = Stanford2D3DS(
+        root=stanford_root, representation=made, inputs=trained.inputs, fold=1, test_rotation=30
+    )
+    data.upright = "pose" if upright else None
     task = SegmentationTask(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
     batch = data.on_after_batch_transfer(batch, 0)
-    images, rays, turns = batch.images[0], batch.rays[0], batch.rotations[0]
-    expected = task.predict_labels(images, tuple(batch.target[0].shape), rays, turns).numpy()
+    shape, rotation = tuple(batch.target[0].shape), batch.rotation[0].numpy()
+    expected = task.predict_labels(batch.images[0], shape, rotation).numpy()
     read = data.source("test").read(int(batch.index[0]))
-    image = InputImage(read.rgb, read.depth)
-    labels = _labels(trained, image, 7, blend=blend, rotations=rotations)
-    assert len(np.unique(expected)) == 3
+    assert (read.up is None) == (upright is None)
+    labels = _labels(trained, InputImage(read.rgb, read.depth, read.up), 7, **settings)
+    assert len(np.unique(expected)) > 1
     np.testing.assert_array_equal(labels + 1, expected)
 
 
@@ -131,16 +143,15 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     awake(network)
     image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
     trained = trained_network(TANGENT, inner=network)
-    labels = _labels(trained, image, per_forward, blend="nearest")
+    labels = _labels(trained, image, per_forward)
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()
-    whole = made.whole()
-    rendered = render_inputs(image, whole, trained.inputs)
+    (views,) = made.view_sets()
+    rendered = render_inputs(image, views, trained.inputs)
     images = normalize(rendered, trained.normalization, trained.inputs)
-    expected = task.predict_labels(images, (32, 64), torch.tensor(whole.rays())).numpy() - 1
+    expected = task.predict_labels(images, (32, 64)).numpy() - 1
     np.testing.assert_array_equal(labels, expected)
-    with torch.no_grad():
-        alone = task.representation.to_labels(task(images), (32, 64)).numpy()
-    assert (alone != expected).any(), "attention does something"
+    task.sees_rays = False
+    assert (task.predict_labels(images, (32, 64)).numpy() - 1 != expected).any(), "attention"
 
 
 def test_elevation_follows_the_zenith() -> None:
@@ -196,7 +207,7 @@ def test_unsure_is_unknown_of_networks_that_know_nothing_too() -> None:
     trained = trained_network(TANGENT, class_names=names, groups=groups)
     predictor = Predictor(trained, PanoramaViews(trained), min_confidence=0.6)
     scores = predictor.predict(InputImage(sphere(32)))
-    probabilities = scores.probabilities(slice(None))
+    probabilities = scores.probabilities(slice(None)).numpy()
     best = probabilities.argmax(axis=-1)
     known = (best < 2) & (probabilities.max(axis=-1) >= 0.6)
     assert all(((best == k) & known).any() != (k == 2) for k in range(3))
@@ -208,10 +219,11 @@ def test_level_and_base_level_choose_the_views() -> None:
         (found,) = PanoramaViews(trained_network(representation), **settings)(
             InputImage(sphere(128))
         )
-        return found.count, found.views(slice(0, 1)).render(found.image.rgb, "bilinear").shape[1]
+        (seen,) = found.sets
+        return len(seen), seen.render(found.image.rgb, "bilinear").shape[1]
 
     assert views(TANGENT) == (20, 16)
-    assert views(TANGENT, levels=(5,)) == (20, 32)
+    assert views(TANGENT, levels=5) == (20, 32)
     assert views(TANGENT, base_level=1) == (80, 8)
     assert views(ERP, base_level=1) == (80, 8)
     assert views(PERSPECTIVE) == (80, 32), "of networks trained on photos, base level 1"
@@ -227,7 +239,7 @@ def _photo(rgb: NDArray[np.uint8], fov_deg: float, **more: Any) -> InputImage:
 
 def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
     (found,) = PhotoViews(trained, **settings)(_photo(_blocks(12, 12), 90.0))
-    left, _, right, _ = found.views(slice(0, 1)).boxes[0]
+    left, _, right, _ = found.sets[0].boxes[0]  # type: ignore[attr-defined]
     return float(right - left) / 6 / PhotoViews(trained, **settings).image_size[1]
 
 
@@ -269,11 +281,11 @@ def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
 def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> None:
     tangent, photos = trained_network(TANGENT), trained_network(PERSPECTIVE)
     assert _radians_per_pixel(tangent) == pytest.approx(TangentGrid(0, 4).pitch)
-    assert _radians_per_pixel(tangent, level=5) == pytest.approx(TangentGrid(0, 5).pitch)
+    assert _radians_per_pixel(tangent, levels=5) == pytest.approx(TangentGrid(0, 5).pitch)
     assert _radians_per_pixel(tangent, base_level=1) == pytest.approx(TangentGrid(1, 4).pitch)
     at_45 = 2 * math.tan(math.radians(22.5)) / 24
     assert _radians_per_pixel(photos) == pytest.approx(at_45)
-    assert _radians_per_pixel(photos, level=7) == pytest.approx(at_45 / 2)
+    assert _radians_per_pixel(photos, levels=7) == pytest.approx(at_45 / 2)
     assert _radians_per_pixel(trained_network(ERP)) == pytest.approx(TangentGrid(1, 4).pitch)
     assert _radians_per_pixel(trained_network(CUBE)) == pytest.approx(2 / 16)
 
@@ -296,9 +308,9 @@ def test_a_photo_of_a_telescope_needs_little_memory() -> None:
 
 def test_impossible_settings_are_refused() -> None:
     trained = trained_network(TANGENT)
-    for settings in ({"upright": True}, {"levels": (4, 5)}):
-        with pytest.raises(SettingError, match=r"upright and levels: .*base_level="):
-            PanoramaViews(trained_network(ERP), **settings)
+    for representation in (ERP, CUBE):
+        with pytest.raises(SettingError, match=r"levels: .*tangent images.*base_level="):
+            PanoramaViews(trained_network(representation), levels=(4, 5))
     strided = trained_network(TANGENT, size_multiple=16)
     with pytest.raises(SettingError, match="multiples of 16"):
         PanoramaViews(strided, levels=(3,))

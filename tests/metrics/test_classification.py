@@ -5,7 +5,7 @@ import pytest
 import torch
 from torchmetrics.classification import MulticlassAccuracy
 
-from tangent_train.metrics.classification import ClassCounts, classification_scores
+from tangent_train.metrics.classification import ClassificationMetric, classification_scores
 
 CLASSES = 6
 
@@ -15,7 +15,7 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     prediction = torch.randint(0, CLASSES, (38,), generator=generator)
     truth = torch.randint(0, CLASSES - 2, (38,), generator=generator)  # without the last class
     truth[20] = prediction[20] = CLASSES - 2  # a class of a single image
-    metric = ClassCounts(CLASSES)
+    metric = ClassificationMetric(CLASSES)
     for batch in (slice(7), slice(7, 8), slice(8, None)):
         metric.update(prediction[batch], truth[batch])
     matrix = metric.compute()
@@ -38,7 +38,7 @@ def test_nothing_counted_has_no_scores() -> None:
 
 
 def test_counts_are_whole_numbers_summed_over_processes() -> None:
-    metric = ClassCounts(2)
+    metric = ClassificationMetric(2)
     metric.confmat += 2**24  # float32 cannot count beyond
     metric.update(torch.tensor([1]), torch.tensor([0]))
 

@@ -11,7 +11,7 @@ from torchmetrics.utilities import dim_zero_cat
 from tangent_train.errors import SettingError
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
-    ConfusionMatrix,
+    SegmentationMetric,
     bootstrap_intervals,
     segmentation_scores,
 )
@@ -26,8 +26,8 @@ def _panoramas() -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
     return [(rng.integers(0, CLASSES, shape), rng.integers(0, CLASSES, shape)) for shape in shapes]
 
 
-def _counted(pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> ConfusionMatrix:
-    metric = ConfusionMatrix(CLASSES)
+def _counted(pairs: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> SegmentationMetric:
+    metric = SegmentationMetric(CLASSES)
     for prediction, truth in pairs:
         metric.update(torch.from_numpy(prediction), torch.from_numpy(truth))
     return metric
@@ -82,7 +82,7 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
     height, width = 64, 128
     truth = torch.ones(height, width, dtype=torch.int64)
     truth[: height // 4] = 2  # above 45°: (1 − sin 45°)/2 of the sphere, a quarter of the rows
-    metric = ConfusionMatrix(3)
+    metric = SegmentationMetric(3)
     metric.update(truth, truth)
     matrices = metric.compute()
     share = matrices.solid_angle.diagonal()[1:] / (4 * np.pi)
@@ -93,7 +93,7 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
 def test_latitude_bands_go_from_north_to_south() -> None:
     # Rows of 1°: their centres are half a degree from the edges of the bands.
     truth = torch.arange(1, 7).repeat_interleave(30)[:, None].expand(180, 4)
-    metric = ConfusionMatrix(7)
+    metric = SegmentationMetric(7)
     metric.update(truth, truth)
     bands = metric.compute().bands
     for k, band in enumerate(bands):
@@ -108,23 +108,21 @@ def test_a_row_on_the_edge_of_two_bands_counts_in_the_northern_one() -> None:
         for row in range(height):
             above = [e for e in BAND_EDGES_DEG[1:-1] if (2 * row + 1) * 90 > (90 - e) * height]
             expected[len(above)] += 2 * height
-        metric = ConfusionMatrix(2)
+        metric = SegmentationMetric(2)
         metric.update(*[torch.ones(height, 2 * height, dtype=torch.int64)] * 2)
         np.testing.assert_array_equal(metric.compute().bands[:, 1, 1], expected)
 
 
 def test_large_counts_stay_exact() -> None:
     # Float32 cannot count beyond 2**24: a data set has more pixels of one class than that.
-    metric = ConfusionMatrix(2)
+    metric = SegmentationMetric(2)
     metric.pixels += 2**24
     metric.bands += 2**24
-    metric.images += 2**24
     metric.update(torch.ones(1, 2, dtype=torch.int64), torch.ones(1, 2, dtype=torch.int64))
     metric.update(torch.ones(1, 1, 1, dtype=torch.int64), torch.ones(1, 1, 1, dtype=torch.int64))
     matrices = metric.compute()
     assert int(matrices.pixels[1, 1]) == 2**24 + 3
     assert int(matrices.bands[:, 1, 1].sum()) == 6 * 2**24 + 2
-    assert matrices.images == 2**24 + 2
     assert matrices.solid_angle.dtype == np.float64
 
 
@@ -132,7 +130,7 @@ def test_large_counts_stay_exact() -> None:
 def test_processes_together_count_every_image_once() -> None:
     """Of three processes, one with two panoramas, one with a third, one without any."""
     whole = _counted(_panoramas()).compute()
-    parts = [_counted(_panoramas()[:2]), _counted(_panoramas()[2:]), ConfusionMatrix(CLASSES)]
+    parts = [_counted(_panoramas()[:2]), _counted(_panoramas()[2:]), SegmentationMetric(CLASSES)]
     states = [[dim_zero_cat(getattr(p, name)) for p in parts] for name in parts[0]._reductions]
     for part in parts:
         gathered = iter(states)
@@ -142,7 +140,6 @@ def test_processes_together_count_every_image_once() -> None:
         np.testing.assert_array_equal(found.pixels, whole.pixels)
         np.testing.assert_array_equal(found.bands, whole.bands)
         np.testing.assert_allclose(found.solid_angle, whole.solid_angle, rtol=1e-12)
-        assert found.images == 3
         np.testing.assert_array_equal(found.of_images, whole.of_images)
 
 
@@ -165,7 +162,7 @@ def test_every_image_is_kept_until_the_next_evaluation() -> None:
 
 
 def _random_images(count: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Confusion matrices, and their sums as `ConfusionMatrix` keeps them; class 4 is rare."""
+    """Confusion matrices, and their sums as `SegmentationMetric` keeps them; class 4 is rare."""
     rng = np.random.default_rng(11)
     confusions = rng.integers(0, 90, (count, CLASSES, CLASSES))
     confusions[:, 0] = 0
@@ -215,7 +212,7 @@ def test_there_is_no_interval_of_one_image_or_of_nothing_labelled() -> None:
 
 
 def test_bad_input_is_refused() -> None:
-    metric = ConfusionMatrix(3)
+    metric = SegmentationMetric(3)
     with pytest.raises(SettingError, match="prediction"):
         metric.update(torch.ones(2, 4, dtype=torch.int64), torch.ones(2, 3, dtype=torch.int64))
     ones = torch.ones(2, 4, dtype=torch.int64)
@@ -226,7 +223,7 @@ def test_bad_input_is_refused() -> None:
         for pair in ((one_of_them, ones), (ones, one_of_them)):
             with pytest.raises(SettingError, match=found):
                 metric.update(*pair)
-    assert metric.compute().images == 0
+    assert len(metric.compute().of_images) == 0
 
 
 def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() -> None:
@@ -235,7 +232,7 @@ def test_photos_are_counted_like_panoramas_without_latitudes_and_solid_angles() 
     photo = _counted([(prediction, truth)]).compute()
     as_one = _counted([(np.hstack(list(prediction)), np.hstack(list(truth)))]).compute()
     np.testing.assert_array_equal(photo.pixels, as_one.pixels)
-    assert photo.images == 1, "three crops of one photo"
+    assert len(photo.of_images) == 1, "three crops of one photo"
     assert not photo.solid_angle.any()
     assert not photo.bands.any()
     assert as_one.solid_angle.any()

@@ -103,6 +103,13 @@ def test_labels_of_tensors_keep_their_dtype() -> None:
     assert (masks == (tensor > 0)).double().mean() > 0.97
 
 
+def test_images_that_do_not_overlap_are_not_feathered() -> None:
+    panorama, grid = np.random.default_rng(0).random((32, 64, 2)), CubeGrid(16)
+    nearest = apply(lambda images: images, panorama, grid, "nearest")
+    np.testing.assert_array_equal(apply(lambda images: images, panorama, grid), nearest)
+    assert not np.isnan(nearest).any()
+
+
 def _other_after_the_first(shapes: list[tuple[int, ...]], dtypes: list[Any]) -> Function:
     results = iter([np.zeros(s, t) for s, t in zip(shapes, dtypes, strict=True)])
     return lambda _: next(results)
@@ -138,7 +145,6 @@ def test_other_results_are_refused(function: Function, message: str) -> None:
         (torch.zeros(3, 8, 16, dtype=torch.uint8), {}, "uint8"),
         (_ARRAY, {"blend": "linear"}, "blend"),
         (_ARRAY, {"images_per_call": 0}, "images_per_call: found 0"),
-        (_ARRAY, {"grid": CubeGrid(8)}, "do not overlap"),
     ],
 )
 def test_what_cannot_be_rendered_is_refused(

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.metrics import ConfusionMatrix
+from tangent_train.metrics import SegmentationMetric
 from tangent_train.rendering import (
     Blend,
     Interpolation,
@@ -75,7 +75,7 @@ def test_functions_of_images(blend: Blend) -> None:
 
 def test_confusion_matrices() -> None:
     prediction, truth = (_random(2, *SHAPE).abs() * 2).long().clamp(max=4)
-    on_cpu, on_gpu = ConfusionMatrix(5), ConfusionMatrix(5).cuda()
+    on_cpu, on_gpu = SegmentationMetric(5), SegmentationMetric(5).cuda()
     on_cpu.update(prediction, truth)
     on_gpu.update(prediction.cuda(), truth.cuda())
     np.testing.assert_array_equal(on_gpu.compute().bands, on_cpu.compute().bands)

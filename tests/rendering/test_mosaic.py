@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 
 from tangent_train.geometry import (
     PinholeGrid,
@@ -25,6 +26,7 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
+from tangent_train.rendering.representations.views import PinholeViews
 
 GRIDS = [
     (TangentGrid(0, 5), (64, 128)),
@@ -42,8 +44,16 @@ def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
 
 def _added(result: ScoreMosaic, scores: torch.Tensor, grid: PinholeGrid) -> ScoreMosaic:
     for faces in np.array_split(np.random.default_rng(0).permutation(grid.num_images), 6):
-        result.add(scores[faces], grid, faces)
+        result.add(scores[faces], PinholeViews(grid, faces))
     return result
+
+
+def _labels(mosaic: ScoreMosaic) -> NDArray[np.unsignedinteger]:
+    return mosaic.labels().numpy()
+
+
+def _probabilities(mosaic: ScoreMosaic) -> NDArray[np.float32]:
+    return mosaic.probabilities(slice(None)).numpy()
 
 
 @pytest.mark.parametrize("averaged", [False, True])
@@ -59,7 +69,7 @@ def test_owners_labels_are_those_of_all_images_at_once(
     decided = (nearest - second > 1e-9).T
     assert decided.mean() > 0.99
     # Another order of the same sums: only ties of rounding may differ.
-    assert (result.labels() == expected)[decided].mean() > 0.9995
+    assert (_labels(result) == expected)[decided].mean() > 0.9995
 
 
 # Differences of hundreds have exponentials that vanish; more than 16 classes are several blocks.
@@ -72,21 +82,21 @@ def test_feathered_probabilities_are_those_of_all_images_at_once(
     result = _added(ScoreMosaic(shape, classes, "feather"), scores, grid)
     softmax = scores.double().softmax(dim=1)
     expected = tangent_to_equirect(softmax, grid, shape, "feather").movedim(0, -1).numpy()
-    np.testing.assert_allclose(result.probabilities(slice(None)), expected, atol=1e-6)
+    np.testing.assert_allclose(_probabilities(result), expected, atol=1e-6)
     labels = tangent_to_labels(softmax, grid, shape, "feather").numpy()
-    assert (result.labels() == labels).mean() > 0.9995
+    assert (_labels(result) == labels).mean() > 0.9995
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_pixels_without_a_probable_class_are_unsure(blend: Blend) -> None:
     grid, shape = GRIDS[1]
     result = _added(ScoreMosaic(shape, 7, blend, min_confidence=0.4), _scores(grid), grid)
-    probabilities = result.probabilities(slice(None))
+    probabilities = _probabilities(result)
     best = probabilities.max(axis=-1)
     decided = abs(best - 0.4) > 1e-6
     expected = np.where(best < 0.4, 7, probabilities.argmax(axis=-1))
     assert set(np.unique(expected)) == set(range(8))
-    np.testing.assert_array_equal(result.labels()[decided], expected[decided])
+    np.testing.assert_array_equal(_labels(result)[decided], expected[decided])
 
 
 def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() -> None:
@@ -94,7 +104,7 @@ def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() ->
     scores = _scores(grid)
     result = _added(ScoreMosaic(shape, 7, "nearest", averaged=True), scores, grid)
     expected = tangent_to_equirect(scores.double(), grid, shape).softmax(dim=0).movedim(0, -1)
-    np.testing.assert_allclose(result.probabilities(slice(None)), expected.numpy(), atol=1e-5)
+    np.testing.assert_allclose(_probabilities(result), expected.numpy(), atol=1e-5)
     np.testing.assert_allclose(result.sums.sum(axis=2), 1, atol=1e-5)  # each counted once
 
 
@@ -104,20 +114,20 @@ def test_infinite_and_nan_scores_have_no_probability(blend: Blend) -> None:
     scores = torch.zeros(20, 4, grid.dim, grid.dim)
     scores[:, 1], scores[:, 2] = -torch.inf, torch.nan
     result = _added(ScoreMosaic(shape, 4, blend, averaged=True), scores, grid)
-    found = result.probabilities(slice(None))
+    found = _probabilities(result)
     np.testing.assert_allclose(found, np.broadcast_to([0.5, 0, 0, 0.5], found.shape), atol=1e-6)
     nothing = _added(ScoreMosaic(shape, 4, blend, averaged=True), scores * torch.nan, grid)
-    assert not nothing.labels().any()
+    assert not nothing.labels().numpy().any()
 
 
 def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     grid, shape = GRIDS[0]
     scores = _scores(grid)
-    expected = _added(ScoreMosaic(shape, 7, "feather"), scores, grid).probabilities(slice(None))
+    expected = _probabilities(_added(ScoreMosaic(shape, 7, "feather"), scores, grid))
     monkeypatch.setattr(accumulate, "_IN_MEMORY_BYTES", 0)
     result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
     assert isinstance(result.sums, np.memmap)
-    np.testing.assert_array_equal(result.probabilities(slice(None)), expected)
+    np.testing.assert_array_equal(_probabilities(result), expected)
 
 
 def _photo_crops(blend: Blend) -> tuple[PhotoCrops, tuple[int, int]]:
@@ -137,15 +147,15 @@ def test_crops_of_a_smooth_field_give_the_field(blend: Blend) -> None:
     field = 0.05 * (x[:, None, :] - 30) + 0.08 * (y[:, :, None] - 20)
     scores = torch.from_numpy(np.stack([np.zeros_like(field), field], axis=1)).float()
     result = ScoreMosaic((height, width), 2, blend, averaged=True)
-    for part in np.array_split(np.arange(len(field)), 3):
-        result.add_crops(scores[part], crops, part)
+    for part in (slice(0, 5), slice(5, None)):
+        result.add(scores[part], crops[part])
     tolerance = 1e-5 if blend == "nearest" else 2e-3  # probabilities, not scores, are feathered
     truth = 0.05 * (np.arange(width) + 0.5 - 30) + 0.08 * (np.arange(height)[:, None] + 0.5 - 20)
     inside = slice(4, -4)
-    probability = result.probabilities(slice(None))[..., 1]
+    probability = _probabilities(result)[..., 1]
     expected = 1 / (1 + np.exp(-truth))
     np.testing.assert_allclose(
         probability[inside, inside], expected[inside, inside], atol=tolerance
     )
     decided = np.abs(truth) > 0.05
-    assert ((result.labels() == 1) == (truth > 0))[inside, inside][decided[inside, inside]].all()
+    assert ((_labels(result) == 1) == (truth > 0))[inside, inside][decided[inside, inside]].all()

@@ -53,8 +53,8 @@ def test_spans_hold_what_images_see_and_little_more(at_pole: int | None) -> None
     shape, grid = (130, 200), TangentGrid(1, 6)
     if at_pole is not None:
         grid = grid.with_rotation([[1], [-1], [1]] * grid.world_from_camera[at_pole].T)
-    sight = tables.sight_of(grid, grid.face_indices(), shape, slice(0, 130), NO_OWNERS)
-    first, count = np.moveaxis(sight.spans[..., None], 2, 0)
+    geometry = tables.canvas_geometry(grid, grid.face_indices(), shape, slice(0, 130), NO_OWNERS)
+    first, count = np.moveaxis(geometry.spans[..., None], 2, 0)
     held = (np.arange(shape[1]) - first) % shape[1] < count
     x, y, z = np.einsum("nji,hwj->inhw", grid.world_from_camera, equirect_directions(shape))
     half = grid.dim / 2 * grid.pitch

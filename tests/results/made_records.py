@@ -9,8 +9,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from tangent_train.results.record import SCORES, Record
+from tangent_train.results.record import Record
 from tangent_train.setting_rules import flat_settings
+from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")
 BANDS = ((45.0, 90.0), (-90.0, 45.0))
@@ -49,14 +50,15 @@ def made_record(
         OmegaConf.update(config, name.replace("__", "."), value)
     flat = dict(flat_settings(OmegaConf.to_container(config)))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
-    found = SCORES["segmentation"]
+    headings, mean = SegmentationTask.headings, sum(present) / len(present)
+    of_class = [heading.of_class for heading in headings.values()]
     return Record(
-        "segmentation",
         "panoramas",
         5,
-        dict.fromkeys(found.means, sum(present) / len(present)),
+        headings,
+        {"miou": mean, **dict.fromkeys(headings, mean)},
         [
-            {"class": name, **dict.fromkeys(found.per_class, value), "share": 0.1}
+            {"class": name, "iou": value, **dict.fromkeys(of_class, value), "share": 0.1}
             for name, value in zip(names, scores, strict=True)
         ],
         [

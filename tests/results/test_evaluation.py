@@ -5,47 +5,65 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from torch import nn
 
-from tangent_train.metrics.segmentation import ConfusionMatrices
+from tangent_train.metrics.segmentation import SegmentationCounts
 from tangent_train.results.evaluation import (
-    classification_record,
     confusion_table,
     headline,
     result_tables,
-    segmentation_record,
     write_results,
 )
 from tangent_train.results.record import Record
+from tangent_train.tasks import SegmentationTask
+from tests.tasks.shapes import shape_task
 
 NAMES = ("unknown", "wall", "floor", "=sofa")
 SHAPES = ("bottle", "chair [old]", "mug", "plant")
+NO_VIEWS: Any = None
+SGD = partial(torch.optim.SGD, lr=1)
 SHAPE_MATRIX = np.array([[4, 0, 0, 0], [0, 8, 0, 0], [3, 0, 1, 0], [0, 0, 0, 0]])
 
 
-def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> ConfusionMatrices:
+def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> SegmentationCounts:
     """Walls found by 90 %, floors by half, no sofa."""
     erp = np.zeros((4, 4), np.int64)
     for place, count in (pixels or {(1, 1): 90, (1, 2): 10, (2, 2): 50, (2, 1): 50}).items():
         erp[place] = count
     bands = np.zeros((6, 4, 4), np.int64)
     bands[2] = erp
-    return ConfusionMatrices(erp, erp / 10, bands, 7, np.zeros((0, 2, 3, 3)))
+    return SegmentationCounts(erp, erp / 10, bands, np.zeros((0, 2, 3, 3)))
 
 
-def _record(absent: Any = "skip", noun: str = "panoramas") -> Record:
-    return segmentation_record(_matrices(), NAMES, absent, noun)
+def _record(
+    counts: SegmentationCounts | None = None, absent: Any = "skip", noun: str = "panoramas"
+) -> Record:
+    """The record of seven images."""
+    task = SegmentationTask(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
+    task.evaluated = 7
+    return task.record(counts or _matrices(), noun)
+
+
+def _record_of_shapes() -> Record:
+    task = shape_task(nn.Identity(), SHAPES)
+    task.evaluated = 16
+    return task.record(SHAPE_MATRIX, "shapes")
 
 
 def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
     write_results(_record(), tmp_path)
     read = json.loads((tmp_path / "results.json").read_text())
-    assert (read["kind"], read["images"], read["noun"]) == ("segmentation", 7, "panoramas")
-    assert read["absent_class"] == "skip"
+    assert (read["images"], read["noun"]) == (7, "panoramas")
+    assert read["headings"]["miou"] == {
+        "text": "mIoU", "unit": "%", "of_class": "iou", "class_text": "IoU"
+    }  # fmt: skip
     assert read["macc"] == read["macc_solid_angle"] == (0.9 + 0.5) / 2
     assert read["miou"] == (90 / 150 + 50 / 110) / 2
     assert [entry["class"] for entry in read["classes"]] == ["wall", "floor", "=sofa"]
@@ -61,7 +79,7 @@ def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
 
 
 def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
-    write_results(_record("zero"), tmp_path)
+    write_results(_record(absent="zero"), tmp_path)
     with (tmp_path / "results.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["class"] for row in rows] == ["wall", "floor", "'=sofa"], "no formula"
@@ -78,8 +96,8 @@ def test_classes_of_no_pixel_are_left_out_of_the_table() -> None:
     predicted = _matrices({(1, 1): 90, (1, 3): 10, (2, 2): 50})
     shown = {
         "skip": _record(),
-        "zero": _record("zero"),
-        "predicted": segmentation_record(predicted, NAMES, "skip"),
+        "zero": _record(absent="zero"),
+        "predicted": _record(predicted),
     }
     names = {name: [row[0] for row in result_tables(r)[0].rows] for name, r in shown.items()}
     whole = ["wall", "floor", "=sofa", "mean"]
@@ -93,7 +111,7 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     matrices = _matrices()._replace(
         solid_angle=none, bands=np.zeros((6, 4, 4), np.int64), of_images=of_images
     )
-    record = segmentation_record(matrices, NAMES, "zero", "photos")
+    record = _record(matrices, "zero", "photos")
     assert record.means["miou_solid_angle"] is None
     assert record.latitude_bands == []
     (table,) = result_tables(record)
@@ -105,10 +123,10 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
 
 def test_means_over_fewer_classes_say_so() -> None:
     """Of labels that have one class, 100 % mIoU is not that of all."""
-    few = segmentation_record(_matrices({(1, 1): 90}), NAMES, "skip")
+    few = _record(_matrices({(1, 1): 90}))
     assert headline(few).endswith(" over 7 panoramas, 1 of 3 classes")
     assert result_tables(few)[0].note == "Means without classes that no label has: floor, =sofa."
-    as_zero = segmentation_record(_matrices({(1, 1): 90}), NAMES, "zero")
+    as_zero = _record(_matrices({(1, 1): 90}), "zero")
     assert headline(as_zero).endswith(" over 7 panoramas")
     assert result_tables(as_zero)[0].note == ""
 
@@ -119,7 +137,7 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     of_images[0, :, :, 0] = [100, 100, 90]  # labelled, predicted, hits
     of_images[1, 0, :, 1] = [100, 100, 50]
     of_images[1, 1, :, 1] = [10, 10, 4]
-    record = segmentation_record(_matrices()._replace(of_images=of_images), NAMES, "skip")
+    record = _record(_matrices()._replace(of_images=of_images))
     expected = {
         "macc": (0.5, 0.9),
         "miou": (50 / 150, 90 / 110),
@@ -140,7 +158,7 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
 
 
 def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
-    record = classification_record(SHAPE_MATRIX, SHAPES)
+    record = _record_of_shapes()
     assert record.means == {"accuracy": 13 / 16, "class_accuracy": 0.75}
     write_results(record, tmp_path)
     text = (tmp_path / "results.md").read_text()
@@ -152,8 +170,8 @@ def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
 def test_the_heat_map_has_shares_of_the_true_class() -> None:
     """Of which those predicted as unknown are a part."""
     matrices = _matrices({(1, 0): 10, (1, 1): 65, (1, 2): 25, (2, 2): 7})
-    table = confusion_table(segmentation_record(matrices, NAMES, "skip"))
+    table = confusion_table(_record(matrices))
     assert table.shades == [[0.65, 0.25, 0], [0, 1, 0], [0, 0, 0]]
     assert table.rows == [("wall", "65", "25", ""), ("floor", "", "100", ""), ("=sofa", "", "", "")]
-    shapes = confusion_table(classification_record(SHAPE_MATRIX, SHAPES))
+    shapes = confusion_table(_record_of_shapes())
     assert shapes.rows[2] == ("mug", "75", "", "25", "")

@@ -14,7 +14,7 @@ from datamodules.images.gpano import area_of_crop, whole_area
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.inference.views import InputImage
+from tangent_train.inference.images import InputImage
 from tangent_train.results.predictions import PredictionFolder, class_shares
 
 NAMES = ("unknown", "up", "down")

@@ -30,6 +30,34 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
     assert read.score("iou", "sofa") is None
 
 
+@pytest.mark.parametrize(
+    ("place", "value"),
+    [
+        (["headings", "miou", "text"], "a\nb"),
+        (["headings", "miou", "unit"], "\x1b[31m"),
+        (["headings", "miou", "of_class"], 1),
+        (["headings", "miou"], "mIoU"),
+        (["headings"], {}),
+        (["headings"], {"a b": {"text": "", "unit": "", "of_class": "", "class_text": ""}}),
+    ],
+)
+def test_headings_are_plain_text(place: list[str], value: Any, tmp_path: Path) -> None:
+    path = write_run(tmp_path / "a", made_record(SCORES)) / "results.json"
+    part = results = json.loads(path.read_text())
+    for name in place[:-1]:
+        part = part[name]
+    part[place[-1]] = value
+    path.write_text(json.dumps(results))
+    with pytest.raises(DataError, match=r"results\.json: found (headings|no score with a heading)"):
+        load_record(path.parent)
+
+
+def test_a_score_cannot_hide_a_field_of_the_file() -> None:
+    record = made_record(SCORES)
+    with pytest.raises(ValueError, match="cannot have the name images"):
+        replace(record, means={"images": 1.0})
+
+
 def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     for name in ("b", "a"):
         write_run(tmp_path / name, made_record(SCORES))
@@ -48,7 +76,7 @@ def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     [
         (None, "No such file"),
         ("[]", "list instead of a mapping"),
-        ('{"kind": "keypoints"}', "kind='keypoints'"),
+        ('{"noun": "pairs"}', "no images"),
         ("[" * 100_000, "nested too deeply"),
     ],
 )

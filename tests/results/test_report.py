@@ -15,6 +15,7 @@ from tangent_train.results.comparisons import published, runs_report, transfer_r
 from tangent_train.results.record import Record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
+from tangent_train.tasks import ClassificationTask
 from tests.decoded import decoded
 from tests.results.made_records import made_record, without_solid_angle
 
@@ -134,12 +135,13 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
         "data._target_": "datamodules.ModelNet40",
         "level": 5,
         "name": "shapes",
-        "representation.rotation": "yaw",
+        "representation.random_rotation": "yaw",
         "data.test_rotation": "so3",
         "representation.base_level": 0,
     }
     means = {"accuracy": 0.8, "class_accuracy": 0.7}
-    record = Record("classification", "shapes", 120, means, classes, settings=settings)
+    headings = ClassificationTask.headings
+    record = Record("shapes", 120, headings, means, classes, settings=settings)
     cells = _cells(_runs_report(record))
     assert cells["shapes"]["rotated in training / test"] == "z / SO3"
     assert cells["shapes"]["accuracy %"] == "80.0"

@@ -16,9 +16,11 @@ from transformers import get_scheduler
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.errors import SettingError
+from tangent_train.tasks.schedules import Schedule, warmup_cosine
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
 LR = 0.1
+_NULL: Any = None  # in a config: the length of the training
 STEPS = 3  # of an epoch
 
 
@@ -68,7 +70,7 @@ def _warm_up_and_cosine(optimizer: Any, epochs: int) -> Any:
     return lr_scheduler.SequentialLR(optimizer, parts, milestones=[1])
 
 
-def _linear_to_zero(optimizer: Any, total_steps: int) -> Any:
+def _linear_to_zero(optimizer: Any, total_steps: Any) -> Any:
     return lr_scheduler.LambdaLR(optimizer, lambda step: 1 - step / total_steps)
 
 
@@ -81,8 +83,16 @@ FIXED: dict[str, Any] = {
     "linear warm-up": partial(lr_scheduler.LinearLR, total_iters=4),
     "one restart": partial(lr_scheduler.CosineAnnealingWarmRestarts, T_0=4),
     "sequence": partial(_warm_up_and_cosine, epochs=4),
-    "of every step": partial(lr_scheduler.OneCycleLR, max_lr=LR),
-    "function of every step": _linear_to_zero,
+    "of every step": Schedule(
+        partial(lr_scheduler.OneCycleLR, max_lr=LR, total_steps=None), "step"
+    ),
+    "function of every step": Schedule(partial(_linear_to_zero, total_steps=None), "step"),
+    "warm-up and cosine": Schedule(
+        partial(warmup_cosine, warmup_share=0.25, total_steps=_NULL), "step"
+    ),
+    "of 4 epochs, every other step": Schedule(
+        partial(lr_scheduler.CosineAnnealingLR, T_max=6), "step", 2
+    ),
     **{
         f"{name} of transformers": partial(
             get_scheduler, name, num_warmup_steps=1, num_training_steps=4

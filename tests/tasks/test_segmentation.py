@@ -27,6 +27,10 @@ WEIGHTS = torch.tensor([1.0, 3.0])
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
+def _sample(images: Tensor, target: Tensor) -> Any:
+    return EvaluationSample(images, target, torch.eye(3).double(), 0)
+
+
 class Data(lightning.LightningDataModule):
     """Panoramas whose class is the sign of the first channel.
 
@@ -44,15 +48,14 @@ class Data(lightning.LightningDataModule):
         for signal, other in panoramas:
             truth = np.where(signal > 0, 2, 1).astype(np.uint8)[..., 0]
             truth[:2] = 0
-            whole = TANGENT.whole()
+            (whole,) = TANGENT.view_sets()
             images = np.concatenate([whole.render(x, "nearest") for x in (signal, other)], axis=-1)
             tensor = torch.from_numpy(images).permute(0, 3, 1, 2).contiguous()
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             labels[:7, 1:] = 0
             labels *= len(self.train) != 1
-            where = torch.tensor(whole.rays()), torch.tensor(whole.rotations())
-            self.train.append(TrainingSample(tensor, labels, where[0], 0))
-            self.test.append(EvaluationSample(tensor, torch.from_numpy(truth), *where, 0))
+            self.train.append(TrainingSample(tensor, labels, torch.tensor(whole.rays()), 0))
+            self.test.append(_sample(tensor, torch.from_numpy(truth)))
 
     def train_dataloader(self) -> DataLoader[Any]:
         return DataLoader(self.train, self.batch_size)
@@ -83,7 +86,7 @@ def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
     task = _task(SignNetwork(), images_per_forward=7)
     trainer = quiet_trainer()
     (figures,) = trainer.test(task, datamodule=Data(), verbose=False)
-    assert task.result.images == 3
+    assert task.evaluated == 3
     assert task.result.pixels[0].sum() == 0, "unknown truth counts for nothing"
     assert task.result.pixels[:, 0].sum() == 0, "unknown is never predicted"
     assert task.result.pixels.sum() == 3 * 30 * 64
@@ -146,12 +149,10 @@ def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() 
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
     assert network.told == [((2, 20, 3, 3), 3)]
     network.told.clear()
-    task.representation = TangentRepresentation(0, 4, average_rotations=2)
+    task.representation = TangentRepresentation(0, 4, rotations=2)
     target = torch.ones(32, 64, dtype=torch.uint8)
     target[16:] = 2
-    views = task.representation.whole()
-    where = torch.tensor(views.rays()), torch.tensor(views.rotations())
-    samples: Any = [EvaluationSample(torch.zeros(40, 2, 16, 16), target, *where, 0)]
+    samples: Any = [_sample(torch.zeros(40, 2, 16, 16), target)]
     quiet_trainer().test(task, DataLoader(samples), verbose=False)
     assert network.told == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
     pixels = task.result.pixels

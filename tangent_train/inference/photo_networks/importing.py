@@ -26,7 +26,7 @@ from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
-from tangent_train.inference.views import check_size
+from tangent_train.inference.representations import check_size
 from tangent_train.registry import unregistered
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"

@@ -10,19 +10,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
-from PIL import Image
 from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import shift_range
 from tangent_train.registry import registered
-from tangent_train.rendering.forward import Interpolation
-from tangent_train.rendering.representations.views import Views
+from tangent_train.rendering.forward import Interpolation, Pixels
+from tangent_train.rendering.kernels import CanvasGeometry
+from tangent_train.rendering.representations.views import NO_RAYS, Placement, Views
+from tangent_train.rendering.resampling import crop
+from tangent_train.rendering.sampling import plane_rays
 
 _PAPER_FOV_DEG = 45.0
 
@@ -30,38 +33,67 @@ _NEGLIGIBLE = 1e-6
 """Share of a crop's side that may stay uncovered."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PhotoCrops(Views):
     """Crops of one photo.
 
     Attributes:
-        boxes: ``(n, 4)`` left, top, right and bottom in the photo, in pixels from its corner.
+        boxes: ``(N, 4)`` left, top, right and bottom of all crops in the photo, in pixels from its
+            corner.
         size: Rows and columns of the crops.
-        mirrored: Whether they are mirrored left to right.
+        mirrored: True if they are mirrored left to right.
+        numbers: ``(n,)`` crops that are rendered; None for all.
+        canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
+        overlapping: See `Placement`.
     """
 
     boxes: NDArray[np.float64]
     size: tuple[int, int]
     mirrored: bool = False
+    numbers: NDArray[np.int64] | None = None
+    canvas_boxes: NDArray[np.float64] | None = None
+    overlapping: bool = True
 
-    def render(self, image: NDArray[Any], interpolation: Interpolation) -> NDArray[Any]:
-        """Render a photo ``(H, W[, C])`` to crops ``(n, h, w[, C])``, dtype kept.
+    def __len__(self) -> int:
+        return len(self.chosen)
 
-        Args:
-            image: The photo; for `bilinear` uint8.
-            interpolation: `bilinear` antialiases when it downsamples (a triangle filter two crop
-                pixels wide). `nearest` takes the pixel at the centre.
-        """
-        draw = _nearest if interpolation == "nearest" else _smooth
-        crops = np.stack([draw(image, box, self.size) for box in self.boxes])
+    def __getitem__(self, part: slice) -> Self:
+        return replace(self, numbers=self.chosen[part])
+
+    @property
+    def chosen(self) -> NDArray[np.int64]:
+        """See `Placement`."""
+        return np.arange(len(self.boxes)) if self.numbers is None else self.numbers
+
+    @property
+    def all_images(self) -> object:
+        """See `Placement`."""
+        return self.boxes
+
+    def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
+        """See `Views`; for ``bilinear`` an array is uint8."""
+        parts: Any = [crop(image, b, self.size, interpolation) for b in self.boxes[self.chosen]]
+        if isinstance(image, Tensor):
+            crops = torch.stack(parts)
+            return crops.flip(-1) if self.mirrored else crops
+        crops = np.stack(parts)
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
 
+    def rays(self) -> NDArray[np.float32]:
+        """No rays: they are not images of a sphere."""
+        return NO_RAYS
+
+    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Placement]:
+        """See `Views`."""
+        del shape
+        return scores, self
+
     def owned(self) -> NDArray[np.bool_]:
-        """Pixels of each crop that lie nearer to its centre than to any other's, ``(n, h, w)``.
+        """Pixels of each crop that lie nearer to its center than to any other's, ``(n, h, w)``.
 
         So every point of the photo counts once, however much the crops overlap.
         """
-        cells = self.cells()
+        cells = cells_of(self.boxes)
         across, down = (
             (cells[:, None, axis] <= places) & (places < cells[:, None, axis + 2])
             for axis in (0, 1)
@@ -70,47 +102,74 @@ class PhotoCrops(Views):
         return down[:, :, None] & across[:, None, :]
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """``(H, W)`` the crop whose centre is nearest to each pixel of the photo."""
-        height, width = shape
-        edges = np.ceil(self.cells() - 0.5).clip(0, (width, height, width, height)).astype(int)
+        """See `Placement`."""
         owner = np.zeros(shape, np.int32)
-        for number, (left, top, right, bottom) in enumerate(edges):
+        for number, (left, top, right, bottom) in enumerate(self._owned_pixels(shape)):
             owner[top:bottom, left:right] = number
         return owner
 
-    def cells(self) -> NDArray[np.float64]:
-        """The part of the photo that lies nearer to a crop's centre than to any other's.
+    def geometry(
+        self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
+    ) -> CanvasGeometry:
+        """See `Placement`."""
+        boxes = self._on_canvas[self.chosen]
+        across, down = (self.size[1 - i] / (boxes[:, 2 + i] - boxes[:, i]) for i in (0, 1))
+        # Of the ray (j, 1, i): pixel j of the photo is at j + ½ from its corner.
+        matrices = np.zeros((len(boxes), 3, 3))
+        matrices[:, 0, 0], matrices[:, 0, 1] = across, (0.5 - boxes[:, 0]) * across - 0.5
+        matrices[:, 1, 2], matrices[:, 1, 1] = down, (0.5 - boxes[:, 1]) * down - 0.5
+        matrices[:, 2, 1] = 1
+        columns, lines = plane_rays(shape)
+        seen = np.concatenate([np.floor(boxes[:, :2]), np.ceil(boxes[:, 2:])], axis=1)
+        spans = _spans(seen, shape)[:, rows]
+        return CanvasGeometry(self.chosen, matrices, spans, columns, lines[rows], owner)
 
-        Returns:
-            ``(n, 4)`` left, top, right and bottom, as `boxes`; infinite beyond the outermost.
-        """
-        cells = np.empty_like(self.boxes)
-        for axis in (0, 1):
-            middle = (self.boxes[:, axis] + self.boxes[:, axis + 2]) / 2
-            centers, own = np.unique(np.round(middle, 6), return_inverse=True)
-            edges = np.array([-np.inf, *(centers[1:] + centers[:-1]) / 2, np.inf])
-            cells[:, axis], cells[:, axis + 2] = edges[own], edges[own + 1]
-        return cells
+    def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
+        """See `Placement`."""
+        return _spans(self._owned_pixels(shape)[self.chosen], shape)
+
+    def _owned_pixels(self, shape: tuple[int, int]) -> NDArray[np.intp]:
+        """``(N, 4)`` first column and row of the owned pixels, and those after the last."""
+        height, width = shape
+        edges = np.ceil(cells_of(self._on_canvas) - 0.5).clip(0, (width, height, width, height))
+        return edges.astype(np.intp)
+
+    @property
+    def _on_canvas(self) -> NDArray[np.float64]:
+        return self.boxes if self.canvas_boxes is None else self.canvas_boxes
 
     def _places(self, axis: int) -> NDArray[np.float64]:
-        """``(n, pixels)`` where the centres of a crop's columns (0) or rows (1) are."""
+        """``(n, pixels)`` where the centers of a crop's columns (0) or rows (1) are."""
         near, far, count = self.boxes[:, axis], self.boxes[:, axis + 2], self.size[1 - axis]
         return np.linspace(near, far, 2 * count + 1, axis=1)[:, 1::2]
 
 
-def _smooth(image: NDArray[Any], box: NDArray[np.float64], size: tuple[int, int]) -> NDArray[Any]:
-    resized = Image.fromarray(image).resize(
-        size[::-1], Image.Resampling.BILINEAR, box=tuple(box.tolist())
-    )
-    return np.asarray(resized)
+def cells_of(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The part of the photo that lies nearer to a crop's center than to any other's.
+
+    Args:
+        boxes: ``(N, 4)`` left, top, right and bottom of all crops.
+
+    Returns:
+        ``(N, 4)`` cells; infinite beyond the outermost.
+    """
+    cells = np.empty_like(boxes)
+    for axis in (0, 1):
+        middle = (boxes[:, axis] + boxes[:, axis + 2]) / 2
+        centers, number = np.unique(np.round(middle, 6), return_inverse=True)
+        edges = np.array([-np.inf, *(centers[1:] + centers[:-1]) / 2, np.inf])
+        cells[:, axis], cells[:, axis + 2] = edges[number], edges[number + 1]
+    return cells
 
 
-def _nearest(image: NDArray[Any], box: NDArray[np.float64], size: tuple[int, int]) -> NDArray[Any]:
-    columns, rows = (
-        np.linspace(near, far, 2 * count + 1)[1::2].astype(np.intp)
-        for near, far, count in zip(box[:2], box[2:], size[::-1], strict=True)
-    )
-    return image[rows][:, columns]
+def _spans(edges: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.int32]:
+    """``(n, H, 2)`` spans of rectangles, see `CanvasGeometry`."""
+    height, width = shape
+    spans = np.zeros((len(edges), height, 2), np.int32)
+    clipped = edges.clip(0, (width, height, width, height)).astype(int)
+    for span, (left, top, right, bottom) in zip(spans, clipped, strict=True):
+        span[top:bottom] = left, right - left
+    return spans
 
 
 @dataclass(frozen=True)
@@ -134,9 +193,9 @@ class PhotoSampler:
         shifts = rng.uniform(least, greatest, (wanted.crops_per_photo, 2))
         return self._crops(shifts, mirrored=wanted.mirror and bool(rng.random() < 0.5))
 
-    def whole(self) -> PhotoCrops:
+    def view_sets(self) -> list[PhotoCrops]:
         """The fewest crops that cover the photo, evenly spread."""
-        return self.cover()
+        return [self.cover()]
 
     def cover(self, overlap: float = 0.0) -> PhotoCrops:
         """The fewest crops that cover the photo, evenly spread.
@@ -218,16 +277,3 @@ class PerspectiveRepresentation:
             size: ``(height, width)`` of the photo.
         """
         return PhotoSampler(camera_matrix, size, self)
-
-    def to_labels(
-        self, scores: Tensor, shape: tuple[int, ...], rotation: NDArray[np.float64] | None = None
-    ) -> Tensor:
-        """The best class of every pixel of every crop.
-
-        Args:
-            scores: Of all crops.
-            shape: Ignored: that of the crops.
-            rotation: Ignored: photos are not rotated.
-        """
-        del shape, rotation
-        return scores.argmax(dim=1)

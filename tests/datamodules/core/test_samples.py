@@ -62,8 +62,8 @@ def test_normalize_against_the_formula(depth: bool) -> None:
 @pytest.mark.parametrize(
     "representation",
     [
-        TangentRepresentation(0, 5, rotation="so3", faces_per_panorama=4, mirror=True),
-        EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+        TangentRepresentation(0, 5, random_rotation="so3", faces_per_panorama=4, mirror=True),
+        EquirectRepresentation(5, crop_deg=90, random_rotation="yaw", mirror=True),
     ],
 )
 def test_elevation_is_how_far_a_pixel_looks_up(
@@ -86,7 +86,7 @@ def test_elevation_is_how_far_a_pixel_looks_up(
 def test_rays_of_a_tilted_panorama_point_where_its_pixels_are_in_the_world(tilt_deg: int) -> None:
     """Tilted about y; the directions of pixels come from a rendered picture of directions."""
     sine, cosine = np.sin(np.radians(tilt_deg)), np.cos(np.radians(tilt_deg))
-    views = TangentRepresentation(0, 5, rotation="so3").sample(np.random.default_rng(2))
+    views = TangentRepresentation(0, 5, random_rotation="so3").sample(np.random.default_rng(2))
     rays = world_rays(views, np.array([sine, 0, cosine]))
     ahead, right, up = np.moveaxis(
         views.render(equirect_directions((256, 512)).astype(np.float32), "bilinear"), -1, 0
@@ -116,7 +116,7 @@ def test_training_sample(erp: Representation) -> None:
     # The same pixels in all channels; neither depth nor labels are interpolated.
     for channel in range(3):
         torch.testing.assert_close(rgb[..., channel], sample.labels)
-    sample = _training(TangentRepresentation(0, 3, rotation="so3"))[0, 0]
+    sample = _training(TangentRepresentation(0, 3, random_rotation="so3"))[0, 0]
     torch.testing.assert_close(sample.images[1], sample.labels.short() * 4)
     assert not torch.equal(sample.images[0][..., 0], sample.labels), "colours are interpolated"
 

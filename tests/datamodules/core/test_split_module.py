@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,14 +11,22 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from lightning import LightningModule, Trainer
 from lightning.pytorch.plugins import HalfPrecision
+from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
 
 from datamodules.core.class_weights import class_weights
+from datamodules.core.index import SPLITS
 from datamodules.core.loading import EpochSampler, sample_rng
+from datamodules.core.panoramas import ImageFiles
+from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
+from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import SettingError
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
+from tests.conftest import fabricate
+from tests.datamodules.data_files import names_of
 
 MakeModule = Callable[..., Stanford2D3DS]
 
@@ -79,7 +88,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     assert aware.up is not None
     assert np.degrees(np.arccos(aware.up[2])) == pytest.approx(30)
     representation = TangentRepresentation(0, 3)
-    rotation = aware.sampler(representation).whole().rotations()[0]
+    rotation = aware.sampler(representation).grid.rotation
     np.testing.assert_allclose(rotation @ [0, 0, 1], aware.up, atol=1e-12)
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
@@ -139,6 +148,88 @@ def test_processes_share_the_panoramas(
             steps.add(len(module.train_dataloader()))
     assert sorted(seen) == list(range(5))
     assert len(steps) == 1
+
+
+def test_processes_take_the_index_of_the_first_which_has_read_everything_once(
+    tmp_path: Path, erp: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = fabricate(tmp_path)
+    broken = next((root / "area_1/pano/rgb").iterdir())
+    content = broken.read_bytes()
+    broken.write_bytes(content[:200] + bytes(20) + content[220:])
+    read: list[str] = []
+
+    def counted(self: StanfordReader, files: ImageFiles) -> NDArray[np.uint8]:
+        read.append(files.name)
+        return read_rgb(files.rgb)
+
+    monkeypatch.setattr(StanfordReader, "rgb", counted)
+    sent: list[bytes] = []  # as to another process
+
+    def broadcast(index: Any) -> Any:
+        sent.extend([pickle.dumps(index)] if index is not None else [])
+        return pickle.loads(sent[0])
+
+    names = []
+    for rank in range(2):
+        module = Stanford2D3DS(root, erp, skip_broken=True, validation_fraction=0)
+        for stage in ("fit", "test"):
+            state = SimpleNamespace(fn=TrainerFn.FITTING if stage == "fit" else TrainerFn.TESTING)
+            strategy = SimpleNamespace(broadcast=broadcast)
+            module.trainer = SimpleNamespace(  # type: ignore[assignment]
+                strategy=strategy, state=state, world_size=2
+            )
+            if rank == 0:
+                module.prepare_data()
+            module.setup(stage)
+        names.append([names_of(module, split) for split in SPLITS])
+    assert names[0] == names[1]
+    assert sorted(map(len, names[1])) == [0, 5, 8]
+    assert len(read) == len(set(read)) == 14
+
+
+def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
+    make_module: MakeModule, tmp_path: Path
+) -> None:
+    class Seen(LightningModule):
+        def __init__(self) -> None:
+            super().__init__()
+            self.weight = torch.nn.Parameter(torch.zeros(()))
+            self.batches: dict[str, list[tuple[int, float]]] = {"train": [], "val": []}
+
+        def training_step(self, batch: Any, number: int) -> Any:
+            self.batches["train"].append((int(batch.index), float(batch.images.sum())))
+            return self.weight * 1
+
+        def validation_step(self, batch: Any, number: int) -> None:
+            self.batches["val"].append((int(batch.index), float(batch.images.sum())))
+
+        def configure_optimizers(self) -> Any:
+            return torch.optim.SGD(self.parameters(), 1)
+
+    quiet: dict[str, Any] = {
+        "accelerator": "cpu",
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "enable_model_summary": False,
+        "use_distributed_sampler": False,
+        "num_sanity_val_steps": 0,
+    }
+    task, module = Seen(), make_module(panoramas_per_step=1)
+    Trainer(max_epochs=2, overfit_batches=2, **quiet).fit(task, datamodule=module)
+    first, second, *again = task.batches["train"]
+    assert again == [first, second]
+    assert [index for index, _ in (first, second)] == [0, 1]
+    assert task.batches["val"][:1] == task.batches["val"][-1:]
+    task = Seen()
+    limits: dict[str, Any] = {"limit_train_batches": 3, "limit_val_batches": 1}
+    Trainer(max_epochs=2, **limits, **quiet).fit(task, datamodule=module)
+    assert [len(task.batches[split]) for split in ("train", "val")] == [6, 2]
+    assert len(set(task.batches["train"])) > 3, "another order and other views"
+    task = Seen()
+    Trainer(fast_dev_run=1, **quiet).fit(task, datamodule=module)
+    assert len(task.batches["train"]) == 1
 
 
 def test_images_have_the_precision_of_the_run(

@@ -68,7 +68,9 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def make_module(root: Path) -> MakeModule:
     def make(rotation: Any = "none", **settings: Any) -> ModelNet40:
-        return ModelNet40(root, TangentRepresentation(0, LEVEL, rotation=rotation), **settings)
+        return ModelNet40(
+            root, TangentRepresentation(0, LEVEL, random_rotation=rotation), **settings
+        )
 
     return make
 
@@ -172,7 +174,7 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         mesh = clean_mesh(read_off(root / f"{module.source('test').name(index)}.off"))
         mesh.vertices = mesh.vertices @ rotated.T
         steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
-        views = representation.whole()
+        (views,) = representation.view_sets()
         expected = np.concatenate(
             [views.render(steps[..., k : k + 3], "bilinear") for k in (0, 3)], axis=-1
         )

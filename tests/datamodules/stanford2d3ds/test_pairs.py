@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs, read_panorama_pose
+from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
+from datamodules.stanford2d3ds.reader import read_panorama_pose
 from datamodules.synthrooms.datamodule import SynthRoomsPairs
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import DataError, SettingError

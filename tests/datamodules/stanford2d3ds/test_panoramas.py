@@ -20,20 +20,42 @@ from tangent_train.rendering import (
     PerspectiveRepresentation,
     TangentRepresentation,
 )
+from tests.cli.tiny_runs import run_command
 from tests.conftest import fabricate
-from tests.datamodules.data_files import names_of, read_png
+from tests.datamodules.data_files import names_of, read_png, write_png
 
 
 def _colors(indices: list[int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.array([[[i >> 16, i >> 8 & 255, i & 255] for i in indices]], np.uint8)
 
 
-def test_what_is_past_the_end_of_the_table_is_missing_or_a_mistake() -> None:
+def test_pixels_of_instances_past_the_end_of_the_table_are_unknown() -> None:
     # #0D0D0D without its red byte would be entry 3341 of the table.
     table = LabelTable(np.full(9816, 6, np.uint8))
-    assert table.decode(_colors([0x0D0D0D, 9815])).tolist() == [[0, 6]]
-    with pytest.raises(DataError, match="found instance 9816 in 2 pixels; expected 0 to 9815"):
-        table.decode(_colors([0x0D0D0D, 9815, 9816, 0xFFFFFF]))
+    colors = _colors([0x0D0D0D, 9815, 9816, 0xFFFFFF])
+    assert table.decode(colors).tolist() == [[0, 6, 0, 0]]
+    assert table.past_end(colors).tolist() == [9816, 0xFFFFFF]
+
+
+def test_instances_past_the_end_are_counted_and_listed_by_the_check(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = fabricate(tmp_path, dict.fromkeys(AREAS, ("office_1",)))
+    file = next((root / "area_6/pano/semantic").iterdir())
+    colors = read_png(file)
+    known = int((colors != 13).any(-1).sum())
+    colors[20:22, 30:32] = (0xAB, 0xCD, 0xEF)
+    write_png(file, colors)
+    data = Stanford2D3DS(root, level=3, validation_fraction=0)
+    data.prepare_data()
+    problems, _ = data.check()
+    (warning,) = problems.warnings
+    assert warning.startswith(f"{file}: 4 pixels of instance {0xEFCDAB} or higher, past the end")
+    assert not problems.listed()
+    place = [files.labels for files in data.index().splits["train"]].index(file)
+    assert np.count_nonzero(data.source("train").labels(place)) == known / 4 - 1
+    run_command(monkeypatch, "check", "data=stanford2d3ds", f"data.root={root}", "level=3")
+    assert f"Warning: {warning}" in capsys.readouterr().err
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -99,7 +121,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     np.testing.assert_array_equal(panorama.labels, classes)
     known = classes > 0
     np.testing.assert_array_equal(
-        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, 0)
+        steps_to_meters(panorama.depth), np.where(known, 1 + (classes - 1) / 4, np.nan)
     )
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))

@@ -17,11 +17,12 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError
 from tangent_train.inference.class_maps import ClassMap, map_classes
+from tangent_train.inference.engine import Predictor
 from tangent_train.inference.export import export_network
+from tangent_train.inference.images import InputImage
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.photo_networks.score_kinds import try_network
-from tangent_train.inference.predictor import Predictor
-from tangent_train.inference.views import InputImage, PanoramaViews
+from tangent_train.inference.representations import PanoramaViews
 from tests.models.onnx_files import write_linear
 
 UNIT = Normalization((0, 0, 0), (1, 1, 1))
@@ -228,7 +229,7 @@ def test_one_score_is_of_a_class_and_its_background(
     images = _images(16, 24)
     expected = np.einsum("c,bchw->bhw", weight[0].astype(np.float64), images.double()) - 1
     scores = trained.network(images)
-    labels = trained.labels(scores.argmax(dim=1).numpy().astype(np.uint8))
+    labels = trained.labels(scores.argmax(dim=1).byte())
     background = 0 if len(names) == 1 else 1
     np.testing.assert_array_equal(labels, np.where(expected > 0, background + 1, background))
     shares = scores.softmax(dim=1)[:, len(names) - 1]
@@ -249,7 +250,7 @@ def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path
         expected = network(images).sigmoid()
         found = again.network(images).softmax(dim=1)
     torch.testing.assert_close(found[:, :1], expected, atol=1e-5, rtol=1e-4)
-    assert again.labels(np.array([0, 1], np.uint8)).tolist() == [1, 0]
+    assert again.labels(torch.tensor([0, 1], dtype=torch.uint8)).tolist() == [1, 0]
 
 
 def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path) -> None:
@@ -258,7 +259,7 @@ def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path)
     images, shown = _images(16, 24), _linear(_images(16, 24)) - 2
     for wins in (True, False):
         trained = _imported(path, unknown_wins=wins)
-        labels = trained.labels(trained.network(images).argmax(dim=1).numpy().astype(np.uint8))
+        labels = trained.labels(trained.network(images).argmax(dim=1).byte())
         best = shown.argmax(axis=-1) + 1
         unknown = (shown.max(axis=-1) < 0) & wins
         assert unknown.any() == wins
@@ -299,14 +300,14 @@ def test_other_values_of_label_maps_are_unknown(
     best = _linear(images).argmax(axis=-1)
     assert set(np.unique(best)) == set(range(5))
     found = trained.network(images)
-    labels = trained.labels(found.argmax(dim=1).numpy().astype(np.uint8))
+    labels = trained.labels(found.argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, np.where(best == 3, 0, best + 1))
     assert float(found.softmax(dim=1).amax(dim=1).min()) > 0.999
     with pytest.raises(SettingError, match="unknown_wins: found false, for label maps"):
         _imported(path, names, unknown_wins=False)
     merged = ClassMap("two", None, {"x": ["a", "b"], "y": ["c"]})
     mapped = map_classes(trained, merged).trained
-    labels = mapped.labels(mapped.network(images).argmax(dim=1).numpy().astype(np.uint8))
+    labels = mapped.labels(mapped.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, np.array([1, 1, 2, 0, 0])[best])
     with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
         map_classes(trained, merged, "never")
@@ -338,7 +339,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     again, images = load_trained(tmp_path / f"net.{suffix}", [name]), _images(32, 48)
     assert again.score_kind == "labels"
     expected = np.array([1, 2, 0, 3])[network(images)]
-    labels = again.labels(again.network(images).argmax(dim=1).numpy().astype(np.uint8))
+    labels = again.labels(again.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, expected)
     with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
         map_classes(again, ClassMap("one", None, {"x": ["a"]}), "never")

@@ -104,8 +104,7 @@ def test_a_second_output_and_one_score(activation: str | None, tmp_path: Path) -
     trained = import_network(_load(tmp_path / "net", "unit"), tmp_path / "net.ckpt")
     shares, scores = shares_of_own(), imported_scores(trained)
     torch.testing.assert_close(scores.softmax(dim=0)[0], shares, rtol=0, atol=1e-4)
-    best = scores.argmax(dim=0).numpy().astype("uint8")
-    labels = torch.from_numpy(trained.labels(best))
+    labels = torch.from_numpy(trained.labels(scores.argmax(dim=0).byte()))
     assert 0.2 < float((shares > 0.5).float().mean()) < 0.8
     assert torch.equal(labels == 1, shares > 0.5)
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from tangent_train.rendering import (
     rotate_equirect,
     tangent_to_equirect,
 )
+from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.geometry.directions import unit
 from tests.rendering.reference import certain_labels, panorama_lonlat, sample_panorama
@@ -38,6 +40,17 @@ def _scores(labels: NDArray[np.uint8]) -> torch.Tensor:
     return torch.nn.functional.one_hot(torch.from_numpy(labels).long(), 9).movedim(-1, 1).float()
 
 
+def _labels_of(
+    representation: Representation, scores: Sequence[torch.Tensor], shape: tuple[int, int] = SHAPE
+) -> NDArray[np.unsignedinteger]:
+    sets = representation.view_sets()
+    several, blend = len(sets) > 1, representation.blend
+    mosaic = ScoreMosaic(shape, scores[0].shape[1], blend, averaged=several)
+    for views, of_set in zip(sets, scores, strict=True):
+        mosaic.add(of_set, views)
+    return mosaic.labels().numpy()
+
+
 def _rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
@@ -45,12 +58,12 @@ def _rng(seed: int = 0) -> np.random.Generator:
 REPRESENTATIONS: list[Representation] = [
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
-    TangentRepresentation(0, 5, crop_multiple=8, rotation="so3", mirror=True),
+    TangentRepresentation(0, 5, crop_multiple=8, random_rotation="so3", mirror=True),
     CubemapRepresentation(5),
-    CubemapRepresentation(5, dim=41, rotation="so3", mirror=True),
+    CubemapRepresentation(5, dim=41, random_rotation="so3", mirror=True),
     CubemapRepresentation(5, margin=7, blend="feather"),
     EquirectRepresentation(5),
-    EquirectRepresentation(5, crop_deg=90, rotation="yaw", mirror=True),
+    EquirectRepresentation(5, crop_deg=90, random_rotation="yaw", mirror=True),
     EquirectRepresentation(5, rows=100),
     EquirectRepresentation(5, rows=60),
 ]
@@ -62,22 +75,22 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
     representation: Representation, rotation: NDArray[np.float64] | None
 ) -> None:
     labels = _labels()
-    source = representation if rotation is None else representation.turned(rotation)
-    views = source.whole().render(labels, "nearest")
-    assert views.shape[1:] == representation.image_size
-    back = representation.to_labels(_scores(views), SHAPE, rotation)
-    assert (back.dtype, back.shape) == (torch.int64, SHAPE)
-    assert np.mean(back.numpy() == labels) > 0.95, "all but the borders between classes"
+    source = representation if rotation is None else representation.with_rotation(rotation)
+    (views,) = source.view_sets()
+    rendered = views.render(labels, "nearest")
+    assert rendered.shape[1:] == representation.image_size
+    back = _labels_of(source, [_scores(rendered)])
+    assert np.mean(back == labels) > 0.95, "all but the borders between classes"
 
 
 @pytest.mark.parametrize(
     "representation",
     [
-        TangentRepresentation(0, 5, faces_per_panorama=5, rotation="so3", mirror=True),
-        CubemapRepresentation(5, rotation="yaw", mirror=True),
-        CubemapRepresentation(5, rotation="so3"),
-        EquirectRepresentation(5, crop_deg=60, rotation="yaw", mirror=True),
-        EquirectRepresentation(5, rotation="so3"),
+        TangentRepresentation(0, 5, faces_per_panorama=5, random_rotation="so3", mirror=True),
+        CubemapRepresentation(5, random_rotation="yaw", mirror=True),
+        CubemapRepresentation(5, random_rotation="so3"),
+        EquirectRepresentation(5, crop_deg=60, random_rotation="yaw", mirror=True),
+        EquirectRepresentation(5, random_rotation="so3"),
     ],
 )
 def test_a_sample_depends_on_its_generator_alone_and_rotates_with_the_whole(
@@ -95,14 +108,17 @@ def test_a_sample_depends_on_its_generator_alone_and_rotates_with_the_whole(
         seen.append(label_views)
     np.testing.assert_array_equal(seen[0], seen[1])
     assert not np.array_equal(seen[0], seen[2])
-    plain, rotated = (r.sample(_rng()) for r in (representation, representation.turned(TILT)))
-    np.testing.assert_allclose(rotated.rotations(), TILT @ plain.rotations(), atol=1e-12)
+    plain, rotated = (
+        r.sample(_rng()).render(equirect_directions(SHAPE).astype(np.float32), "bilinear")
+        for r in (representation, representation.with_rotation(TILT))
+    )
+    np.testing.assert_allclose(rotated, plain @ TILT.T, atol=0.05)
 
 
 def test_faces_are_drawn_without_repetition_and_all_of_them_sooner_or_later() -> None:
     representation = TangentRepresentation(0, 5, faces_per_panorama=5)
     x = np.arange(64 * 128, dtype=np.float32).reshape(SHAPE)
-    whole = representation.whole().render(x, "nearest")
+    whole = representation.view_sets()[0].render(x, "nearest")
     drawn = set()
     for seed in range(30):
         views = representation.sample(_rng(seed)).render(x, "nearest")
@@ -148,14 +164,14 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (TangentRepresentation, {"dim": 64, "crop_multiple": 16}, "representation.dim"),
         (TangentRepresentation, {"dim": 8}, "dim: found 8; expected at least 24"),
         (TangentRepresentation, {"faces_per_panorama": 0}, "1 to 20"),
-        (TangentRepresentation, {"rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
+        (TangentRepresentation, {"random_rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
         (TangentRepresentation, {"blend": "average"}, "'nearest' or 'feather'"),
-        (TangentRepresentation, {"average_rotations": 0}, "average_rotations: found 0"),
+        (TangentRepresentation, {"rotations": 0}, "rotations: found 0"),
         (EquirectRepresentation, {"crop_deg": 0}, "crop_deg: found 0; expected 0 to 360"),
         (EquirectRepresentation, {"crop_deg": 361}, "crop_deg: found 361"),
         (EquirectRepresentation, {"rows": 0}, "rows: found 0"),
-        (EquirectRepresentation, {"rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
-        (EquirectRepresentation, {"average_rotations": 0}, "average_rotations: found 0"),
+        (EquirectRepresentation, {"random_rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
+        (EquirectRepresentation, {"rotations": 0}, "rotations: found 0"),
     ],
 )
 def test_impossible_settings_are_refused(made: Any, settings: dict[str, Any], message: str) -> None:
@@ -169,17 +185,20 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
     """Independent: rotating what is looked at instead, with `rotate_equirect`."""
     waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
     image = waves.astype(np.float32)
-    views = representation.turned(TILT).whole().render(image, "bilinear")
-    expected = representation.whole().render(rotate_equirect(image, TILT.T), "bilinear")
+    (rotated,), (plain,) = (
+        representation.with_rotation(TILT).view_sets(),
+        representation.view_sets(),
+    )
+    views = rotated.render(image, "bilinear")
+    expected = plain.render(rotate_equirect(image, TILT.T), "bilinear")
     np.testing.assert_allclose(views, expected, atol=2)
-    np.testing.assert_array_equal(representation.turned(TILT).whole().rotations(), TILT[None])
 
 
 @pytest.mark.parametrize("rows", [24, 100])
 def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> None:
     """Against bilinear interpolation in double precision, across the seam and beyond the poles."""
     scores = torch.randn(1, 3, rows, 2 * rows, generator=torch.Generator().manual_seed(0))
-    found = EquirectRepresentation(5, rows=rows).to_labels(scores, SHAPE).numpy()
+    found = _labels_of(EquirectRepresentation(5, rows=rows), [scores])
     image = scores[0].movedim(0, -1).double().numpy()
     expected = sample_panorama(image, panorama_lonlat(SHAPE), "bilinear")
     clear = certain_labels(expected, margin=1e-4)
@@ -189,15 +208,15 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
 
 def test_the_identity_is_no_rotation() -> None:
     """Tables of rotated images are not kept."""
-    assert TangentRepresentation(0, 5).turned(np.eye(3)).grid == TangentGrid(0, 5)
+    assert TangentRepresentation(0, 5).with_rotation(np.eye(3)).grid == TangentGrid(0, 5)
 
 
 @pytest.mark.parametrize(
     ("averaged", "levels", "blend", "least"),
     [
-        ({"average_rotations": 3}, [4, 4, 4], "nearest", 0.999),
-        ({"average_rotations": 3}, [4, 4, 4], "feather", 0.95),
-        ({"further_levels": [3, 2]}, [4, 3, 2], "nearest", 0.999),
+        ({"rotations": 3}, [4, 4, 4], "nearest", 0.999),
+        ({"rotations": 3}, [4, 4, 4], "feather", 0.95),
+        ({"levels": [4, 3, 2]}, [4, 3, 2], "nearest", 0.999),
     ],
 )
 def test_averages_have_the_highest_mean_probability(
@@ -208,57 +227,52 @@ def test_averages_have_the_highest_mean_probability(
     Feathered ones are added up with the weights of all parts, there with those of each: almost the
     same.
     """
-    representation = TangentRepresentation(0, 4, blend=blend, **averaged).turned(TILT)
-    views = representation.whole()
-    rotations, shape = views.rotations(), (32, 64)
-    assert rotations.shape == (3, 3, 3)
-    np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
+    representation = TangentRepresentation(0, 4, blend=blend, **averaged).with_rotation(TILT)
+    views, shape = representation.view_sets(), (32, 64)
+    angles = [24 * k if "rotations" in averaged else 0 for k in range(3)]
+    rotations = [TILT @ rotation_about((0, 0, 1), math.radians(angle)) for angle in angles]
     image = equirect_directions(shape).astype(np.float32)
-    rendered = views.render(image, "bilinear")
     grids = [TangentGrid(0, s, 16, R) for s, R in zip(levels, rotations, strict=True)]
-    for own, grid in zip(np.split(rendered, 3), grids, strict=True):
-        np.testing.assert_array_equal(own, equirect_to_tangent(image, grid))
-    waves = torch.from_numpy(views.rays()).double() @ torch.tensor([3.0, 2.0, 1.0]).double()
+    for of_set, grid in zip(views, grids, strict=True):
+        rendered = of_set.render(image, "bilinear")
+        np.testing.assert_array_equal(rendered, equirect_to_tangent(image, grid))
+    rays = np.concatenate([of_set.rays() for of_set in views])
+    waves = torch.from_numpy(rays).double() @ torch.tensor([3.0, 2.0, 1.0]).double()
     scores = torch.randn(60, 5, 16, 16, generator=torch.Generator().manual_seed(0))
     scores += 4 * torch.sin(waves[:, 2, None, None, None] + torch.arange(5)[:, None, None]).float()
     mean = torch.zeros(5, *shape, dtype=torch.float64)
-    for own_scores, grid in zip(torch.split(scores.double(), 20), grids, strict=True):
+    for of_grid, grid in zip(torch.split(scores.double(), 20), grids, strict=True):
         if blend == "nearest":
-            mean += tangent_to_equirect(own_scores, grid, shape).softmax(dim=0)
+            mean += tangent_to_equirect(of_grid, grid, shape).softmax(dim=0)
         else:
-            mean += tangent_to_equirect(own_scores.softmax(dim=1), grid, shape, blend)
-    labels = representation.to_averaged_labels(iter(torch.split(scores, 20)), shape, rotations)
-    assert labels.dtype == torch.int64
-    assert (labels == mean.argmax(dim=0)).double().mean() > least
+            mean += tangent_to_equirect(of_grid.softmax(dim=1), grid, shape, blend)
+    labels = _labels_of(representation, torch.split(scores, 20), shape)
+    assert (labels == mean.argmax(dim=0).numpy()).mean() > least
 
 
 def test_equirectangular_averages_have_the_highest_mean_probability() -> None:
-    """In a tilted frame: probabilities of every rotation, shifted back, then rotated back."""
-    representation = EquirectRepresentation(4, average_rotations=3).turned(TILT)
-    views, shape = representation.whole(), (32, 64)
-    rotations, columns = views.rotations(), representation.image_size[1]
-    assert rotations.shape == (3, 3, 3)
-    np.testing.assert_allclose(rotations[:, :, 2], np.tile(TILT[:, 2], (3, 1)), atol=1e-12)
+    """In a tilted frame: scores of every rotation, shifted back, then rotated back."""
+    representation = EquirectRepresentation(4, rotations=3).with_rotation(TILT)
+    views, shape = representation.view_sets(), (32, 64)
     image = equirect_directions(shape).astype(np.float32)
-    upright = EquirectRepresentation(4).turned(TILT).whole().render(image, "bilinear")
-    shifts = [0, round(columns / 3), round(columns * 2 / 3)]
-    rendered = views.render(image, "bilinear")
-    for own, shift in zip(rendered, shifts, strict=True):
-        np.testing.assert_allclose(np.roll(own, shift, axis=1), upright[0], atol=0.02)
-    generator = torch.Generator().manual_seed(0)
-    scores = torch.randn(3, 5, *representation.image_size, generator=generator)
-    for place, shift in enumerate(shifts):
-        waves = torch.from_numpy(upright[0] @ [3.0, 2.0, 1.0]).float()
-        scores[place] += 4 * torch.sin(waves + torch.arange(5)[:, None, None]).roll(-shift, -1)
-    mean = torch.zeros(5, *shape, dtype=torch.float64)
-    for one, shift in zip(scores.double(), shifts, strict=True):
-        mean += one.roll(shift, -1).softmax(dim=0)
-    best = rotate_equirect(mean.argmax(dim=0).numpy().astype(np.uint8), TILT, "nearest")
-    labels = representation.to_averaged_labels(iter(scores[:, None]), shape, rotations)
-    assert labels.dtype == torch.int64
-    assert (labels.numpy() == best).mean() > 0.999
-    first = representation.to_labels(scores[:1], shape, rotations[0])
-    assert (first.numpy() == best).mean() < 0.95, "averaging does something"
+    (plain,) = EquirectRepresentation(4).with_rotation(TILT).view_sets()
+    upright = plain.render(image, "bilinear")[0]
+    shifts = [0, 21, 43]
+    for of_set, shift in zip(views, shifts, strict=True):
+        seen = of_set.render(image, "bilinear")[0]
+        np.testing.assert_array_equal(np.roll(seen, shift, axis=1), upright)
+    waves = torch.from_numpy(upright @ [3.0, 2.0, 1.0]) + torch.arange(5)[:, None, None]
+    noise = torch.randn(3, 5, *shape, generator=torch.Generator().manual_seed(0))
+    scores = [(4 * torch.sin(waves) + n).float().roll(-k, -1) for n, k in zip(noise, shifts)]  # noqa: B905
+    upright_scores = [one.roll(shift, -1) for one, shift in zip(scores, shifts, strict=True)]
+    mean = sum(
+        torch.from_numpy(rotate_equirect(one.movedim(0, -1).double().numpy(), TILT)).softmax(-1)
+        for one in upright_scores
+    )
+    labels = _labels_of(representation, [one[None] for one in scores], shape)
+    assert (labels == torch.as_tensor(mean).argmax(-1).numpy()).mean() > 0.999
+    first = _labels_of(EquirectRepresentation(4).with_rotation(TILT), [scores[0][None]], shape)
+    assert (first != labels).mean() > 0.02, "averaging does something"
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

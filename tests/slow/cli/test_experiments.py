@@ -30,7 +30,7 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
         settings["trainer"], "trainer", logger=False, enable_checkpointing=False
     )
     assert trainer.max_epochs == settings["trainer"]["max_epochs"]
-    assert task.optimization(lambda: 1000)
+    assert task.optimization(lambda: {"epoch": 1000, "step": 1000})
     return set(task.state_dict())
 
 

@@ -15,7 +15,7 @@ import torch
 from lightning.pytorch.plugins import MixedPrecision
 
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.results.evaluation import segmentation_record, write_results
+from tangent_train.results.evaluation import write_results
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
 WITHOUT_VALIDATION = pytest.mark.filterwarnings(
@@ -63,7 +63,7 @@ def test_panoramas_without_a_labelled_pixel(root: Path, tmp_path: Path, absent: 
     panels = PredictionPanels(tmp_path / "panels", count=2)
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
-    record = segmentation_record(task.result, task.class_names, absent, data.noun)
+    record = task.record(task.result, data.noun)
     write_results(record, tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert written["images"] == 5

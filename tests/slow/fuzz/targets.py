@@ -24,8 +24,7 @@ from datamodules.images.gpano import area_of, up_of
 from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.files import CLASSES
-from datamodules.stanford2d3ds.pairs import read_panorama_pose
-from datamodules.stanford2d3ds.reader import LabelTable, read_camera_matrix
+from datamodules.stanford2d3ds.reader import LabelTable, read_camera_matrix, read_panorama_pose
 from datamodules.zind.homes import list_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about

@@ -13,6 +13,7 @@ from torch.optim import SGD, Adam
 from torch.optim.lr_scheduler import CyclicLR, LinearLR, OneCycleLR, StepLR
 
 from tangent_train.errors import SettingError
+from tangent_train.tasks.schedules import Schedule
 from tests.tasks.shapes import Shapes, SmallNetwork, quiet_trainer, shape_task
 
 pytestmark = pytest.mark.filterwarnings("ignore:Found .* in eval mode")
@@ -79,7 +80,7 @@ def test_what_was_loaded_takes_smaller_steps() -> None:
         (None, 9, 0.1),
         (partial(StepLR, step_size=1, gamma=0.5), 3, 0.025),
         (partial(LinearLR, start_factor=1.0, end_factor=0.5, total_iters=1), 6, 0.05),
-        (partial(OneCycleLR, max_lr=0.1), 1, 4e-7),
+        (Schedule(partial(OneCycleLR, max_lr=0.1, total_steps=None), "step"), 1, 4e-7),
         (
             partial(CyclicLR, base_lr=0.01, max_lr=0.1, step_size_up=1, cycle_momentum=False),
             6,
@@ -113,5 +114,5 @@ def test_schedules_move_both_rates_by_epoch_or_over_the_whole_training(
 
 @pytest.mark.parametrize("factor", [0, -1, float("inf"), "small"])
 def test_impossible_factors_are_refused(factor: Any) -> None:
-    with pytest.raises(SettingError, match=r"optimizer\.backbone_lr_factor: .*task\.frozen"):
+    with pytest.raises(SettingError, match=r"task\.backbone_lr_factor: .*task\.frozen"):
         shape_task(backbone_lr_factor=factor)

@@ -1,0 +1,73 @@
+"""Whole panoramas and photos as arrays, for code of your own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.panoramas import ImageFiles, ImageReader, steps_to_meters
+from datamodules.core.reading import SplitReader
+from datamodules.core.transforms import RotatedPanoramas
+from tangent_train.geometry import PanoramaPose
+
+
+class LabeledImage(NamedTuple):
+    """One panorama or photo.
+
+    Attributes:
+        name: Unique short name; ``/`` between groups.
+        rgb: ``(H, W, 3)`` uint8.
+        labels: ``(H, W)`` uint8 places in the class names of the data set, 0 where unknown.
+        distance_m: ``(H, W)`` float32 metres from the center of the camera, NaN where missing; None
+            without depth among the inputs of the data set.
+        pose: Pose; None if the data set has none. In the axes of a photo, x is its optical axis, y
+            points to the right and z up in the image.
+        camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
+
+    The arrays may be shared or read-only: do not write to them.
+    """
+
+    name: str
+    rgb: NDArray[np.uint8]
+    labels: NDArray[np.uint8]
+    distance_m: NDArray[np.float32] | None
+    pose: PanoramaPose | None
+    camera_matrix: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class LabeledImages(Sequence[LabeledImage]):
+    """The images of a split, read one at a time, as training and evaluation read them.
+
+    Attributes:
+        source: Reader of the split.
+        reader: Reader of the data set.
+    """
+
+    source: SplitReader[ImageFiles, Any]
+    reader: ImageReader
+
+    def __len__(self) -> int:
+        return len(self.source)
+
+    @overload
+    def __getitem__(self, index: int) -> LabeledImage: ...
+    @overload
+    def __getitem__(self, index: slice) -> list[LabeledImage]: ...
+    def __getitem__(self, index: int | slice) -> LabeledImage | list[LabeledImage]:
+        if isinstance(index, slice):
+            return [self[place] for place in range(len(self))[index]]
+        place = range(len(self))[index]
+        files, image = self.source.items[place], self.source.read(place)
+        pose = self.reader.pose(files)
+        for transform in self.source.transforms:
+            if pose is not None and isinstance(transform, RotatedPanoramas):
+                rotation = transform.rotation(place)
+                pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
+        distance_m = None if image.depth is None else steps_to_meters(image.depth)
+        matrix = getattr(image, "camera_matrix", None)
+        return LabeledImage(files.name, image.rgb, image.labels, distance_m, pose, matrix)

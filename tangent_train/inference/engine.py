@@ -1,0 +1,298 @@
+"""The engine: images → views → network → mosaic → labels.
+
+A representation selects the views of an image. The engine renders them, or takes rendered views
+from the loader, gives them to the network a few at a time, and adds the scores to a mosaic. Images,
+views, scores and mosaic are on one device. Validation, test, prediction, transfer, `load` and
+`NetworkJudge` use it.
+"""
+
+from __future__ import annotations
+
+import inspect
+import math
+import weakref
+from collections import deque
+from contextlib import suppress
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+
+from datamodules.core.inputs import MAX_DEPTH_M, normalize
+from datamodules.core.panoramas import STEPS_PER_M, resize_depth
+from datamodules.core.samples import render_inputs
+from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
+from tangent_train.errors import SettingError
+from tangent_train.inference.representations import PanoramaViews
+from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.sampling import sphere_rays
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Iterator, Sequence
+
+    from numpy.typing import NDArray
+    from torch import Tensor, nn
+
+    from datamodules.core.inputs import Input
+    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.inference.images import InputImage
+    from tangent_train.inference.representations import PhotoViews
+    from tangent_train.rendering import Interpolation, Representation
+    from tangent_train.rendering.representations.views import Views
+
+    ViewImages = Callable[[slice], Tensor]
+    """Gives some of the views as images ``(n, C, h, w)``, normalized."""
+
+_PIXELS_PER_FORWARD = 2**20
+
+
+def sees_rays(network: nn.Module) -> bool:
+    """True if a network takes viewing rays, as for cross-image attention."""
+    inner = network.network if isinstance(network, ClassScoreNetwork) else network
+    return "rays" in inspect.signature(inner.forward).parameters
+
+
+def views_per_forward(image_size: tuple[int, int]) -> int:
+    """Views of so many rows and columns per call of a network, which bounds memory."""
+    return max(1, _PIXELS_PER_FORWARD // math.prod(image_size))
+
+
+@torch.no_grad()
+def view_scores(
+    network: Callable[..., Any],
+    images: ViewImages,
+    count: int,
+    per_forward: int,
+    rays: Tensor | None = None,
+) -> Iterator[tuple[slice, Tensor]]:
+    """Scores of the views of one image, a few views at a time.
+
+    Args:
+        network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict with these
+            under ``"out"``.
+        images: The views.
+        count: Number of views N.
+        per_forward: Views per call of the network.
+        rays: ``(N, 3, 3)``, see `Views.rays`, for networks with cross-image attention: they are
+            called once with all views as ``network(images, rays[None])``.
+
+    Yields:
+        Some of the views and their float32 scores ``(n, K, h, w)``.
+    """
+    step = per_forward if rays is None else count
+    for start in range(0, count, step):
+        part = slice(start, min(start + step, count))
+        returned = network(images(part), *(() if rays is None else (rays[None],)))
+        yield part, plain_scores(returned).float()
+
+
+def fill(
+    mosaic: ScoreMosaic,
+    network: Callable[..., Any],
+    sets: Iterable[tuple[Views, ViewImages, Tensor | None]],
+    per_forward: int,
+    progress: Callable[[int], object] = lambda count: None,
+) -> ScoreMosaic:
+    """Add the scores of sets of views to a mosaic.
+
+    Args:
+        mosaic: The mosaic.
+        network: See `view_scores`.
+        sets: Views that cover the whole image, their images, and the rays that the network takes.
+        per_forward: Views per call of the network.
+        progress: Called with the number of views done since its last call.
+    """
+    for views, images, rays in sets:
+        for part, scores in view_scores(network, images, len(views), per_forward, rays):
+            mosaic.add(scores, views[part])
+            progress(part.stop - part.start)
+    return mosaic
+
+
+def upright_rays(
+    representation: Representation, device: torch.device | str
+) -> Iterator[Tensor | None]:
+    """Viewing rays of each set of views, in a frame whose zenith is z.
+
+    Args:
+        representation: The representation of upright panoramas: the views of a tilted panorama
+            stand upright, so their rays are the same.
+        device: Device of the rays.
+    """
+    for views in representation.view_sets():
+        rays = views.rays()
+        yield torch.from_numpy(rays).to(device) if len(rays) else None
+
+
+def input_planes(
+    image: InputImage, shape: tuple[int, int], inputs: Sequence[Input], device: torch.device | str
+) -> tuple[Tensor, list[tuple[Tensor, Interpolation]]]:
+    """The inputs of a network as images of whole panoramas or photos, on a device.
+
+    Args:
+        image: The image.
+        shape: Rows and columns to which it is resized.
+        inputs: Inputs of the network.
+        device: A torch device.
+
+    Returns:
+        RGB ``(3, H, W)`` float32 of 0 to 255; and the others, ``(1, H, W)``, with their
+        interpolation: depth as in `render_inputs`, and elevation.
+    """
+    rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(device).movedim(-1, 0).float()
+    others: list[tuple[Tensor, Interpolation]] = []
+    if "depth" in inputs and image.depth is not None:
+        steps = np.minimum(resize_depth(image.depth, shape), int(MAX_DEPTH_M * STEPS_PER_M))
+        others.append((torch.from_numpy(steps.view(np.int16))[None].to(device), "nearest"))
+    if "elevation" in inputs:
+        up = np.array((0.0, 0.0, 1.0)) if image.up is None else image.up
+        columns, rows = sphere_rays(shape)
+        level, lines = (torch.from_numpy(a).to(device) for a in (up[:2] @ columns, rows))
+        elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
+        others.append((elevation[None].float(), "bilinear"))
+    return resize(rgb, shape, "bilinear"), others
+
+
+class RenderedViews:
+    """The views of one image, rendered on a device as a network takes them.
+
+    On the CPU arrays are rendered (see `render_inputs`), on other devices tensors: the image is
+    copied to the device once, and everything else happens there.
+
+    Args:
+        trained: The network, which is on the device.
+        image: The image.
+        shape: Rows and columns to which it is resized first.
+        device: A torch device.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        image: InputImage,
+        shape: tuple[int, int],
+        device: torch.device | str,
+    ) -> None:
+        weights = next(trained.network.parameters(), None)
+        # Halves the time of a UNet on a CPU; an ONNX file takes the format it was made for.
+        contiguous = torch.contiguous_format
+        self._format = contiguous if weights is None else torch.channels_last
+        self._dtype = torch.float32 if weights is None else weights.dtype
+        self._trained = trained
+        on_cpu = torch.device(device).type == "cpu"
+        self._image = image.resized(shape) if on_cpu else image
+        self._planes = None if on_cpu else input_planes(image, shape, trained.inputs, device)
+
+    def __call__(self, views: Views) -> Tensor:
+        """Views ``(n, C, h, w)``, normalized."""
+        inputs = self._trained.inputs
+        if self._planes is None:
+            rendered = render_inputs(self._image, views, inputs)
+        else:
+            rgb, others = self._planes
+            colors = views.render(rgb, "bilinear").round().movedim(1, -1)
+            rendered = colors, *(views.render(plane, how)[:, 0] for plane, how in others)
+        images = normalize(rendered, self._trained.normalization, inputs)
+        return images.to(self._dtype).contiguous(memory_format=self._format)
+
+    def of(self, views: Views) -> ViewImages:
+        """Gives some of the views."""
+        return lambda part: self(views[part])
+
+
+class Predictor:
+    """Predicts the class scores of whole panoramas or photos.
+
+    Args:
+        trained: The network; it is moved to the device.
+        view_sets: Its views.
+        device: A torch device, or ``auto``: a GPU if there is one.
+        images_per_forward: Views per call of the network, which bounds memory; None for 2^20
+            pixels' worth. A network with cross-image attention takes all views of a panorama
+            at once, and their scores are held.
+        min_confidence: Pixels whose best class has a lower probability, from 0 to 1, are unknown.
+
+    Attributes:
+        device: Device of the network, the views and the mosaic.
+
+    Raises:
+        SettingError: There is no such device, or the confidence is not a probability.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        view_sets: PanoramaViews | PhotoViews,
+        device: str = "cpu",
+        images_per_forward: int | None = None,
+        min_confidence: float = 0.0,
+    ) -> None:
+        if not 0 <= min_confidence <= 1:
+            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
+        if device == "auto":
+            device = "cuda" if torch.cuda.is_available() else "cpu"
+        try:
+            self.device = torch.zeros(1, device=device).device  # an ONNX file has nothing to move
+            trained.network.to(self.device).to(memory_format=torch.channels_last)
+        except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
+            raise SettingError(
+                "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
+            ) from error
+        self._per_forward = images_per_forward or views_per_forward(view_sets.image_size)
+        self._trained, self._view_sets = trained, view_sets
+        self._min_confidence = min_confidence
+        self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
+
+    def predict(
+        self,
+        image: InputImage,
+        progress: Callable[[float], object] = lambda share: None,
+        *,
+        probabilities: bool = False,
+    ) -> ScoreMosaic:
+        """The scores of one image at its own resolution.
+
+        Args:
+            image: A panorama or photo.
+            progress: Called with the share of the image done since its last call.
+            probabilities: True if `ScoreMosaic.probabilities` is needed.
+
+        Returns:
+            The scores; score k is that of label k + 1, the last one perhaps of nothing, see
+            `TrainedNetwork.groups`.
+        """
+        sources = self._view_sets(image)
+        network: Any = self._trained.network
+        device = self.device
+        sets: list[tuple[Views, ViewImages, Tensor | None]] = []
+        for shown, shape, views in sources:
+            rendered = RenderedViews(self._trained, shown, shape, device)
+            sets += [(part, rendered.of(part), None) for part in views]
+        if sees_rays(network):
+            network = partial(network, images_per_chunk=self._per_forward)
+            if isinstance(self._view_sets, PanoramaViews):
+                rays = upright_rays(self._view_sets.representation, device)
+                sets = [(*part[:2], of_set) for part, of_set in zip(sets, rays, strict=True)]
+        count = sum(len(views) for views, _, _ in sets)
+        mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
+        return fill(mosaic, network, sets, self._per_forward, lambda done: progress(done / count))
+
+    def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
+        """A mosaic; it reuses the memory of the last one that is no longer used."""
+        spare = None
+        with suppress(IndexError):
+            spare = self._spare.pop()
+        mosaic = ScoreMosaic(
+            shape,
+            self._trained.network.num_scores,
+            self._view_sets.blend,
+            averaged=averaged,
+            min_confidence=self._min_confidence,
+            device=self.device,
+            spare=spare,
+        )
+        if not isinstance(mosaic.sums, np.memmap):  # room on a disk is given back at once
+            weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
+        return mosaic

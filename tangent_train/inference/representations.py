@@ -1,0 +1,270 @@
+"""The views of new panoramas and photos that a trained network is given."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+
+from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
+from tangent_train.errors import SettingError, width_height
+from tangent_train.inference.images import InputImage
+from tangent_train.registry import build_from_config
+from tangent_train.rendering import (
+    EquirectRepresentation,
+    PerspectiveRepresentation,
+    Representation,
+)
+from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
+from tangent_train.rendering.upright.gravity import upright_rotation
+
+if TYPE_CHECKING:
+    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.rendering import Blend
+    from tangent_train.rendering.representations.views import Views
+
+Levels = int | Sequence[int] | None
+"""A level s, the angular resolution, or several to average over; None as trained."""
+
+_TANGENT = "tangent_train.rendering.TangentRepresentation"
+_PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+_EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
+
+_BASE_LEVEL = 1
+"""For networks trained on photos (paper, section 5: transfer uses b = 1)."""
+
+_OVERLAP = 0.25
+"""Least overlap of neighboring crops of a photo that are feathered, as a share of their side."""
+
+_OVERSAMPLED = 2
+"""Photos are shrunk to so many pixels per pixel of a crop before they are mirrored."""
+
+
+class SourceViews(NamedTuple):
+    """Sets of views that are rendered from one image.
+
+    Attributes:
+        image: The image.
+        shape: Rows and columns to which it is resized first.
+        sets: The sets, each of which shows all of the image.
+    """
+
+    image: InputImage
+    shape: tuple[int, int]
+    sets: Sequence[Views]
+
+
+class PanoramaViews:
+    """Views of panoramas, by default those of training; scores of several sets are averaged.
+
+    Networks trained on photos get tangent images of base level 1, at the level that matches the
+    angular resolution of their crops.
+
+    Args:
+        trained: The network.
+        levels: See `Levels`. All are rendered from a panorama of the highest one.
+        base_level: Base level b of tangent images; None as trained.
+        blend: Blending of overlapping views.
+        rotations: Rotations about the vertical to average over.
+
+    Attributes:
+        representation: The representation of upright panoramas.
+
+    Raises:
+        SettingError: The network cannot take such views.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        levels: Levels = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+        rotations: int = 1,
+    ) -> None:
+        settings = panorama_settings(trained, levels, base_level)
+        settings["rotations"] = rotations
+        if settings["_target_"] != _EQUIRECT:
+            settings["blend"] = blend
+        self.representation = _built(trained, settings)
+        self.image_size = self.representation.image_size
+        self.blend = self.representation.blend
+
+    def __call__(self, image: InputImage) -> list[SourceViews]:
+        """The sets of views of one panorama."""
+        representation: Representation = self.representation
+        if image.up is not None:
+            representation = representation.with_rotation(upright_rotation(image.up))
+        rows = representation.erp_height
+        shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
+        return [SourceViews(image, shape, representation.view_sets())]
+
+
+class PhotoViews:
+    """Crops of photos, with the size and angular resolution of the network's training images.
+
+    Args:
+        trained: The network.
+        levels: See `Levels`.
+        base_level: Crops of the size of tangent images of another base level b.
+        blend: ``feather``: crops overlap by a quarter and are averaged.
+
+    Raises:
+        SettingError: The network cannot take such crops.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        levels: Levels = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+    ) -> None:
+        if "elevation" in trained.inputs:
+            raise SettingError(
+                "projection",
+                found="perspective",
+                expected="equirectangular: the network takes the elevation of every pixel, which "
+                "is unknown in photos",
+            )
+        self._crops = [
+            _photo_representation(trained, level, base_level)
+            for level in level_list(levels, trained.level)
+        ]
+        self.image_size = max(crops.image_size for crops in self._crops)
+        self.blend: Blend = blend
+
+    def __call__(self, image: InputImage) -> list[SourceViews]:
+        """Crops that cover the photo; one smaller than a crop is mirrored at its borders."""
+        overlap = _OVERLAP if self.blend == "feather" else 0.0
+        return [_covered(image, crops, overlap) for crops in self._crops]
+
+
+def panorama_settings(
+    trained: TrainedNetwork, levels: Levels = None, base_level: int | None = None
+) -> dict[str, Any]:
+    """The section of a config for the representation of panoramas, see `PanoramaViews`.
+
+    Args:
+        trained: The network.
+        levels: See `Levels`.
+        base_level: Base level b of tangent images; None as trained.
+
+    Raises:
+        SettingError: The representation does not take several levels.
+    """
+    chosen = level_list(levels, trained.level)
+    level = max(chosen)
+    settings: dict[str, Any] = {k: v for k, v in trained.representation.items() if k != "levels"}
+    kind = settings["_target_"]
+    if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
+        settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
+    if settings["_target_"] == _TANGENT and base_level not in (None, settings["base_level"]):
+        settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
+    if level != trained.level:
+        settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
+    settings["level"] = level
+    if len(chosen) > 1:
+        if settings["_target_"] != _TANGENT:
+            raise SettingError(
+                "levels",
+                found=chosen,
+                expected="one, for a network that does not take tangent images",
+                remedy="Give base_level= to use tangent images.",
+            )
+        settings["levels"] = chosen
+    if settings["_target_"] == _TANGENT and trained.fixed_size is not None:
+        side = max(trained.fixed_size)
+        if base_level is None and settings.get("dim") is None:
+            settings["base_level"] = max(0, math.ceil(level - math.log2(side)))
+        default = settings.get("dim") or 2 ** (level - settings["base_level"])
+        settings["dim"] = max(default, side)  # larger ones are divided
+    return settings
+
+
+def _built(
+    trained: TrainedNetwork, settings: dict[str, Any]
+) -> PinholeRepresentation | EquirectRepresentation:
+    """The representation of some settings.
+
+    Raises:
+        SettingError: The network cannot take its images.
+    """
+    built: Any = build_from_config(settings, "representation", trained.source)
+    check_size(trained, built.image_size)
+    return built
+
+
+def _photo_representation(
+    trained: TrainedNetwork, level: int, base_level: int | None
+) -> PerspectiveRepresentation:
+    settings = trained.representation
+    if settings["_target_"] == _PERSPECTIVE and base_level is None:
+        half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
+        half_extent /= 2.0 ** (level - trained.level)
+        size = trained.image_size
+    else:
+        seen = _built(trained, panorama_settings(trained, level, base_level))
+        if isinstance(seen, EquirectRepresentation):
+            return _photo_representation(trained, level, _BASE_LEVEL)
+        size, half_extent = seen.image_size, seen.grid.dim / 2 * seen.grid.pitch
+    check_size(trained, size)
+    return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
+
+
+def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
+    """Refuse images that a network does not take.
+
+    Args:
+        trained: The network.
+        size: Rows and columns of the images.
+
+    Raises:
+        SettingError: It does not take them.
+    """
+    fixed, multiple = trained.fixed_size, trained.size_multiple
+    small = fixed is not None and any(n < least for n, least in zip(size, fixed, strict=True))
+    if small or (fixed is None and any(side % multiple for side in size)):
+        raise SettingError(
+            "level and base_level",
+            found=f"images of {width_height(size)}",
+            expected=f"at least {width_height(fixed)}, as the network's file takes"
+            if fixed
+            else f"multiples of {multiple}, as the network needs",
+            remedy="Choose other levels, or leave both as trained.",
+        )
+
+
+def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:
+    """Crops that cover a photo, mirrored at its borders as far as a crop is larger.
+
+    Args:
+        image: The photo; the depth of the result is the distance.
+        wanted: The common camera of the crops.
+        overlap: See `PhotoSampler.cover`.
+    """
+    matrix, size = np.array(image.camera_matrix), image.rgb.shape[:2]
+    depth = None if image.depth is None else distance_from_z_depth(image.depth, matrix)
+    pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / wanted.image_size[1]
+    per_pixel = pixel * np.diag(matrix)[[1, 0]]  # photo pixels per crop pixel, down and across
+    # Shrunk first: mirrored at full resolution, a photo of a telescope would fill the memory.
+    kept = np.minimum(1, _OVERSAMPLED / per_pixel)
+    rows, columns = (max(1, round(n * share)) for n, share in zip(size, kept, strict=True))
+    scale = np.array([columns / size[1], rows / size[0]])
+    least = np.ceil(wanted.image_size * per_pixel * scale[::-1] + 1e-6)
+    top, left = (math.ceil(max(0, a - b) / 2) for a, b in zip(least, (rows, columns), strict=True))
+    borders = (top, top, left, left, cv2.BORDER_REFLECT_101)
+    rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
+    if depth is not None:
+        depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
+    # Crops that cover the whole image do not depend on its principal point.
+    focal = np.diag([*np.diag(matrix)[:2] * scale, 1])
+    offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
+    mirrored = InputImage(rgb, depth)
+    crops = wanted.of_camera(focal, mirrored.shape).cover(overlap)
+    in_photo = replace(crops, canvas_boxes=(crops.boxes - offset) / factor)
+    return SourceViews(mirrored, mirrored.shape, [in_photo])

@@ -1,0 +1,203 @@
+"""Class scores of a canvas, accumulated by torch on any device.
+
+The same sums as in `kernels`, but the scores of a class lie beside each other: ``(K, H, W)``. What
+an image covers of the canvas is a few rectangles, and every rectangle is sampled in one call.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch.nn.functional import grid_sample
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from tangent_train.rendering.representations.views import Placement
+
+_SCORES_AT_ONCE = 2**25
+"""Scores that are sampled in one call, 128 MiB."""
+
+_PIXELS_AT_ONCE = 2**20
+"""Pixels of sums whose classes are compared at once."""
+
+_SHARE = 4
+"""Sums take this part of the memory of a GPU at most."""
+
+_BYTES = 2**33
+"""Sums take as many bytes at most on other devices."""
+
+
+def fits_on(device: torch.device | str, shape: tuple[int, int], num_classes: int) -> bool:
+    """True if sums of a canvas leave most of the memory of a device to the network."""
+    limit = _BYTES
+    if torch.device(device).type == "cuda" and torch.cuda.is_available():
+        limit = torch.cuda.get_device_properties(device).total_memory // _SHARE
+    return 4 * num_classes * math.prod(shape) <= limit
+
+
+class DeviceSums:
+    """Sums of probabilities, or labels, of a canvas on a device.
+
+    Args:
+        shape: ``(H, W)`` of the canvas.
+        num_classes: K.
+        device: A torch device.
+        averaged: True to keep sums; False to keep labels only.
+
+    Attributes:
+        sums: ``(K, H, W)`` float32; ``(0, H, W)`` where they are not kept.
+    """
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        num_classes: int,
+        device: torch.device | str,
+        *,
+        averaged: bool,
+    ) -> None:
+        self._shape = shape
+        self._averaged = averaged
+        self._num_classes = num_classes
+        channels = num_classes if averaged else 0
+        self.sums = torch.zeros((channels, *shape), dtype=torch.float32, device=device)
+        self._labels = torch.zeros(shape, dtype=torch.int32, device=device)
+
+    def add(self, scores: Tensor, images: Placement, owner: Tensor | None) -> None:
+        """Add the scores of some images.
+
+        Args:
+            scores: ``(n, K, h, w)`` float32 scores, on the device.
+            images: Place of the images on the canvas.
+            owner: ``(H, W)`` owners; None for feathering.
+        """
+        height, _ = self._shape
+        geometry = images.geometry(self._shape, slice(0, height), np.empty((0, 0), np.uint8))
+        spans = geometry.spans if owner is None else images.owned_spans(self._shape)
+        if owner is None:
+            scores = _softmax(scores)
+        rays = _Rays(geometry.matrices, geometry.columns, geometry.rows, scores)
+        for m, number in enumerate(images.chosen.tolist()):
+            for rows, columns in _boxes(spans[m], self._shape[1], scores.shape[1]):
+                offsets = rays.offsets(m, rows, columns)
+                sampled = grid_sample(
+                    scores[m : m + 1],
+                    offsets.movedim(0, -1)[None].float(),
+                    padding_mode="border",
+                    align_corners=False,
+                )[0]
+                if owner is None:
+                    weight = (1 - offsets.square()).clamp_(min=0).prod(dim=0).sqrt_().float()
+                    self.sums[:, rows, columns].addcmul_(sampled, weight)
+                    continue
+                is_owner = owner[rows, columns] == number
+                if self._averaged:
+                    self.sums[:, rows, columns].addcmul_(
+                        _softmax(sampled[None])[0], is_owner.float()
+                    )
+                else:
+                    best = _without_nan(sampled).argmax(dim=0).int()
+                    labels = self._labels[rows, columns]
+                    labels.copy_(best.where(is_owner, labels))
+
+    def labels(self, min_confidence: float) -> Tensor:
+        """``(H, W)`` indices of the best classes; K where the best is less probable."""
+        if self._averaged:
+            step = max(1, _PIXELS_AT_ONCE // self._shape[1])
+            for start in range(0, self._shape[0], step):
+                sums = self.sums[:, start : start + step]
+                highest, best = sums.max(dim=0)
+                if min_confidence > 0:
+                    unsure = highest < min_confidence * sums.sum(dim=0)
+                    best = best.masked_fill(unsure, self._num_classes)
+                self._labels[start : start + step] = best
+        return self._labels.to(torch.uint8 if self._num_classes < 256 else torch.uint16)
+
+
+class _Rays:
+    """Positions of the pixels of a canvas in images.
+
+    Args:
+        matrices: ``(n, 3, 3)`` see `CanvasGeometry`.
+        columns: ``(2, W)`` factors of the rays.
+        rows: ``(H, 2)`` factors of the rays.
+        scores: ``(n, K, h, w)`` of the images, on the device.
+    """
+
+    def __init__(
+        self,
+        matrices: NDArray[np.float64],
+        columns: NDArray[np.float64],
+        rows: NDArray[np.float64],
+        scores: Tensor,
+    ) -> None:
+        device = scores.device
+        dtype = torch.float32 if device.type == "mps" else torch.float64
+        height, width = scores.shape[-2:]
+        # To offsets from the center in half image sides.
+        scaled = np.diag([2 / width, 2 / height, 1]) @ matrices
+        scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * matrices[:, 2:]
+        m, c, r = (
+            torch.from_numpy(a).to(device, dtype, non_blocking=True)
+            for a in (scaled, columns, rows)
+        )
+        with torch.autocast(device.type, enabled=False):
+            self._of_columns = m[:, :, :2] @ c  # (n, 3, W)
+        self._of_rows = m[:, :, 2:] * r[:, 1]  # (n, 3, H)
+        self._factor = r[:, :1]
+
+    def offsets(self, m: int, rows: slice, columns: slice) -> Tensor:
+        """``(2, rows, columns)`` offsets in image m; 2 where it looks away."""
+        x, y, z = torch.addcmul(
+            self._of_rows[m, :, rows, None],
+            self._factor[rows],
+            self._of_columns[m, :, None, columns],
+        )
+        offsets = torch.stack([x, y]) / z
+        return offsets.masked_fill_(z <= 0, 2)
+
+
+def _boxes(spans: NDArray[np.int32], width: int, num_classes: int) -> Iterator[tuple[slice, slice]]:
+    """Rows and columns of rectangles that contain spans of an image.
+
+    Args:
+        spans: ``(H, 2)`` see `CanvasGeometry`.
+        width: Columns of the canvas.
+        num_classes: K.
+    """
+    seen = np.flatnonzero(spans[:, 1])
+    if not len(seen):
+        return
+    rows = np.arange(seen[0], seen[-1] + 1)
+    # All around the sphere in some rows near a pole: bands of about as many columns.
+    step = max(1, min(-(-len(rows) // 4), _SCORES_AT_ONCE // (num_classes * width)))
+    for band in np.split(rows, range(step, len(rows), step)):
+        inside = spans[band][spans[band, 1] > 0]
+        if not len(inside):
+            continue
+        first = inside[:, 0].astype(int)
+        # Relative to one of them: other rows may begin on the other side of the seam.
+        before = (first - first[0] + width // 2) % width - width // 2
+        start, stop = int(before.min()), int((before + inside[:, 1]).max())
+        start, count = int(first[0]) + start, min(stop - start, width)
+        start = 0 if count == width else start % width
+        inner = slice(int(band[0]), int(band[-1]) + 1)
+        yield inner, slice(start, min(start + count, width))
+        if start + count > width:
+            yield inner, slice(0, start + count - width)
+
+
+def _without_nan(scores: Tensor) -> Tensor:
+    return scores.masked_fill(scores.isnan(), -torch.inf)
+
+
+def _softmax(scores: Tensor) -> Tensor:
+    """Softmax over the classes of ``(n, K, h, w)``; scores that are not numbers have none."""
+    return _without_nan(scores).softmax(dim=1).nan_to_num_(0.0)

@@ -1,0 +1,84 @@
+"""A task of somebody else's package from the command line, without a change to this one."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from tangent_train.checkpoints.content import read_checkpoint
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.errors import DataError
+from tests.cli.tiny_runs import SMALL_ROOMS, Run
+from tests.decoded import decoded
+from tests.running import ROOT
+
+PACKAGE = ROOT / "tests" / "tasks" / "toy_regression"
+TRUST = "trust=[toy_regression.ShareOfClass]"
+SETTINGS = (
+    f"--config-dir={PACKAGE / 'configs'}",
+    "task=share",
+    "logger=csv",
+    *SMALL_ROOMS,
+    "representation.base_level=0",
+    "network.widths=[4,8]",
+    "optimizer.lr=0.1",
+    "trainer.max_epochs=3",
+    "panels=1",
+    "hydra.run.dir=own",
+)
+
+
+def _logged(folder: Path) -> list[float]:
+    """The validation's mean absolute error after each epoch."""
+    (path,) = folder.rglob("metrics.csv")
+    with path.open(newline="") as file:
+        return [float(row["val/mae"]) for row in csv.DictReader(file) if row["val/mae"]]
+
+
+def test_a_task_of_ones_own_trains_evaluates_reports_and_resumes(
+    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(PACKAGE.parent)
+    run("train", *SETTINGS, rooms)
+    folder = Path("own")
+    scores = _logged(folder)
+    assert min(scores) < max(scores)
+    assert len(scores) == 3
+    best = read_checkpoint(folder / "checkpoints" / "best.ckpt")
+    assert scores[best["epoch"]] == min(scores), "the smallest error is the best"
+    assert json.loads((folder / "validation.json").read_text())["best"] == min(scores)
+    results = json.loads((folder / "results.json").read_text())
+    assert 0 < results["mae"] < 1
+    assert (results["noun"], results["images"], results["classes"]) == ("panoramas", 2, [])
+    text = f"mean absolute error {results['mae']:.3g} over 2 panoramas"
+    assert text in (folder / "results.md").read_text()
+    assert text in (folder / "report.html").read_text()
+    (panel,) = (folder / "panels").iterdir()
+    assert (decoded(panel.read_bytes()) == (255, 0, 0)).all(-1).any(), "its own picture"
+
+    run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", TRUST, "hydra.run.dir=again")
+    assert json.loads(Path("again/results.json").read_text())["mae"] == results["mae"]
+    capsys.readouterr()
+    run("report", "own")
+    assert "mean absolute error" in capsys.readouterr().out
+    with Path("report/report.csv").open(newline="") as file:
+        lines = [(row["fold"], row["score"], float(row["mean"])) for row in csv.DictReader(file)]
+    assert lines == [(fold, "mae", results["mae"]) for fold in ("1", "mean")]
+    assert Path("report/report.png").stat().st_size > 5000
+
+    run("train", f"resume={folder}", "trainer.max_epochs=4", TRUST)
+    assert read_checkpoint(folder / "checkpoints" / "last.ckpt")["epoch"] == 3
+    assert json.loads((folder / "validation.json").read_text())["best"] <= min(scores)
+    with pytest.raises(DataError, match=r"predicts something else; expected .* pixel_classes"):
+        load_trained(folder / "checkpoints" / "last.ckpt", ["toy_regression.ShareOfClass"])
+
+
+def test_a_network_without_scores_of_pixels_cannot_estimate_which_way_is_up(
+    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(PACKAGE.parent)
+    with pytest.raises(SystemExit, match=r"data\.upright: found auto, with ShareOfClass"):
+        run("train", *SETTINGS, rooms, "data.upright=auto")
