@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -54,22 +55,20 @@ class Normalization:
 
     def __post_init__(self) -> None:
         # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
-        try:
-            object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
-            object.__setattr__(self, "std", tuple(float(value) for value in self.std))
-        except (TypeError, ValueError) as error:
+        mean: tuple[float, ...] = ()
+        std: tuple[float, ...] = ()
+        with suppress(TypeError, ValueError):
+            mean, std = (tuple(map(float, values)) for values in (self.mean, self.std))
+        right = len(mean) == len(std) and len(mean) in (3, 4, 6)
+        if not (right and all(map(math.isfinite, mean + std)) and min(std) > 0):
             raise SettingError(
                 "normalization",
                 found=f"mean {self.mean}, std {self.std}",
-                expected="lists of a number for every channel, such as mean: [0.5, 0.5, 0.5]",
-            ) from error
-        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
-        if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
-            raise SettingError(
-                "normalization",
-                found=f"mean {self.mean}, std {self.std}",
-                expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
+                expected="3 numbers each, as mean: [0.5, 0.5, 0.5], 4 with depth, 6 of shapes, std "
+                "greater than 0",
             )
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "std", std)
 
     @classmethod
     def of(cls, given: Any, channels: int, setting: str = "normalization") -> Self:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -337,11 +337,18 @@ class _Reading:
         reader: Reader of the data set.
         num_classes: K + 1, the unknown class included.
         shape: Rows and columns of the result; None for those of the files.
+        kind: Kind of the images.
     """
 
     reader: ImageReader
     num_classes: int
     shape: tuple[int, int] | None = None
+    kind: ClassVar[type[Panorama | Photo]]
+
+    @property
+    def store_name(self) -> str:
+        """Name of the images in a store."""
+        return "photos" if self.shape is None else "{}x{}".format(*self.shape)
 
     @property
     def layout(self) -> Layout:
@@ -389,6 +396,8 @@ class _Reading:
 class PanoramaReading(_Reading):
     """Reads panoramas at one size."""
 
+    kind = Panorama
+
     def __call__(self, files: ImageFiles) -> Panorama:
         """One panorama."""
         shape: Any = self.shape
@@ -398,6 +407,8 @@ class PanoramaReading(_Reading):
 
 class PhotoReading(_Reading):
     """Reads photos; z-depth becomes distance from the centre of projection."""
+
+    kind = Photo
 
     @property
     def layout(self) -> Layout:

@@ -133,8 +133,13 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from omegaconf import OmegaConf
 
     from tangent_train.cli.command_settings import check_settings
+    from tangent_train.cli.run_folder import folder_settings
+    from tangent_train.cli.setting_names import check_names, declared_settings
     from tangent_train.cli.sweep import in_sweep, run_job
 
+    composed: Any = OmegaConf.to_container(config)
+    whole = OmegaConf.to_container(HydraConfig.instance().cfg)
+    check_names(command, composed, f"{composed} {whole} {folder_settings}")
     if in_sweep():
         return run_job(command, config, () if stored is None else stored.added, visible_gpus)
     logging.getLogger().handlers.clear()  # Hydra's would print again what Lightning prints
@@ -143,8 +148,10 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     name = "import_network" if command == "import" else command  # a word of Python
     settings: Any = OmegaConf.to_container(config, resolve=True)
-    if command == "import":
-        settings["network"] = (settings["network"] or {}).get("name")
+    settings = {n: value for n, value in settings.items() if n in declared_settings(command)}
+    if command == "import" and isinstance(settings["network"], dict):
+        network = dict(settings["network"])
+        settings["network"] = network if len(network) > 1 else network["name"]
     check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)

@@ -89,7 +89,7 @@ def _best_on_validation(
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:
-        content = {"figure": best.monitor, "best": score}
+        content = {"figure": best.monitor, "mode": best.mode, "best": score}
         write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
     return score
 
