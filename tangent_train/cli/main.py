@@ -57,6 +57,8 @@ def _main(command: str) -> None:
 
         if stored is not None:
             arguments = stored.arguments
+        # Hydra takes no null for a group on the command line.
+        arguments = ["logger=none" if a == "logger=null" else a for a in arguments]
         if command == "import":
             # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
             arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]

@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
@@ -219,6 +220,13 @@ def build(
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
+    if getattr(data, "upright", None) == "auto" and task.predicts != PIXEL_CLASSES:
+        raise SettingError(
+            "data.upright",
+            found=f"auto, with {type(task).__name__}",
+            expected=f"null or pose: a network that predicts {PIXEL_CLASSES} estimates which way "
+            "is up",
+        )
     try_network(task, data.in_channels)
     if trains:
         try_training(task, data, settings)

@@ -246,10 +246,7 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
     said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
     assert "2 of 4 panoramas could not be rendered" in said
     assert "in/b.png" in said
-    assert (
-        "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice as wide"
-        in said
-    )
+    assert "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice" in said
     assert sorted(path.name for path in (tmp_path / "tan").iterdir()) == ["a", "c"]
     (tmp_path / "tan" / "a" / "face_019.png").unlink()
     said = refused(back=tmp_path / "tan", output=tmp_path / "back")
@@ -323,20 +320,22 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
 
 # What is refused.
 
+_IN = {"input": "in", "output": "tan"}
+
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
         ({"input": "in"}, "output: found none"),
-        ({"input": "in", "output": "tan", "faces": [80]}, "80"),
-        ({"input": "in", "output": "tan", "format": "gif"}, r"\.gif.*expected .*\.png"),
+        ({**_IN, "faces": [80]}, "80"),
+        ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
-            {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
-            "format: found jpg; .* others change pixels",
+            {**_IN, "interpolation": "nearest", "format": "jpg"},
+            "found jpg; .* others change pix",
         ),
         ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
-        ({"input": "in", "output": "tan", "mask": "in/room.png"}, "none without colmap=true"),
+        ({**_IN, "mask": "in/room.png"}, "none without colmap=true"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],
@@ -362,7 +361,7 @@ def test_settings_that_cannot_work(
         (
             {"face_003.png": (16, 16, 3)},
             {},
-            r"003\.png: found uint8 of shape \(16, 16, 3\); expected squares, all alike: 32×32",
+            r"003\.png: found uint8 .*; expected squares, .* 32×",
         ),
         ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),
