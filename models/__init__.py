@@ -1,6 +1,6 @@
-"""Networks. Any other `nn.Module` that maps images to scores works too, named by ``_target_``.
+"""Networks. Other `nn.Module` classes that map images to scores can be named by ``_target_``.
 
-Each is imported when it is first asked for: ``models.UNet`` reads ``models/unet.py`` and no other.
+Each is imported on first use: ``models.UNet`` imports ``models/unet.py`` only.
 """
 
 from importlib import import_module

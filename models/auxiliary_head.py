@@ -21,7 +21,7 @@ _LISTED_DEPTH = 2
 
 
 def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
-    """Channels C' of the features ``(B, C', h', w')`` that a submodule returns.
+    """Return channels C' of the features ``(B, C', h', w')`` that a submodule returns.
 
     A copy of the network is run on an empty image, on torch's meta device where possible.
 
@@ -94,7 +94,7 @@ class AuxiliaryHead(nn.Module):
         network.get_submodule(stage).register_forward_hook(self._keep)
 
     def forward(self, images: Tensor) -> Any:
-        """The network's result; in training ``{"out": scores, "aux": (B, K, h', w')}``.
+        """Return the network's result; in training ``{"out": scores, "aux": (B, K, h', w')}``.
 
         Args:
             images: ``(B, C, h, w)``.

@@ -81,13 +81,13 @@ class FCNResNet(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel, interpolated from an eighth of the resolution."""
+        """Return scores of every pixel, interpolated from an eighth of the resolution."""
         scores = self.classifier(self.backbone(images)["out"])
         return functional.interpolate(scores, images.shape[-2:], mode="bilinear")
 
 
 def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
-    """The tensors that `weights` names, under the names of the FCN."""
+    """Return the tensors that `weights` names, under the names of the FCN."""
     if weights in _PUBLISHED:
         tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
     elif Path(weights).is_file():

@@ -23,14 +23,14 @@ def _convolution(in_channels: int, out_channels: int, size: int) -> list[nn.Modu
 
 
 def _encoder(in_channels: int, out_channels: int) -> nn.Sequential:
-    """Two convolutions; pooling follows where the skip connection branches off."""
+    """Make two convolutions; pooling follows where the skip connection branches off."""
     return nn.Sequential(
         *_convolution(in_channels, out_channels, 3), *_convolution(out_channels, out_channels, 3)
     )
 
 
 def _decoder(in_channels: int, neck: int, out_channels: int) -> nn.Sequential:
-    """Two convolutions, twice the resolution, a 1×1 convolution."""
+    """Make two convolutions, twice the resolution, a 1×1 convolution."""
     return nn.Sequential(
         *_convolution(in_channels, neck, 3),
         *_convolution(neck, neck, 3),
@@ -76,7 +76,7 @@ class HexUNet(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel.
+        """Return scores of every pixel.
 
         Raises:
             SettingError: A side is not a multiple of the network's stride, 16.

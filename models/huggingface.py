@@ -26,7 +26,7 @@ _MASK2FORMER = (384, 384)
 
 
 def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
-    """The settings of transformers that describe a network, and those of the networks inside it.
+    """Return the settings of transformers that describe a network and networks inside it.
 
     These are the arguments that the class of the settings declares. Nothing else gets through, such
     as code of a model's author, kernels, quantizers, other names for settings (``attribute_map``),
@@ -53,13 +53,13 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
     names = {name.removeprefix("_") for name in declared}
     names |= {alias for alias, name in kind.attribute_map.items() if name in declared}
 
-    def plain(value: Any, own: Any = None) -> Any:
+    def plain(value: Any, inner_kind: Any = None) -> Any:
         if isinstance(value, list | tuple):
             return [plain(one) for one in value]
         if not isinstance(value, Mapping):
             return value
-        if own is not None or "model_type" in value:
-            return architecture(value, own)
+        if inner_kind is not None or "model_type" in value:
+            return architecture(value, inner_kind)
         return {name: plain(inner) for name, inner in value.items()}
 
     known = {n: plain(value, kind.sub_configs.get(n)) for n, value in config.items() if n in names}
@@ -67,7 +67,7 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
 
 
 def _patch_size(config: Any) -> int:
-    """Side in pixels of the patches of which a network reads whole ones only; 1 without any."""
+    """Return the side in pixels of the patches that a network reads whole; 1 without patches."""
     inside = getattr(config, "backbone_config", None) or config
     size = getattr(inside, "patch_size", 1)
     return int(size if isinstance(size, int) else max(size))
@@ -78,9 +78,9 @@ class HuggingFaceNetwork(nn.Module):
     """Any network of transformers for semantic or universal segmentation, with random weights.
 
     Args:
-        config: Its `architecture`, with ``model_type``.
+        config: `architecture` of the network, with ``model_type``.
         num_classes: Scores K of a pixel.
-        bgr: Whether it takes images with blue first, as MobileViT does.
+        bgr: True if the network takes images with blue first, e.g. MobileViT.
         task: Tokens of "the task is semantic", which OneFormer takes besides images.
 
     Attributes:
@@ -141,7 +141,7 @@ class HuggingFaceNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel of the images.
+        """Return scores of every pixel of the images.
 
         Of networks for universal segmentation, which give masks with classes, their logarithms: the
         softmax of these is again the share of every class, and sums of classes are those of shares.

@@ -1,9 +1,8 @@
-"""Initialization of a network from the trained tensors of another."""
+"""Initialization of a network from trained tensors of another network."""
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,11 +17,11 @@ class Origins(NamedTuple):
     """Origin of each tensor of a network.
 
     Attributes:
-        loaded: Names of those taken unchanged.
-        adapted: Names of those changed to fit, and how.
-        fresh: Names of those left as they were, and why.
+        loaded: Names of tensors loaded unchanged.
+        adapted: Changes of the tensors that were adapted, by name.
+        fresh: Reasons why tensors kept their values, by name.
         unused: Names in the file that the network does not have.
-        share: Fraction of the network's numbers that came from the file.
+        share: Fraction of the network's numbers that are from the file.
     """
 
     loaded: tuple[str, ...]
@@ -32,7 +31,7 @@ class Origins(NamedTuple):
     share: float
 
     def __str__(self) -> str:
-        """A few lines for the terminal."""
+        """Return lines for the terminal."""
         lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
         for kind, reasons in (
             ("adapted", self.adapted),
@@ -40,7 +39,9 @@ class Origins(NamedTuple):
             ("not used", dict.fromkeys(self.unused, "not in the network")),
         ):
             lines += [f"{kind}: {len(reasons)}"] * bool(reasons)
-            lines += _by_reason(reasons)
+            for reason in dict.fromkeys(reasons.values()):
+                names = [name for name, given in reasons.items() if given == reason]
+                lines.append(f"  {reason}: {', '.join(names)}")
         return printable("\n".join(lines))
 
 
@@ -52,40 +53,39 @@ def initialize(
 ) -> Origins:
     """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
-    Names are matched by `tensors_for`, so that tensors move into and out of modules that wrap a
-    network, as `SphereContext` and `AuxiliaryHead` do. Filters of the first convolution for
-    input channels that the file does not know start at zero (paper, supplement, "Level 10
+    Names are matched by `tensors_for`, also if one of the two networks is wrapped in another module
+    (`SphereContext`, `AuxiliaryHead`). Filters of the first convolution for input channels that are
+    not in the file start at zero (paper, supplement, "Level 10
     parameters"), so RGB-D begins as RGB. Other tensors of another shape stay as they are: the last
     layer, for another number of classes.
 
     Args:
         network: Changed in place.
         path: The file; only tensors and plain values are read.
-        channels: Names of the input channels of the file's network and of this one; filters of the
-            first convolution are matched by them. By default they are matched by position.
-        of_other_classes: Names of tensors to leave as they are even where those of the file fit:
-            their scores are of other classes.
+        channels: Names of the input channels of the file's network and of this network, by which
+            filters of the first convolution are matched; by default by position.
+        of_other_classes: Names of tensors to leave as they are although they have the shape of
+            those in the file: their scores are of other classes.
 
     Raises:
         DataError: The file cannot be read, or nothing in it fits.
     """
     path = Path(path)
-    own = network.state_dict()
+    current = network.state_dict()
     found = tensors_for(network, path)
     convolutions = (name for name, m in network.named_modules() if isinstance(m, nn.Conv2d))
     stem = f"{next(convolutions, None)}.weight".removeprefix(".")
     loaded: dict[str, Tensor] = {}
     adapted: dict[str, str] = {}
     fresh: dict[str, str] = {}
-    for name, tensor in own.items():
+    for name, tensor in current.items():
         given = found.get(name)
         if given is None:
             fresh[name] = "not in the file"
         elif name in of_other_classes and given.shape == tensor.shape:
             fresh[name] = "of other classes in the file"
         elif name == stem and given.ndim == 4 and given[:, 0].shape == tensor[:, 0].shape:
-            before, now = _channel_names(given, tensor, channels)
-            loaded[name], changes = _by_channel(given, before, now)
+            loaded[name], changes = _by_channel(given, tensor, channels)
             if changes:
                 adapted[name] = changes
         elif given.shape == tensor.shape:
@@ -96,43 +96,29 @@ def initialize(
         raise DataError(
             path,
             found="no tensor that fits" + (f", but {next(iter(found))}" if found else ""),
-            expected=f"tensors of {type(network).__name__}, {next(iter(own))} for one",
+            expected=f"tensors of {type(network).__name__}, {next(iter(current))} for one",
             remedy="Is it a checkpoint of the same network, with the same settings?",
         )
-    network.load_state_dict({**own, **loaded})
+    network.load_state_dict({**current, **loaded})
     return Origins(
         loaded=tuple(name for name in loaded if name not in adapted),
         adapted=adapted,
         fresh=fresh,
-        unused=tuple(name for name in found if name not in own),
+        unused=tuple(name for name in found if name not in current),
         share=sum(min(found[name].numel(), t.numel()) for name, t in loaded.items())
-        / sum(t.numel() for t in own.values()),
+        / sum(t.numel() for t in current.values()),
     )
 
 
-def _channel_names(
+def _by_channel(
     given: Tensor, wanted: Tensor, channels: tuple[Sequence[str], Sequence[str]] | None
-) -> tuple[Sequence[str], Sequence[str]]:
-    counts = (given.shape[1], wanted.shape[1])
-    if channels is None or counts != (len(channels[0]), len(channels[1])):
-        numbered = [f"channel {k}" for k in range(max(counts))]
-        return numbered[: counts[0]], numbered[: counts[1]]
-    return channels
-
-
-def _by_channel(given: Tensor, before: Sequence[str], now: Sequence[str]) -> tuple[Tensor, str]:
-    """Filters for the wanted channels, and a description of the change."""
+) -> tuple[Tensor, str]:
+    """Return filters for the wanted channels, and a description of the change."""
+    before, now = channels or ((), ())
+    if (len(before), len(now)) != (given.shape[1], wanted.shape[1]):
+        before, now = ([f"channel {k}" for k in range(t.shape[1])] for t in (given, wanted))
     new = ", ".join(name for name in now if name not in before)
     lost = ", ".join(name for name in before if name not in now)
     notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
     places = [before.index(name) if name in before else None for name in now]
     return select_channels(given, places), "; ".join(notes)
-
-
-def _by_reason(reasons: Mapping[str, str]) -> Iterator[str]:
-    """A line per reason, with the names of all its tensors."""
-    names: defaultdict[str, list[str]] = defaultdict(list)
-    for name, why in reasons.items():
-        names[why].append(name)
-    for why, found in names.items():
-        yield f"  {why}: {', '.join(found)}"

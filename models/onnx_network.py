@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, of_extra
 from tangent_train.files import crc32_of
 
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
@@ -35,13 +35,13 @@ class OnnxNetwork(nn.Module):
 
     Attributes:
         path: The file.
-        metadata: The file's own, text by key.
+        metadata: Metadata of the file, text by key.
         checksum: Checksum of its tensors.
         image_size: The only rows and columns it takes; None where it takes others.
 
     Raises:
-        DataError: There is no such file, it is no network of this kind, it needs other files, or
-            onnxruntime is missing.
+        DataError: There is no such file, it is not a network of this kind, or it needs other files.
+        SettingError: onnxruntime is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -49,23 +49,15 @@ class OnnxNetwork(nn.Module):
         self.path = path
         if not path.is_file():
             raise DataError(path, found="no such file", expected="an ONNX file")
-        try:
+        with of_extra("export", path):
             import onnx
             import onnxruntime
-        except ImportError as error:
-            raise DataError(
-                path,
-                found="an ONNX file",
-                expected="the packages onnx and onnxruntime, to run it",
-                remedy="Run: pip install 'tangent-train[export]'",
-            ) from error
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = _ERRORS_ONLY
         # Threads that wait for work by spinning take the cores from what is done with the scores.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-        usable = {"CPUExecutionProvider"}
-        usable |= {"CUDAExecutionProvider"} if torch.cuda.is_available() else set()
+        usable = ["CPUExecutionProvider", *["CUDAExecutionProvider"] * torch.cuda.is_available()]
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]
         try:
             # Both read the file alike, whatever its name and its first bytes are.
@@ -92,9 +84,8 @@ class OnnxNetwork(nn.Module):
                 expected="images (B, C, h, w) as the only input, scores as the only output",
             )
         self._input = inputs[0]
-        if self._input.type not in _TYPES:
-            found, expected = f"images as {self._input.type}", " or ".join(_TYPES)
-            raise DataError(path, found=found, expected=expected)
+        if (kind := self._input.type) not in _TYPES:
+            raise DataError(path, found=f"images as {kind}", expected=" or ".join(_TYPES))
         shape = self._input.shape
         self._channels_last = shape[3] == _COLORS and shape[1] != _COLORS
         self._batch = shape[0] if isinstance(shape[0], int) else None
@@ -104,7 +95,7 @@ class OnnxNetwork(nn.Module):
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
-        """Scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
+        """Return scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
 
         Raises:
             SettingError: The file was made for images of another shape, or gives something else.
@@ -116,7 +107,7 @@ class OnnxNetwork(nn.Module):
         return (parts[0] if len(parts) == 1 else torch.cat(parts)).to(images.device)
 
     def _run(self, part: Tensor, images: Tensor) -> Tensor:
-        """Scores or labels of some images, of the size of the images."""
+        """Return scores or labels of some images, of the size of the images."""
         missing = 0 if self._batch is None else self._batch - len(part)
         if missing:
             part = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)])
@@ -155,19 +146,19 @@ class OnnxNetwork(nn.Module):
 
 
 def graph_checksum(graph: Any) -> str:
-    """CRC-32 of all tensors in an ONNX graph, in their order."""
+    """Return the CRC-32 of all tensors in an ONNX graph, in their order."""
     return crc32_of(tensor.SerializeToString(deterministic=True) for tensor in _tensors(graph))
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
-    """The output of a network as ``(B, K, h, w)``, maps with K = 1; None for anything else.
+    """Return an output as ``(B, K, h, w)``, maps with K = 1; None for other shapes.
 
     The axis of the classes is the one without which rows and columns have one stride.
 
     Args:
         returned: By the network.
         size: Rows and columns of the images.
-        last: Whether the channels of the images are last, to decide where both axes could be.
+        last: True if the channels of the images are last; decides if both axes are possible.
     """
     if returned.ndim == _LABEL_MAP:
         returned = returned[:, None]
@@ -182,7 +173,7 @@ def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tens
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """All tensors in a message and in those inside it."""
+    """Return all tensors in a message and in those inside it."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in value if hasattr(value, "__len__") else [value]:

@@ -28,65 +28,60 @@ _COUNTER = "num_batches_tracked"
 
 
 def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
-    """The tensors of a file by the names that a network has for them.
+    """Return the tensors of a file by the names that a network has for them.
 
-    They are those of the mapping in the file (``state_dict``, ``model``, or all of it) with the
-    most fitting names. Names are compared without ``network.``, and without the commonest prefix of
-    the file's names (``module.``, ``_orig_mod.``, ``model.net.``, …) and of the network's.
+    They are the tensors of the mapping in the file (``state_dict``, ``model``, or all of it) and of
+    the prefix in it (``module.``, ``_orig_mod.``, ``model.net.``, …) with the most fitting names;
+    of several, those in ``state_dict``. Names are compared without ``network.``, and without the
+    commonest prefix of the network's names.
 
     Args:
         network: The network.
         path: See `read_tensors`.
 
     Raises:
-        DataError: The file cannot be read, several mappings with different tensors fit equally
-            well and none is called ``state_dict``, or a mapping has two networks with different
-            tensors (``student.``, ``teacher.``).
+        DataError: The file cannot be read, or several mappings or prefixes (``student.``,
+            ``teacher.``) with different tensors fit equally well.
     """
-    own = network.state_dict()
-    given = read_tensors(path)
-    found = {place: _renamed(tensors, own) for place, tensors in given.items()}
-    fitting = {place: len(own.keys() & tensors.keys()) for place, tensors in found.items()}
-    best = [place for place, count in fitting.items() if count == max(fitting.values())]
-    if "state_dict" in best:
-        _check_alone(given["state_dict"], own, path)
-        return found["state_dict"]
-    first = found[best[0]]
-    if any(found[place].get(name) is not first.get(name) for place in best for name in own):
-        raise DataError(
-            path,
-            found=f"several state dicts: {', '.join(filter(None, best))}",
-            expected="the tensors of one network, or of several one called state_dict",
-            remedy=f"Save one of them alone: torch.save(torch.load(…)['{best[-1]}'], 'state.pt').",
-        )
-    _check_alone(given[best[0]], own, path)
+    names = {_inner(name): name for name in network.state_dict()}
+    given = {
+        place: {_inner(name): tensor for name, tensor in tensors.items()}
+        for place, tensors in read_tensors(path).items()
+    }
+    fitting: dict[tuple[str, str, str], int] = {}
+    for place, tensors in given.items():
+        inside, count = _prefixes(names, tensors)[0]
+        for outside, of_outside in _prefixes(tensors, names):
+            fitting[place, outside, inside] = max(count, of_outside)
+    best = [key for key, count in fitting.items() if count == max(fitting.values())]
+    best = [key for key in best if key[0] == "state_dict"] or best
+
+    def renamed(place: str, outside: str, inside: str) -> dict[str, Tensor]:
+        new = {n: inside + n.removeprefix(outside) for n in given[place] if n.startswith(outside)}
+        return {names.get(after, after): given[place][before] for before, after in new.items()}
+
+    place, prefix, _ = best[0]
+    first = renamed(*best[0])
+    for other in best[1:]:
+        second = renamed(*other)
+        is_part = other[0] == place and other[1].startswith(prefix)
+        if not is_part and not all(_equal(first.get(n), second.get(n)) for n in names.values()):
+            shown = dict.fromkeys(f"{place}.{prefix}".strip(".") for place, prefix, _ in best)
+            raise DataError(
+                path,
+                found=f"networks with different tensors: {', '.join(filter(None, shown))}",
+                expected="the tensors of one network, or of several one called state_dict",
+                remedy=f"Save one of them alone, for example {list(shown)[-1]}.",
+            )
     return first
 
 
-def _check_alone(tensors: Mapping[str, Tensor], own: Iterable[str], path: Path) -> None:
-    """Refuse a mapping with a second network of other tensors, under another prefix."""
-    inner = {_inner(name): tensor for name, tensor in tensors.items()}
-    counts = _prefixes(inner, {_inner(name): name for name in own})
-    first, *others = sorted(counts, key=lambda prefix: (-counts[prefix], len(prefix))) or [""]
-    for other in others:
-        pairs = [
-            (tensor, inner.get(other + name.removeprefix(first)))
-            for name, tensor in inner.items()
-            if name.startswith(first)
-        ]
-        is_second = counts[other] == counts[first] and not other.startswith(first)
-        if is_second and not all(b is not None and torch.equal(a, b) for a, b in pairs):
-            raise DataError(
-                path,
-                found=f"two networks with different tensors: {first}* and {other}*",
-                expected="the tensors of one network",
-                remedy=f"Save one of them alone: keep the names that begin with {first} or those "
-                f"that begin with {other}.",
-            )
+def _equal(one: Tensor | None, other: Tensor | None) -> bool:
+    return one is other or (one is not None and other is not None and torch.equal(one, other))
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
-    """The mappings with tensors in a file, by their place, such as ``state_dict``; the whole is "".
+    """Read the mappings with tensors in a file, by place, e.g. ``state_dict``; the whole is "".
 
     Names of tensors in mappings inside them are joined by dots. Those of ``state_dict`` are the
     ones under ``network.`` if there are any, as in checkpoints of this package.
@@ -118,7 +113,7 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
 def _mappings(
     content: Mapping[Any, Any], seen: set[int], depth: int = 0
 ) -> dict[str, dict[str, Tensor]]:
-    """The mappings with tensors in one, each once, itself as ""; see `read_tensors`."""
+    """Return the mappings with tensors in a mapping, each once, itself as ""."""
     seen.add(id(content))
     tensors: dict[str, Tensor] = {}
     inside: dict[str, dict[str, Tensor]] = {}
@@ -134,43 +129,24 @@ def _mappings(
     return ({"": tensors} if tensors else {}) | inside
 
 
-def _renamed(tensors: Mapping[str, Tensor], own: Iterable[str]) -> dict[str, Tensor]:
-    """Tensors by the names of a network, see `tensors_for`."""
-    inner_own = {_inner(name): name for name in own}
-    inner = {_inner(name): tensor for name, tensor in tensors.items()}
-    outside, inside = _prefix(inner, inner_own), _prefix(inner_own, inner)
-    renamed = {}
-    for name, tensor in inner.items():
-        if name.startswith(outside):
-            place = inside + name.removeprefix(outside)
-            renamed[inner_own.get(place, place)] = tensor
-    return renamed
-
-
 def _inner(name: str) -> str:
-    """The name without the attributes by which modules of this package hold a network."""
+    """Return a name without the attributes by which modules of this package hold a network."""
     return ".".join(part for part in name.split(".") if part != "network")
 
 
-def _prefix(names: Iterable[str], ends: Mapping[str, object]) -> str:
-    """The commonest prefix, of equally common ones the shortest, before one of these ends."""
-    counts = _prefixes(names, ends)
-    return min(counts, key=lambda prefix: (-counts[prefix], len(prefix)), default="")
-
-
-def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> Counter[str]:
-    """Prefixes before one of these ends, with their numbers of names."""
+def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> list[tuple[str, int]]:
+    """Return prefixes before these ends with their numbers of names, the commonest first."""
     counts: Counter[str] = Counter()
     for name in names:
         parts = name.split(".")
         for k in range(len(parts)):
             if ".".join(parts[k:]) in ends:
                 counts["".join(f"{part}." for part in parts[:k])] += 1
-    return counts
+    return sorted(counts.items(), key=lambda item: (-item[1], len(item[0]))) or [("", 0)]
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
-    """Tensors that torchvision publishes, from the local cache or the internet.
+    """Return tensors that torchvision publishes, from the local cache or the internet.
 
     Raises:
         DataError: They are not in the cache and cannot be fetched.
@@ -180,18 +156,14 @@ def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
             progress=True, check_hash=True, map_location="cpu", weights_only=True
         )
     except (OSError, HTTPException, RuntimeError) as error:
+        cached = Path(torch.hub.get_dir(), "checkpoints", weights.url.rpartition("/")[2])
         raise DataError(
             weights.url,
             found=f"no way to fetch it ({error})",
             expected="an internet connection the first time these weights are used",
-            remedy=f"Fetch it on another machine and save it as {_cached(weights.url)}.",
+            remedy=f"Fetch it on another machine and save it as {cached}.",
         ) from error
     return dict(tensors)
-
-
-def _cached(url: str) -> Path:
-    """The file in which torch looks for what it has fetched."""
-    return Path(torch.hub.get_dir(), "checkpoints", url.rpartition("/")[2])
 
 
 def load_tensors(
@@ -202,19 +174,19 @@ def load_tensors(
     Args:
         network: The network, changed in place.
         tensors: Names and values.
-        source: Their source, for the message.
+        source: Source of the tensors, for the message.
         fresh: Prefix of the names of tensors that are not loaded; None where all are.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape.
     """
-    own = {
+    kept = {
         name: tensor
         for name, tensor in network.state_dict().items()
         if _COUNTER in name or (fresh is not None and name.startswith(fresh))
     }
     try:
-        network.load_state_dict({**own, **tensors})
+        network.load_state_dict({**kept, **tensors})
     except RuntimeError as error:
         raise DataError(
             source,

@@ -54,7 +54,7 @@ class ShapeClassifier(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch views channels height width"]
     ) -> Float[Tensor, "batch classes"]:
-        """Class scores of shapes, each seen in any number of views.
+        """Return class scores of shapes, each seen in any number of views.
 
         Raises:
             SettingError: A side is not a multiple of the network's stride, 16.

@@ -68,7 +68,7 @@ class SphereAttention(nn.Module):
         tokens: Float[Tensor, "spheres images channels rows columns"],
         directions: Float[Tensor, "spheres images 3 rows columns"],
     ) -> Float[Tensor, "spheres images channels rows columns"]:
-        """The residual to be added to every token.
+        """Return the residual to be added to every token.
 
         Args:
             tokens: Features of the images of each sphere.
@@ -88,9 +88,9 @@ class SphereAttention(nn.Module):
             for part in (queries, keys, values)
         )
         along = along.reshape(spheres * images, -1, 3)
-        own = angular_attention(queries, keys, values, along, kappa)
-        own = own.reshape(spheres, images, *own.shape[1:]).transpose(1, 2).flatten(2, 3)
-        others = (seen - own).to(x.dtype).transpose(1, 2).flatten(2)
+        inside = angular_attention(queries, keys, values, along, kappa)
+        inside = inside.reshape(spheres, images, *inside.shape[1:]).transpose(1, 2).flatten(2, 3)
+        others = (seen - inside).to(x.dtype).transpose(1, 2).flatten(2)
         added: Tensor = self.output(others)
         return added.reshape(spheres, images, rows, columns, channels).movedim(-1, 2)
 
@@ -102,15 +102,15 @@ def angular_attention(
     directions: Float[Tensor, "spheres tokens 3"],
     kappa: Float[Tensor, " heads"],
 ) -> Float[Tensor, "spheres heads tokens size"]:
-    """Attention with logits ``q·k / √size + κ (dᵢ·dⱼ − 1)``, in single precision or better.
+    """Attend with logits ``q·k / √size + κ (dᵢ·dⱼ − 1)``, in single precision or better.
 
     The −1 is common to all keys, and κ dᵢ·dⱼ is a dot product too: three more numbers in queries
     and keys suffice, and no kernel has to hold tokens × tokens of memory.
 
     Args:
-        queries: Of every head.
-        keys: Of every head.
-        values: Of every head.
+        queries: Queries of every head.
+        keys: Keys of every head.
+        values: Values of every head.
         directions: Unit viewing directions of the tokens.
         kappa: Concentration of every head.
 

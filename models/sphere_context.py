@@ -70,7 +70,7 @@ class SphereContext(nn.Module):
         rays: Float[Tensor, "spheres images_of_sphere 3 3"] | None = None,
         images_per_chunk: int | None = None,
     ) -> Any:
-        """The network's result for images with context.
+        """Return the network's result for images with context.
 
         Args:
             images: Sphere by sphere, the same number of each.
@@ -101,7 +101,7 @@ class SphereContext(nn.Module):
     def encode(
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images features rows columns"]:
-        """Tokens of images: the first of the three steps that bound memory."""
+        """Return the tokens of images: the first of the three steps that bound memory."""
         try:
             self._run(images, _stop)
         except _ReachedError as reached:
@@ -115,7 +115,7 @@ class SphereContext(nn.Module):
         rays: Float[Tensor, "spheres images_of_sphere 3 3"],
         tokens: Float[Tensor, "images features rows columns"],
     ) -> Float[Tensor, "images features rows columns"]:
-        """Residual of the tokens of all images of the spheres: the second step."""
+        """Return the residual of the tokens of all images of the spheres: the second step."""
         directions = token_directions(rays, tokens.shape[-2], tokens.shape[-1])
         context: Tensor = self.mixer(tokens.reshape(*rays.shape[:2], *tokens.shape[1:]), directions)
         return context.flatten(0, 1)
@@ -125,7 +125,7 @@ class SphereContext(nn.Module):
         images: Float[Tensor, "images channels height width"],
         context: Float[Tensor, "images features rows columns"],
     ) -> Any:
-        """The network's result for images with their part of the second step: the third."""
+        """Return the network's result for images with their part of the second step: the third."""
         return self._run(images, lambda features: _add(features, context))
 
     def _run(self, images: Tensor, at_stage: Callable[[Tensor], Tensor]) -> Any:
@@ -186,12 +186,12 @@ class SphereContext(nn.Module):
 def token_directions(
     rays: Float[Tensor, "spheres images 3 3"], rows: int, columns: int
 ) -> Float[Tensor, "spheres images 3 rows columns"]:
-    """Unit viewing directions of the token centers.
+    """Return unit viewing directions of the token centers.
 
     Args:
         rays: They map image coordinates to directions, see `SphereContext.forward`.
-        rows: Of tokens.
-        columns: Of tokens.
+        rows: Rows of tokens.
+        columns: Columns of tokens.
     """
     y, x = (
         (2 * torch.arange(count, dtype=rays.dtype, device=rays.device) + 1) / count - 1
@@ -214,7 +214,7 @@ def _stop(features: Tensor) -> Tensor:
 
 @contextmanager
 def _frozen_statistics(modules: Any) -> Iterator[None]:
-    """Batch normalization by the statistics of the batch that leaves the running ones alone."""
+    """Normalize by the statistics of the batch; the running statistics stay the same."""
     norms = [m for m in modules if isinstance(m, _BatchNorm) and m.training]
     before = [(norm.momentum, norm.num_batches_tracked) for norm in norms]
     for norm in norms:

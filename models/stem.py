@@ -49,7 +49,7 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
 
 
 def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
-    """Filters for other input channels.
+    """Return filters for other input channels.
 
     Args:
         weight: ``(out, in, h, w)``.

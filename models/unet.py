@@ -39,7 +39,7 @@ class Residual(nn.Module):
         )
 
     def forward(self, x: Tensor) -> Tensor:
-        """Features ``(B, out_channels, h, w)``."""
+        """Return features ``(B, out_channels, h, w)``."""
         return torch.relu(self.body(x) + self.shortcut(x))
 
 
@@ -111,7 +111,7 @@ class UNet(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Scores of every pixel.
+        """Return scores of every pixel.
 
         Raises:
             SettingError: A side is not a multiple of the network's stride (32 by default).
@@ -133,7 +133,7 @@ def check_sides(images: Tensor, stride: int, network: str) -> None:
     Args:
         images: ``(B, C, h, w)``.
         stride: Pixels of the image per pixel of the coarsest features.
-        network: Its name.
+        network: Name of the network.
 
     Raises:
         SettingError: A side is not a multiple.

@@ -27,7 +27,7 @@ CAMERAS = {
 
 
 def angular_resolution() -> list[Row]:
-    """Panoramas of levels 0 to 10; below them cameras, at the level of the same resolution."""
+    """Return panoramas of levels 0 to 10; below them cameras, at the level of that resolution."""
     rows: list[Row] = []
     for level in range(11):
         height, width = equirect_shape(level)
@@ -43,7 +43,7 @@ def angular_resolution() -> list[Row]:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Degrees per pixel over the level."""
+    """Return degrees per pixel over the level."""
     figure = Figure((8.5, 5), layout="constrained")
     axes = figure.subplots()
     levels = range(11)

@@ -35,7 +35,7 @@ class Digits(NamedTuple):
 
 
 def small_digits() -> Digits:
-    """The 1797 digits of scikit-learn, enlarged from 8² to 20² pixels and framed as MNIST's."""
+    """Return scikit-learn's 1797 digits, enlarged from 8² to 20² pixels, framed as MNIST's."""
     from sklearn.datasets import load_digits
 
     bunch = load_digits()
@@ -46,7 +46,7 @@ def small_digits() -> Digits:
 
 
 def mnist(folder: str) -> Digits:
-    """MNIST as torchvision stores it, ``<folder>/MNIST/raw``; nothing is downloaded."""
+    """Read MNIST as torchvision stores it, ``<folder>/MNIST/raw``; nothing is downloaded."""
     from torchvision.datasets import MNIST
 
     train, test = MNIST(folder, train=True), MNIST(folder, train=False)
@@ -55,7 +55,7 @@ def mnist(folder: str) -> Digits:
 
 
 def distort(images: Tensor, k1: float) -> Tensor:
-    """Images ``(n, 1, s, s)`` behind a lens with coefficient K1 ≥ 0; black beyond their edges."""
+    """Return images ``(n, 1, s, s)`` behind a lens with coefficient K1 ≥ 0; black beyond edges."""
     points = pixel_centers(images)
     if k1 > 0:  # the real root of K1 r³ + r = r'
         q = (3 * k1) ** -0.5
@@ -65,34 +65,34 @@ def distort(images: Tensor, k1: float) -> Tensor:
 
 
 def enlarge(images: Tensor, k1: float) -> Tensor:
-    """Images evenly enlarged, as much as the lens does on average over the digits' square."""
+    """Enlarge images as much as the lens does on average over the digits' square."""
     return sample(images, pixel_centers(images) / mean_enlargement(k1))
 
 
 def mean_enlargement(k1: float) -> float:
-    """Mean of 1 + K1 r² over the square that digits fill."""
+    """Return mean of 1 + K1 r² over the square that digits fill."""
     return 1 + k1 * 2 / 3 * BODY**2
 
 
 def pixel_centers(images: Tensor) -> Tensor:
-    """``(1, s, s, 2)`` float64, right and down; the edges of an image are at ±1."""
+    """Return ``(1, s, s, 2)`` float64, right and down; the edges of an image are at ±1."""
     identity = torch.eye(2, 3, dtype=torch.float64)[None]
     return F.affine_grid(identity, [1, 1, *images.shape[2:]], align_corners=False)
 
 
 def sample(images: Tensor, points: Tensor) -> Tensor:
-    """Bilinear samples of images at points; black beyond their edges."""
+    """Return bilinear samples of images at points; black beyond their edges."""
     grid = points.to(images.dtype).expand(len(images), -1, -1, -1)
     return F.grid_sample(images, grid, align_corners=False)
 
 
 def normalized(images: Tensor) -> Tensor:
-    """Less the mean of MNIST's pixels, over their standard deviation."""
+    """Return less the mean of MNIST's pixels, over their standard deviation."""
     return (images - 0.1307) / 0.3081
 
 
 def train(images: Tensor, labels: Tensor, epochs: int, seed: int) -> nn.Module:
-    """A network of two convolutions and 206,922 parameters, without augmentation."""
+    """Train a network of two convolutions and 206,922 parameters, without augmentation."""
     torch.manual_seed(seed)
     network = nn.Sequential(
         *(nn.Conv2d(1, 16, 3, padding=1), nn.ReLU(), nn.MaxPool2d(2)),
@@ -112,7 +112,7 @@ def train(images: Tensor, labels: Tensor, epochs: int, seed: int) -> nn.Module:
 
 
 def distorted_digits(digits: Digits, epochs: int, seeds: Sequence[int]) -> list[Row]:
-    """Accuracy in percent, mean and sample standard deviation over the seeds."""
+    """Return accuracy in percent, mean and sample standard deviation over the seeds."""
     images = normalized(digits.train_images)
     networks = [train(images, digits.train_labels, epochs, seed) for seed in seeds]
     rows: list[Row] = []
@@ -129,7 +129,7 @@ def distorted_digits(digits: Digits, epochs: int, seeds: Sequence[int]) -> list[
 
 
 def picture(rows: Sequence[Row], digit: Tensor) -> Figure:
-    """A digit ``(1, 1, 28, 28)`` behind some lenses, and the accuracies."""
+    """Return A digit ``(1, 1, 28, 28)`` behind some lenses, and the accuracies."""
     figure = Figure((8, 6.2), layout="constrained")
     above, below = np.array(figure.subfigures(2, 1, height_ratios=(1, 2.8)))
     for axes, k1 in zip(above.subplots(1, 6), K1[::2], strict=True):

@@ -14,7 +14,7 @@ PAPER_DEG = (73.1, 51.6, 31.5, 16.7, 8.4)
 
 
 def fov(level: int = 10) -> list[Row]:
-    """Fields of view at base levels 0 to 4.
+    """Return fields of view at base levels 0 to 4.
 
     Args:
         level: Level s of the panorama.
@@ -32,7 +32,7 @@ def fov(level: int = 10) -> list[Row]:
 
 
 def picture() -> Figure:
-    """Fields of view over the level of the panorama."""
+    """Return fields of view over the level of the panorama."""
     figure = Figure((8, 4.4), layout="constrained")
     axes = figure.subplots()
     tables = {level: fov(level) for level in range(4, 11)}

@@ -24,7 +24,7 @@ def save(
     """Print a Markdown table; write ``<name>.csv`` and ``<name>.png``.
 
     Args:
-        name: Of the study.
+        name: Name of the study.
         rows: Lines of the table, all with the same columns.
         figure: The picture.
         folder: Output folder; created if missing.
@@ -36,7 +36,7 @@ def save(
 
 
 def markdown(rows: Sequence[Row], digits: int = 6) -> str:
-    """The table; floats with `digits` significant digits."""
+    """Return the table; floats with `digits` significant digits."""
     header = list(rows[0])
     cells = [
         [f"{v:.{digits}g}" if isinstance(v, float) else str(v) for v in row.values()]

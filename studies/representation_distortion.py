@@ -35,19 +35,19 @@ GRIDS: dict[str, PinholeGrid | None] = {
 
 
 def angle_to_owner(grid: PinholeGrid, directions: Array) -> Array:
-    """``(...)`` angles θ in radians from ``(..., 3)`` directions to the nearest image center."""
+    """Return ``(...)`` angles θ in radians from ``(..., 3)`` directions to the nearest center."""
     chord, _ = cKDTree(grid.centers_xyz).query(directions)
     return 2 * np.arcsin(np.minimum(chord / 2, 1))
 
 
 def pinhole_distortion(theta: Array) -> tuple[Array, Array]:
-    """Angular distortion in radians and area scale of a pinhole image at the angle θ."""
+    """Return angular distortion in radians and area scale of a pinhole image at the angle θ."""
     a, b = 1 / np.cos(theta) ** 2, 1 / np.cos(theta)
     return 2 * np.arcsin((a - b) / (a + b)), a * b
 
 
 def distortion(grid: PinholeGrid | None, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """``(H, W)`` angular distortion and area scale, at the pixels of a panorama.
+    """Return ``(H, W)`` angular distortion and area scale, at the pixels of a panorama.
 
     Args:
         grid: Images, each within the region it owns; None for the ERP itself.
@@ -60,7 +60,7 @@ def distortion(grid: PinholeGrid | None, shape: tuple[int, int]) -> tuple[Array,
 
 
 def worst(grid: PinholeGrid | None) -> tuple[float, float]:
-    """Greatest angular distortion in degrees and greatest area scale."""
+    """Return greatest angular distortion in degrees and greatest area scale."""
     if grid is None:
         return 180.0, np.inf
     corners = SphericalVoronoi(grid.centers_xyz).vertices
@@ -69,7 +69,7 @@ def worst(grid: PinholeGrid | None) -> tuple[float, float]:
 
 
 def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]:
-    """Means over the sphere by solid angle, and extremes.
+    """Return means over the sphere by solid angle, and extremes.
 
     Args:
         shape: ``(H, W)`` of the panorama at whose pixels the means are sampled.
@@ -89,7 +89,7 @@ def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Maps over the sphere, and bars of the means."""
+    """Return maps over the sphere, and bars of the means."""
     figure = Figure((11.5, 5.4), layout="constrained")
     upper, lower = np.array(figure.subfigures(2, 1))
     panels = upper.subplots(2, 5, subplot_kw={"xticks": [], "yticks": []})

@@ -17,7 +17,7 @@ SPHERES = ("of its mean radius", "vertices on it", "around the mesh")
 
 
 def surface_area(levels: int = 8) -> list[Row]:
-    """Area of the mesh after Loop subdivision over that of a sphere of the same radius.
+    """Return the area of the mesh after Loop subdivision over that of a sphere.
 
     Args:
         levels: The last level.
@@ -36,13 +36,13 @@ def surface_area(levels: int = 8) -> list[Row]:
 
 
 def mesh_area(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """Sum of the areas of triangles."""
+    """Return sum of the areas of triangles."""
     a, b, c = vertices[faces.T]
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """The ratios, and what they lack to 1."""
+    """Return the ratios, and what they lack to 1."""
     figure = Figure((9, 4.2), layout="constrained")
     ratio, missing = figure.subplots(1, 2)
     levels = [row["level"] for row in rows]

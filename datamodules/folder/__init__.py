@@ -1,1 +1,1 @@
-"""Data sets of your own: folders of panoramas or photos with labels."""
+"""User-defined data sets: folders of panoramas or photos with labels."""

@@ -1,4 +1,4 @@
-"""Cameras of a user's own photos: ``cameras.json``, one field of view for all, or EXIF data."""
+"""Cameras of photos: ``cameras.json``, one field of view for all, or EXIF data."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class FolderCameras:
 
     Attributes:
         path: ``cameras.json``, there or not.
-        given: Its content by the name of an image or a folder; ``.`` for all.
+        given: Content of the file by the name of an image or a folder; ``.`` for all.
         fov_deg: Horizontal field of view of the photos that it does not name; None for that of
             their EXIF data.
     """
@@ -73,10 +73,10 @@ class FolderCameras:
             problems.add(error, f"{self.path.name}: {place}")
 
     def matrix(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix of a photo.
+        """Return the camera matrix of a photo.
 
         Args:
-            files: Of the photo.
+            files: Files of the photo.
 
         Returns:
             ``(3, 3)`` K of the photo as displayed, its EXIF orientation applied, for integer pixel

@@ -1,4 +1,4 @@
-"""Classes of a user's own data set, `classes.json`: the meaning of its label pixels."""
+"""Classes of a user-defined data set, `classes.json`: the meaning of its label pixels."""
 
 from __future__ import annotations
 
@@ -39,8 +39,8 @@ class FolderClasses:
         names: K names; the label of a class is its place here plus one.
         codes: ``(n,)`` int32, in rising order: values, or colors as R · 65536 + G · 256 + B.
         labels: ``(n,)`` uint8, the class of each.
-        in_colors: Whether the codes are colors.
-        length: Of the list that named the classes; None where they were given values or colors.
+        in_colors: True if the codes are colors.
+        length: Length of the list of names; None if the classes have values or colors.
     """
 
     names: tuple[str, ...]
@@ -56,11 +56,11 @@ class FolderClasses:
         return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
     def decode(self, stored: NDArray[np.integer], path: object = "labels") -> NDArray[np.uint8]:
-        """Labels of the pixels of a label image; 0 where they have no class.
+        """Return labels of the pixels of a label image; 0 where they have no class.
 
         Args:
             stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colors.
-            path: Their file, for messages.
+            path: File of the pixels, for messages.
 
         Returns:
             ``(H, W)``.
@@ -89,14 +89,14 @@ class FolderClasses:
         return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
 
     def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
-        """One number for each pixel of a label image, as in `codes`."""
+        """Return one number for each pixel of a label image, as in `codes`."""
         numbers = stored.astype(np.int32)
         if not self.in_colors:
             return numbers
         return numbers[..., 0] << 16 | numbers[..., 1] << 8 | numbers[..., 2]
 
     def describe(self, codes: NDArray[np.int32]) -> str:
-        """Some codes as they are written in `classes.json`."""
+        """Format some codes as in `classes.json`."""
         written = "#{:06x}" if self.in_colors else "{}"
         shown = [written.format(code) for code in codes[:_MOST_SHOWN].tolist()]
         shown += ["…"] if len(codes) > _MOST_SHOWN else []
@@ -183,7 +183,7 @@ def _check_names(path: Path, names: list[Any]) -> None:
 
 
 def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:
-    """The label of every value or color."""
+    """Return the label of every value or color."""
     if len({isinstance(value, str) for _, values in named for value in values}) > 1:
         raise DataError(path, found="values and colours", expected="either values or colours")
     labels: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""Decoder of the files of a user's own images."""
+"""Decoder of images and labels of a user."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ _COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "pa
 
 @dataclass(frozen=True)
 class FolderReader(ImageReader):
-    """Reads a user's own images.
+    """Decoder of images and labels of a user.
 
     Attributes:
         classes: Meaning of their labels.
         depth_units_per_m: Units in a meter of depth files of whole numbers.
-        cameras: Of photos.
+        cameras: Cameras of photos.
     """
 
     classes: FolderClasses
@@ -64,33 +64,33 @@ class FolderReader(ImageReader):
         return read_image_size(path)
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colors, whatever the format."""
+        """Decode the colors."""
         return read_rgb(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes by ``classes.json``."""
+        """Return classes by ``classes.json``."""
         codes = read_codes(files.labels, in_colors=self.classes.in_colors)
         codes = codes if shape is None else resize_nearest(codes, shape)
         return self.classes.decode(codes, files.labels)
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Depth in steps of 1/512 m."""
+        """Read depth in steps of 1/512 m."""
         return meters_to_steps(read_depth_m(files.parts["depth"], self.depth_units_per_m))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
+        """Read the camera matrix, by ``cameras.json``, the field of view or the EXIF data."""
         return self.cameras.matrix(files) if self.cameras else super().camera(files)
 
 
 def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
-    """All images of a data set, in the order of their names.
+    """List all images of a data set, in the order of their names.
 
     A name is the path of the image in ``images/`` without ending, see `composed`.
 
     Args:
         root: Folder with ``images/`` and ``labels/``.
         problems: Duplicate names and missing or ambiguous files are added.
-        with_depth: Whether depth is wanted.
+        with_depth: True to name files of depth.
 
     Raises:
         DataError: A folder is missing, or there are no images.
@@ -104,7 +104,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
     depths = NamedFiles(root / "depth") if with_depth else None
     for rgb in image_paths(root / "images"):
         name = _name(root / "images", rgb)
-        own, depth = labels.folder / f"{name}.png", None
+        label, depth = labels.folder / f"{name}.png", None
         with problems.noted(name):
             if name in found:
                 raise DataError(
@@ -113,11 +113,11 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )
-            own = labels.path(f"{name}.png")
+            label = labels.path(f"{name}.png")
             if depths is not None:
                 without = "Or train without depth: data.inputs=[rgb]."
                 depth = find_depth(depths, name, without)
-        found.setdefault(name, ImageFiles(name, rgb, own, depth))
+        found.setdefault(name, ImageFiles(name, rgb, label, depth))
     return [found[name] for name in sorted(found)]
 
 
@@ -176,8 +176,8 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
 
     Args:
         path: The PNG.
-        in_colors: Whether classes are told by colors, not values. Of palettes, values are the
-            numbers of the entries.
+        in_colors: True if classes are colors, not values. The values of palettes are the numbers
+            of the entries.
 
     Returns:
         ``(H, W)`` values, or ``(H, W, 3)`` colors; transparency is left out.
@@ -189,7 +189,7 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
 
 
 def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
-    """Masks of all pixels of some classes.
+    """Return masks of all pixels of some classes.
 
     Args:
         folder: With ``labels/`` and ``classes.json``, as of ``data=folder``.

@@ -1,4 +1,4 @@
-"""Training, validation and test splits of a user's own data set."""
+"""Training, validation and test splits of a user-defined data set."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FolderSplits:
         validation_fraction: Share of the training scenes for validation, if drawn: at least one,
             never all, so none of a single image; 0 for no validation, whether there is a list or
             not.
-        seed: Of the drawing.
+        seed: Seed of the drawing.
     """
 
     root: Path
@@ -43,7 +43,7 @@ class FolderSplits:
     def divide(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, list[ImageFiles]]:
-        """The images of every split, each in the order given.
+        """Return the images of every split, in the order given.
 
         Args:
             images: All of the data set.
@@ -54,33 +54,26 @@ class FolderSplits:
         """
         listed = self._read_lists(images, problems)
         named = {name for names in listed.values() for name in names}
-        rest = [files for files in images if files.name not in named]
-        if "test" in listed:
-            test = self._some("test", listed["test"])
-        elif "train" in listed:
-            test = self._some("test", {files.name for files in rest})
+        rest = {files.name for files in images} - named
+        if "test" in listed or "train" in listed:
+            test = self._some("test", listed.get("test", rest))
         else:
-            test = self._draw("test", rest, self.test_fraction)
-        rest = [files for files in rest if files.name not in test]
-        train = self._some("train", listed.get("train", {files.name for files in rest}))
+            test = self._draw("test", images, rest, self.test_fraction)
+        train = self._some("train", listed.get("train", rest - test))
         held: set[str] = set()
         if self.validation_fraction and "val" in listed:
             held = self._some("val", listed["val"])
         elif self.validation_fraction:
-            training = [files for files in images if files.name in train]
-            held = self._draw("val", training, self.validation_fraction)
+            held = self._draw("val", images, train, self.validation_fraction)
         chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
-        return {
-            split: [files for files in images if files.name in chosen[split]] for split in SPLITS
-        }
+        return {split: [f for f in images if f.name in chosen[split]] for split in SPLITS}
 
     def _read_lists(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
-        """Names in each existing list."""
-        names = {files.name: files.name for files in images}
-        # With the ending of the image is right as well.
-        names |= {files.name + files.rgb.suffix: files.name for files in images}
+        """Read the names in each existing list."""
+        # Lists may name images with or without their suffix.
+        names = {f.name + suffix: f.name for f in images for suffix in ("", f.rgb.suffix)}
         listed: dict[Split, set[str]] = {}
         owners: dict[str, Path] = {}
         for split in SPLITS:
@@ -93,14 +86,17 @@ class FolderSplits:
                     listed[split].add(_listed_name(path, line, names, owners))
         return listed
 
-    def _draw(self, split: Split, images: Sequence[ImageFiles], fraction: float) -> set[str]:
-        """The names in some scenes, the same for the same seed."""
-        groups = {files.name: _scene(files) for files in images}
+    def _draw(
+        self, split: Split, images: Sequence[ImageFiles], names: set[str], fraction: float
+    ) -> set[str]:
+        """Draw the names in some scenes."""
+        # Scenes are top-level folders; an image outside folders is a scene of its own.
+        groups = {f.name: f.name.partition("/")[0] for f in images if f.name in names}
         if len(set(groups.values())) == 1 < len(groups):
             rank_zero_warn(
                 f"All {len(groups)} images to draw those of {split} from are in one scene, "
-                f"{groups[images[0].name]}. They are drawn one by one: scores will be better than "
-                "on places that are new to the network.",
+                f"{next(iter(groups.values()))}. They are drawn one by one: scores will be better "
+                "than on places that are new to the network.",
                 category=UserWarning,
             )
             groups = {name: name for name in groups}
@@ -115,7 +111,7 @@ class FolderSplits:
         return {name for name, group in groups.items() if group in drawn}
 
     def _some(self, split: Split, names: set[str]) -> set[str]:
-        """The names, if there are any."""
+        """Return the names if there are any."""
         if not names:
             raise DataError(
                 self.root,
@@ -127,13 +123,8 @@ class FolderSplits:
         return names
 
 
-def _scene(files: ImageFiles) -> str:
-    """The top-level folder of the name; the name itself of an image outside folders."""
-    return files.name.partition("/")[0]
-
-
 def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
-    """The image that a line of a list names, which is then that list's own."""
+    """Return the image that a line of a list names, and assign it to that list."""
     if line not in names:
         raise DataError(
             path,
@@ -152,7 +143,7 @@ def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str,
 
 
 def _lines(path: Path) -> list[str]:
-    """The names in a list, without empty lines and those that begin with #."""
+    """Read the names in a list, without empty lines and comments (#)."""
     try:
         lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
     except (OSError, UnicodeDecodeError) as error:

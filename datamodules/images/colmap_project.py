@@ -22,7 +22,7 @@ from tangent_train.rendering.camera_files import RIG_FILE, write_rig
 
 
 def flat_names(names: Sequence[str]) -> dict[str, str]:
-    """Names without folders, by the names of panoramas.
+    """Return names without folders, by the names of panoramas.
 
     Raises:
         DataError: Two are the same.
@@ -44,14 +44,14 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
 
 
 class ColmapProject:
-    """A project in the making.
+    """A project that is being written.
 
     Args:
         folder: A new one.
         grid: The images of every panorama.
-        faces: Indices of those that are rendered.
-        suffix: Of their files.
-        interpolation: As of `equirect_to_tangent`.
+        faces: Indices of the rendered images.
+        suffix: Suffix of the image files.
+        interpolation: See `equirect_to_tangent`.
     """
 
     def __init__(
@@ -78,8 +78,8 @@ class ColmapProject:
         """Render a panorama.
 
         Args:
-            name: Of its images; one of `flat_names`.
-            file: Of the panorama, as the rig names it.
+            name: Name of the images, from `flat_names`.
+            file: File of the panorama, as named in the rig.
             image: ``(H, W)`` or ``(H, W, C)``.
             counts: ``(H', W')``, 0 where pixels are ignored.
             progress: See `write_each`.

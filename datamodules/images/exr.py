@@ -17,7 +17,7 @@ _CONVERT = "Save the depth alone, or convert it to a float TIFF or .npy file."
 
 
 def read_exr_size(path: Path) -> tuple[int, int]:
-    """Rows and columns of an OpenEXR image, from its header.
+    """Read rows and columns of an OpenEXR image, from its header.
 
     Raises:
         DataError: It cannot be read.

@@ -50,10 +50,10 @@ class PanoramaArea:
     Attributes:
         full_shape: Rows H and columns W = 2 H of the whole panorama.
         rows: First row of the image in it, and the one after its last.
-        columns: The same of columns; the first is below W, the last may be beyond: the image then
+        columns: First column of the image, below W, and the one after its last; beyond W the image
             continues at the left, across ±180°.
-        image_shape: Rows and columns of the image itself: those of its place, or a little more or
-            less where these were rounded.
+        image_shape: Rows and columns of the image itself, which may differ from `rows` and
+            `columns` by rounding.
     """
 
     full_shape: tuple[int, int]
@@ -63,7 +63,7 @@ class PanoramaArea:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the image is the whole panorama."""
+        """True if the image is the whole panorama."""
         height, width = self.full_shape
         return self.rows == (0, height) and self.columns == (0, width)
 
@@ -78,7 +78,7 @@ class PanoramaArea:
         return whole
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
-        """The image's part ``(h, w[, C])`` of a panorama ``(H, W[, C])``; inverse of `place`.
+        """Cut the image ``(h, w[, C])`` out of a panorama ``(H, W[, C])``; inverse of `place`.
 
         Of a whole panorama it is the panorama itself.
         """
@@ -88,7 +88,7 @@ class PanoramaArea:
         return whole[rows[:, None], columns]
 
     def places(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows ``(h,)`` and columns ``(w,)`` of the whole panorama that `cut` takes."""
+        """Return rows ``(h,)`` and columns ``(w,)`` of the whole panorama that `cut` takes."""
         rows = np.arange(*self.rows)[:, None]
         columns = np.arange(*self.columns)[None] % self.full_shape[1]
         height, width = self.image_shape
@@ -96,13 +96,13 @@ class PanoramaArea:
 
 
 def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
-    """The place of an image by its own GPano tags.
+    """Return the place of an image on the sphere by its GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
-        size: Its rows and columns.
+        size: Rows and columns of the image.
 
     Returns:
         The whole sphere if tags are missing, see `whole_area`.
@@ -143,10 +143,10 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
 
 
 def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
-    """The place of an image by the angles of its outer edges.
+    """Return the place of an image by the angles of its outer edges.
 
     Args:
-        size: Its rows and columns.
+        size: Rows and columns of the image.
         crop: West and east, −180 to 180; west is the greater one of an image across ±180°. South
             and north, −90 to 90. Degrees.
 
@@ -178,13 +178,13 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
 
 
 def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> PanoramaArea:
-    """The place of an image that shows the whole sphere.
+    """Return the place of an image that shows the whole sphere.
 
     Args:
         path: The image, for the message.
-        size: Its rows and columns. One column too many or too few is allowed, a rounding error of
-            other programs: it is left out, or its neighbor is repeated.
-        remedy: For the message.
+        size: Rows and columns of the image. One column too many or too few is allowed, a rounding
+            error of other programs: it is left out, or its neighbor is repeated.
+        remedy: Remedy in the message.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -201,7 +201,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
 
 
 def up_of(path: Path) -> NDArray[np.float64] | None:
-    """The direction of up in a panorama by its own GPano tags, see `up_from_pose`.
+    """Return the direction of up by the GPano tags of a panorama, see `up_from_pose`.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
@@ -234,13 +234,13 @@ def _number(path: Path, name: str, text: str, most: float) -> float:
 def _area(
     subject: object, size: tuple[int, int], across: tuple[float, float], down: tuple[float, float]
 ) -> PanoramaArea:
-    """The place of an image.
+    """Return the place of an image.
 
     Args:
-        subject: Of the error.
-        size: Its rows and columns.
-        across: Its left edge and its width, as fractions of the whole panorama's.
-        down: Its upper edge and its height.
+        subject: Subject of the error.
+        size: Rows and columns of the image.
+        across: Left edge and width of the image, as fractions of the whole width.
+        down: Upper edge and height, as fractions of the whole height.
     """
     full_height = max(1, round(size[1] / across[1] / 2))
     if 2 * full_height > _MOST_COLUMNS:

@@ -1,4 +1,4 @@
-"""Finding and naming the user's own images and depth maps."""
+"""Finding and naming images and depth maps of users."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ def image_paths(
     is_result: Callable[[Path], bool] = lambda path: False,
     tell: Callable[[str], object] = lambda text: None,
 ) -> list[Path]:
-    """The images that a setting names.
+    """List the images that a setting names.
 
     Args:
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth.
-        suffixes: Of images, in lower case.
+        suffixes: Suffixes of images, in lower case.
         is_result: True for files that a command wrote: they are passed over.
         tell: Called with the number of the other files of a folder or pattern, if there are any.
 
@@ -58,7 +58,7 @@ def image_paths(
         named = list(walk_files(path))
     else:
         named = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
-    # Links that lead nowhere stay: whoever reads them says so.
+    # Broken links stay: reading them is an error.
     files = {file for file in named if not file.is_dir() and not file.name.startswith(".")}
     found = {file for file in files if not is_result(file)}
     images = sorted(file for file in found if file.suffix.lower() in suffixes)
@@ -79,10 +79,10 @@ def image_paths(
 
 
 def walk_files(folder: Path) -> Iterator[Path]:
-    """Files of a folder and its subfolders, linked ones included, each folder once.
+    """Yield files of a folder and its subfolders, linked ones included, each folder once.
 
     Args:
-        folder: There or not; hidden files and folders are left out.
+        folder: A folder, which may be missing; hidden files and folders are left out.
 
     Raises:
         DataError: A folder cannot be opened.
@@ -103,7 +103,7 @@ def _refuse(error: OSError) -> None:
 
 
 def composed(name: str) -> str:
-    """A name with composed letters (Unicode's form NFC).
+    """Compose the letters of a name (Unicode's form NFC).
 
     Keyboards write "ü" as one character; macOS and its archives, as "u" and an accent.
 
@@ -114,7 +114,7 @@ def composed(name: str) -> str:
 
 
 def spelled(name: str) -> str:
-    """A quoted name with the code points of its letters beyond ASCII.
+    """Quote a name, with the code points of its letters beyond ASCII.
 
     >>> spelled("k" + chr(0xFC) + "che")
     "'k<U+00FC>che'"
@@ -126,7 +126,7 @@ class NamedFiles:
     """Files of a folder and its subfolders by `composed` names.
 
     Args:
-        folder: There or not.
+        folder: The folder, which may be missing.
 
     Raises:
         DataError: A folder cannot be opened.
@@ -140,10 +140,10 @@ class NamedFiles:
             self._found.setdefault(name, []).append(path)
 
     def path(self, name: str) -> Path:
-        """The file of a name, there or not.
+        """Return the file of a name, existing or not.
 
         Args:
-            name: Its path in the folder.
+            name: Path of the file in the folder.
 
         Raises:
             DataError: There are several.
@@ -160,7 +160,7 @@ class NamedFiles:
 
 
 def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
-    """The depth map of an image.
+    """Find the depth map of an image.
 
     Args:
         files: The depth maps.
@@ -185,7 +185,7 @@ def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
 
 
 def short_names(paths: Sequence[Path]) -> list[str]:
-    """A name for every image: its path below the folder all are in, without suffix.
+    """Return a name for every image: its path below their common folder, without suffix.
 
     Images that would share a name keep their suffix.
 

@@ -31,15 +31,15 @@ def _not_black(path: Path) -> NDArray[np.bool_]:
 
 
 class Masks:
-    """Where panoramas count, in the frame in which they are stored.
+    """Pixels of panoramas that count, in the frame in which they are stored.
 
     Args:
         mask: See `Mask`; text is a path; of an array ``(H, W)`` 0 and False do not count.
-        setting: Its name, for messages.
+        setting: Name of the setting, for messages.
         counts: Reads a file.
 
     Attributes:
-        of_each: Whether every panorama has a mask of its own.
+        of_each: True if every panorama has its own mask.
 
     Raises:
         DataError: There is no such file, or it cannot be read.
@@ -60,7 +60,7 @@ class Masks:
             self._path = Path(mask)
             self.of_each = self._path.is_dir()
             self._files = NamedFiles(self._path) if self.of_each else None
-            self._of_all = None if self.of_each else self._read(self._path)
+            self._of_all = None if self.of_each else counts(self._checked(self._path))
         elif isinstance(mask, np.ndarray) and mask.ndim == 2:
             self._path, self._of_all = Path(setting), mask != 0
         elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
@@ -82,10 +82,10 @@ class Masks:
         whole_area(path, read_image_size(path), _REMEDY)
 
     def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
-        """Where a panorama counts: 255, elsewhere and where it shows nothing 0.
+        """Return 255 where a panorama counts, and 0 elsewhere and where it shows nothing.
 
         Args:
-            name: Its path in the folder of panoramas, without ending.
+            name: Path of the panorama in its folder, without suffix.
             area: The part of the sphere that it shows. A mask of its size is of that part; others
                 are of the whole sphere and sampled without interpolation.
 
@@ -98,27 +98,24 @@ class Masks:
         kept = self._kept
         if kept is not None and kept[0] == area:
             return kept[1]
-        path, own = self._path, self._of_all
+        path, stored = self._path, self._of_all
         if self.of_each:
             path = self._file(name)
-            own = self._read(path)
+            stored = self._counts(self._checked(path))
         counts = area.place(np.full(area.image_shape, 255, np.uint8))
         rows = area.full_shape[0]
         counts[90 - (np.arange(rows) + 0.5) * 180 / rows < self._lowest_deg] = 0
-        if own is not None:
-            rows, columns = own.shape
+        if stored is not None:
+            rows, columns = stored.shape
             fits = (rows, columns) == area.image_shape
             place = area if fits else whole_area(path, (rows, columns), _REMEDY)
-            counts[~resize_nearest(place.place(own), area.full_shape)] = 0
+            counts[~resize_nearest(place.place(stored), area.full_shape)] = 0
         if not self.of_each:
             self._kept = area, counts
         return counts
 
     def _file(self, name: str) -> Path:
         return self._path if self._files is None else self._files.path(f"{name}.png")
-
-    def _read(self, path: Path) -> NDArray[np.bool_]:
-        return self._counts(self._checked(path))
 
     def _checked(self, path: Path) -> Path:
         there = path.is_file()

@@ -23,7 +23,7 @@ _SEEN = np.array(
 
 @lru_cache
 def class_colors(num_classes: int) -> NDArray[np.uint8]:
-    """Distinct colors, black for the unknown class 0.
+    """Return distinct colors, black for the unknown class 0.
 
     Each is the one that is farthest from all before it in CIELAB: by full color vision plus three
     times by the worse of eyes without red and without green cones. Classes with small numbers,

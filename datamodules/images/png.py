@@ -119,7 +119,7 @@ def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
         colors: Allowed values of `PngHeader.color`.
 
     Raises:
-        DataError: As by `read_png_header`, or it has another pixel format.
+        DataError: See `read_png_header`, or the file has another pixel format.
     """
     header = read_png_header(path)
     if header.bits != bits or header.color not in colors:
@@ -137,7 +137,7 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
 
     Args:
         path: The image.
-        size: Its rows and columns.
+        size: Rows and columns of the image.
         erp_height: Rows needed.
 
     Raises:

@@ -35,12 +35,12 @@ _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 def panorama_area(
     path: Path, size: tuple[int, int], crop: Sequence[float] | None = None
 ) -> PanoramaArea:
-    """The part of the sphere that a file shows.
+    """Return the part of the sphere that a file shows.
 
     Args:
         path: An image, or an array or video, which have no GPano tags.
-        size: Its rows and columns, of a video those of a frame.
-        crop: That part, see `area_of_crop`; None for that of its GPano tags.
+        size: Rows and columns of the image or of a frame of the video.
+        crop: The part, see `area_of_crop`; None for the part in the GPano tags.
 
     Raises:
         DataError: It is neither a whole panorama nor tagged as a part of one.
@@ -98,12 +98,11 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
     height, width = equirect_shape(level)
     if image.shape[0] <= height or image.dtype not in _RESIZABLE:
         return image
-    channels = np.atleast_3d(image)
-    small = np.empty((height, width, channels.shape[2]), image.dtype)
-    for k in range(channels.shape[2]):  # OpenCV takes four channels at most
-        one = np.ascontiguousarray(channels[..., k])
-        small[..., k] = cv2.resize(one, (width, height), interpolation=cv2.INTER_AREA)
-    return small.reshape(height, width, *image.shape[2:])
+    small = [  # OpenCV takes four channels at most
+        cv2.resize(np.ascontiguousarray(channel), (width, height), interpolation=cv2.INTER_AREA)
+        for channel in np.moveaxis(np.atleast_3d(image), -1, 0)
+    ]
+    return np.stack(small, axis=-1).reshape(height, width, *image.shape[2:])
 
 
 def write_tangent_folder(
@@ -119,7 +118,7 @@ def write_tangent_folder(
         folder: A new one, or one with tangent images of an earlier run, which it replaces.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
         cameras: Content of its ``cameras.json``.
-        interpolation: As of `equirect_to_tangent`.
+        interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
     Raises:
@@ -138,7 +137,7 @@ def write_tangent_folder(
 
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[Path]:
-    """A folder to be filled by the block; it appears once that has succeeded.
+    """Open a folder to be filled by the block; it appears once the block has succeeded.
 
     Args:
         folder: A new one, or one that holds only what an earlier run wrote.

@@ -26,7 +26,7 @@ from tangent_train.rendering import Blend, tangent_to_equirect
 from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
 
-Kind = Literal["color", "labels", "depth", "features"]
+ResultKind = Literal["color", "labels", "depth", "features"]
 """Meaning of pixels: colors and features are interpolated, labels and depth never."""
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
@@ -40,10 +40,10 @@ _NO_DEPTH = 65535
 
 
 def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
-    """The results for all images of a grid: files with the images' names and any suffix.
+    """List the results for all images of a grid: files with the images' names.
 
     Args:
-        folder: Their folder.
+        folder: Folder of the results.
         cameras: The images.
 
     Returns:
@@ -89,11 +89,11 @@ class TangentResults:
 
     arrays: Sequence[NDArray[Any]]
     grid: PinholeGrid
-    kind: Kind
+    kind: ResultKind
 
     @classmethod
     def read(
-        cls, files: Sequence[Path], grid: PinholeGrid, kind: Kind | Literal["auto"]
+        cls, files: Sequence[Path], grid: PinholeGrid, kind: ResultKind | Literal["auto"]
     ) -> TangentResults:
         """Read and check them.
 
@@ -127,8 +127,8 @@ class TangentResults:
                 files[0],
                 found=f"{first.dtype} of shape {first.shape}",
                 expected=f"{decided}",
-                remedy=f"Say what they are with kind={', '.join(get_args(Kind))}: labels and depth "
-                "have one channel, colours one or three.",
+                remedy=f"Choose kind={', '.join(get_args(ResultKind))}: labels and depth have one "
+                "channel, colours one or three.",
             )
         return cls(arrays, grid, decided)
 
@@ -149,7 +149,7 @@ class TangentResults:
                 32-bit and labels the smallest integers that hold them.
             shape: ``(H, W)`` of the panorama.
             blend: Blending of overlapping images, for colors and features.
-            z_depth: Whether depth is along the axes of the images' cameras, to be converted to
+            z_depth: True if depth is along the axes of the images' cameras, to be converted to
                 distance from the center.
 
         Raises:
@@ -200,7 +200,7 @@ class TangentResults:
             out[part] = tangent_to_equirect(group, grid, shape, blend)
 
 
-def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
+def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
     is_array, kind = file.suffix.lower() == ".npy", array.dtype.kind
     if is_array and kind == "f":
         return "features"
@@ -210,7 +210,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> Kind:
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
-    """Distances from the center, of depth ``(d, d)`` along the axis of an image's camera."""
+    """Convert depth ``(d, d)`` along the axis of an image's camera to distances."""
     lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)

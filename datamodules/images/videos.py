@@ -28,7 +28,7 @@ _BOXES = b"ftyp styp moov moof mdat mfra free skip wide meta sidx ssix prft pdin
 _BOX_HEAD = 8  # bytes
 _SHOWN_VP8 = 0x10
 _STRAIGHT = 0.02  # tolerance of a matrix: about a degree
-_UNTURNED = np.eye(2, dtype=np.int64)
+_UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
 _UPRIGHT = "Export the video upright."
 _AHEAD = 2
 _ENCODER = "libx264"
@@ -37,12 +37,12 @@ _BT709 = 1  # of the matrix, primaries and transfer: what players assume of larg
 
 
 def read_video_size(path: Path) -> tuple[int, int, int]:
-    """Number of frames that players show, and rows and columns of the first one, upright.
+    """Return the number of frames that players show, and upright rows and columns of the first.
 
     All packets are read; only the first frame is decoded.
 
     Raises:
-        DataError: It cannot be read, is truncated or damaged, or has no video stream or no frames.
+        DataError: It cannot be read, is truncated or damaged, or lacks a video stream or frames.
         SettingError: PyAV is missing.
     """
     _check_end(path)
@@ -64,7 +64,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
     if first is None:
         raise DataError(path, found="no frame that can be decoded", expected="a whole video")
     check_pixels(path, first.height, first.width)
-    rows, columns = _upright(first, _turn(path, first)).shape[:2]
+    rows, columns = _upright(first, _orientation(path, first)).shape[:2]
     # A cut without encoding leaves frames before the first one that need what was cut off.
     start = first.pts
     return sum(None in (time, start) or time >= start for time in times), rows, columns
@@ -73,7 +73,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
 def read_frames(
     path: Path, frames: int | None = None, every: int = 1
 ) -> Generator[Callable[[], NDArray[np.uint8]]]:
-    """The first and then every n-th frame of a video, decoded in a thread a few ahead.
+    """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
 
     Args:
         path: The video.
@@ -81,8 +81,7 @@ def read_frames(
         every: Distance n of the frames.
 
     Yields:
-        A function that returns a frame, upright in RGB, ``(H, W, 3)``; not calling it saves the
-        conversion.
+        A function that converts a frame: upright in RGB, ``(H, W, 3)``.
 
     Raises:
         DataError: A frame is damaged, or there are more or fewer.
@@ -92,23 +91,23 @@ def read_frames(
 
 
 def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArray[np.int64]]]:
-    """Frames, and the turn that makes them upright."""
+    """Yield frames with their orientation, see `_orientation`."""
 
     def decoded() -> Generator[tuple[Any, NDArray[np.int64]]]:
-        number, turn = -1, _UNTURNED
+        number, signs = -1, _UPRIGHT_SIGNS
         with _opened(path) as (container, stream):
             for number, frame in enumerate(container.decode(stream)):
                 if frame.is_corrupt:
                     raise _damaged(path, f"frame {number}, and frames before that refer to it")
                 # Within an H.264 stream, a matrix may be that of the first frame alone.
-                own = _turn(path, frame)
-                turn = own if number == 0 else turn
-                if "DISPLAYMATRIX" in frame.side_data and (own != turn).any():
+                given = _orientation(path, frame)
+                signs = given if number == 0 else signs
+                if "DISPLAYMATRIX" in frame.side_data and (given != signs).any():
                     found = f"another orientation from frame {number} on"
                     expects = "a video of one orientation"
                     raise DataError(path, found=found, expected=expects, remedy=_UPRIGHT)
                 if number % every == 0:
-                    yield frame, turn
+                    yield frame, signs
         if number + 1 != expected:
             raise _damaged(path, f"{number + 1} of {expected} frames")
 
@@ -119,7 +118,7 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """A container and its video stream; errors in the block name the file."""
+    """Open a container and its video stream; errors in the block name the file."""
     with of_extra("video", path):
         import av
     options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
@@ -150,7 +149,7 @@ def _file_url(path: Path) -> str:
 
 @contextmanager
 def _logged_errors(path: Path) -> Iterator[list[str]]:
-    """Errors that FFmpeg's reader of Matroska logs; it passes over damaged parts."""
+    """Collect the errors that FFmpeg's reader of Matroska logs; it skips damaged parts."""
     with of_extra("video", path):
         import av.logging as log
     errors: list[str] = []
@@ -202,7 +201,7 @@ def _check_end(path: Path) -> None:
 
 
 def _is_shown(packet: Any) -> bool:
-    """False for packets that an edit list hides, and reference frames of VP8 (RFC 6386, 9.1)."""
+    """False for packets hidden by an edit list, and for reference frames of VP8 (RFC 6386, 9.1)."""
     hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
     return not (packet.is_discard or hidden)
 
@@ -217,42 +216,35 @@ def _damaged(path: Path, detail: str) -> DataError:
     )
 
 
-def _turn(path: Path, frame: Any) -> NDArray[np.int64]:
-    """Signs ``(2, 2)`` of the display matrix of a frame, transposed; the identity without one.
+def _orientation(path: Path, frame: Any) -> NDArray[np.int64]:
+    """Return the signs ``(2, 2)`` of the transposed display matrix of a frame, or the identity.
 
-    The matrix M of ISO 14496-12 takes a stored pixel [x y 1] to the shown one [x y 1] M.
+    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M.
 
     Raises:
         DataError: It is not a rotation by quarter turns, mirrored or not.
     """
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
-        return _UNTURNED
-    # Its rows give the column and the row of a shown pixel.
+        return _UPRIGHT_SIGNS
+    # Its rows give the column and the row of a displayed pixel.
     matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
     unit = matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)
     signs = np.rint(unit).astype(np.int64)
     if (signs @ signs.T != np.eye(2)).any() or abs(unit - signs).max() > _STRAIGHT:
-        products = matrix @ matrix.T
-        is_rotation = np.allclose(products, products[0, 0] * np.eye(2), atol=1e-3 * products.max())
-        angle_deg = np.degrees(np.arctan2(matrix[1, 0], matrix[0, 0]))
-        raise DataError(
-            path,
-            found=f"a rotation by {angle_deg:.4g}°"
-            if is_rotation and matrix.any()
-            else "a display matrix that is not a rotation",
-            expected="a rotation by 90°, 180° or 270°, mirrored or not",
-            remedy=_UPRIGHT,
-        )
+        shown = np.array2string(matrix / 2**16, precision=4).replace("\n", "")
+        expected = "a rotation by 90°, 180° or 270°, mirrored or not"
+        found = f"a display matrix {shown}"
+        raise DataError(path, found=found, expected=expected, remedy=_UPRIGHT)
     return signs
 
 
 def _upright(frame: Any, signs: NDArray[np.int64]) -> NDArray[np.uint8]:
-    """A frame ``(H, W, 3)`` in RGB as players show it, by its `_turn`."""
+    """Convert a frame to RGB ``(H, W, 3)`` as players show it, by its `_orientation`."""
     rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
-    turned = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
+    rgb = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
     column_step, row_step = signs.sum(axis=1)
-    return np.ascontiguousarray(turned[::row_step, ::column_step])
+    return np.ascontiguousarray(rgb[::row_step, ::column_step])
 
 
 def write_video(
@@ -267,7 +259,7 @@ def write_video(
     Args:
         path: The file, which appears once complete.
         source: The other video.
-        size: Its number of frames, rows and columns by `read_video_size`.
+        size: Number of frames, rows and columns of the other video by `read_video_size`.
         paint: Returns a frame ``(H, W, 3)`` of the new one for the number of a frame and the
             upright frame of the other one. Called in threads.
         every: Take the first and then every n-th frame.
@@ -282,9 +274,9 @@ def write_video(
     expected, rows, columns = size
 
     def painted(numbered: tuple[int, tuple[Any, NDArray[np.int64]]]) -> Any:
-        place, (frame, turn) = numbered
+        place, (frame, signs) = numbered
         number = place * every
-        picture = np.ascontiguousarray(paint(number, _upright(frame, turn)))
+        picture = np.ascontiguousarray(paint(number, _upright(frame, signs)))
         made = av.VideoFrame.from_ndarray(picture, format="rgb24")
         made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
         made.time_base = stream.time_base

@@ -52,7 +52,7 @@ def _unreadable(path: Path, error: Exception) -> DataError:
 
 
 def _packets(path: Path) -> list[bytes]:
-    """The XMP packets of an image: the main one, then those that it names as its extension."""
+    """Return the XMP packets of an image: the main packet, then its extensions."""
     info, segments = read_metadata(path)
     main = info.get("xmp") or info.get("XML:com.adobe.xmp") or b""
     packets = [main.encode() if isinstance(main, str) else main]
@@ -92,7 +92,7 @@ def _properties(packet: bytes, namespace: str) -> dict[str, str]:
 
 
 def _root(packet: bytes) -> ElementTree.Element:
-    """The outermost element; what fills the packet after it may be anything."""
+    """Return the outermost element; padding after it is ignored."""
     if b"<!DOCTYPE" in packet.replace(b"\0", b""):  # it could define entities that grow
         raise ValueError("a document type")
     parser: Any = ElementTree.XMLPullParser(("start", "end"))

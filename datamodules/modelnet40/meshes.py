@@ -103,7 +103,7 @@ def clean_mesh(mesh: Trimesh) -> Trimesh:
 
 
 def mesh_spheres(mesh: Trimesh, shape: tuple[int, int]) -> NDArray[np.float64]:
-    """The spherical images of a mesh and of its convex hull.
+    """Return the spherical images of a mesh and of its convex hull.
 
     A flat mesh has no hull: it is its own.
 
@@ -124,7 +124,7 @@ def mesh_spheres(mesh: Trimesh, shape: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def _cast(mesh: Trimesh, directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distance, ``|n·r|`` and ``|n×r|`` of first hits of rays inward, ``(n, 3)``."""
+    """Return distance, ``|n·r|`` and ``|n×r|`` of first hits of rays inward, ``(n, 3)``."""
     # Robust: no ray slips through between two triangles that share an edge.
     tree = EmbreeScene(robust=True)
     _keep = TriangleMesh(tree, mesh.triangles.astype(np.float32))

@@ -42,9 +42,9 @@ class ShapeFile(NamedTuple):
 
     Attributes:
         path: The file.
-        name: Its path in the data set, without the suffix.
+        name: Path of the file in the data set, without suffix.
         label: Name of its class.
-        part: Its split.
+        part: Split of the mesh.
     """
 
     path: Path
@@ -59,10 +59,10 @@ class ShapeFile(NamedTuple):
 
 
 def find_shapes(root: Path) -> list[ShapeFile]:
-    """All meshes of a data set, ordered by name within each part.
+    """List all meshes of a data set, ordered by name within each part.
 
     Args:
-        root: Its folder.
+        root: Folder of the data set.
 
     Raises:
         DataError: The folder is missing or holds no such tree, or a class has no training shape.

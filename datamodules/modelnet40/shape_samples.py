@@ -57,7 +57,7 @@ class Spheres(NamedTuple):
 
 
 def make_spheres(shape: tuple[int, int], mesh: ShapeFile) -> Spheres:
-    """The spheres of a mesh, of a shape ``(H, W)``."""
+    """Make the spheres of a mesh, of a shape ``(H, W)``."""
     values = mesh_spheres(clean_mesh(read_off(mesh.path)), shape)
     return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
@@ -83,11 +83,11 @@ class ShapeViews(Dataset[ShapeSample]):
 
     Attributes:
         source: The shapes.
-        class_names: Of the labels, in their order.
+        class_names: Names of the labels, in their order.
         representation: Representation of the images.
-        seed: Of the run, 0 or more.
-        random: Whether views are drawn for every epoch and index; else all are taken.
-        rotation: Rotation of whole shapes in evaluation, each with its own.
+        seed: Seed of the run, 0 or more.
+        random: True to draw views for every epoch and index; else all views are taken.
+        rotation: Rotation of whole shapes in evaluation, different for each shape.
     """
 
     source: _Shapes
@@ -120,7 +120,7 @@ class ShapeViews(Dataset[ShapeSample]):
         return self.representation.with_rotation(self.shape_rotation(index).T).view_sets()
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
-        """The rotation of one shape, ``(3, 3)``: its point x is now at R x."""
+        """Return the rotation of one shape, ``(3, 3)``: its point x is now at R x."""
         rng = sample_rng(self.seed, 0, index)
         if self.rotation == "so3":
             return random_rotation(rng)
@@ -132,7 +132,7 @@ def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:
 
     Args:
         images: ``(..., h, w, 6)`` int16 in steps of `STEPS`.
-        normalization: Of six channels.
+        normalization: Normalization of six channels.
 
     Returns:
         ``(..., 6, h, w)`` float32, on the same device.

@@ -1,4 +1,4 @@
-"""The files of Stanford2D3DS: names, partners and formats."""
+"""Files of Stanford2D3DS: names, classes and folds."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ _NAME = re.compile(
 
 
 class FileName(NamedTuple):
-    """The parts of the name of an image; panoramas have the frame `equirectangular`."""
+    """Parts of the name of an image; panoramas have the frame `equirectangular`."""
 
     camera: str
     room: str
@@ -72,7 +72,7 @@ class FileName(NamedTuple):
             name: The name without folders.
 
         Raises:
-            DataError: It is not the name of an image of the data set.
+            DataError: It is not a name of the data set.
 
         >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
         ('office', 7, '3')
@@ -95,9 +95,9 @@ class PictureFiles(NamedTuple):
 
     Attributes:
         area: One of `AREAS`.
-        name: Its name.
-        image: Its files, named ``area_3/office_2/<32 hex>``; of photos with the frame.
-        pose: Its camera and pose.
+        name: Parts of the file name.
+        image: Files of the image, named ``area_3/office_2/<32 hex>``; photos with the frame.
+        pose: File of camera and pose.
     """
 
     area: str
@@ -118,41 +118,36 @@ def list_pictures(
     with_depth: bool,
     problems: Problems,
 ) -> list[PictureFiles]:
-    """The panoramas or photos of one area, in the order of their names.
+    """List the panoramas or photos of an area in the order of their names.
 
     Args:
         root: Folder of the data set.
         area: One of `AREAS`.
         group: Panoramas or photos.
-        with_depth: Whether depth is wanted.
-        problems: That there are none, or other files, is added.
+        with_depth: True to name files of depth.
+        problems: Problems are added: no images, or other files.
     """
     from datamodules.core.panoramas import ImageFiles
 
     folder = root / f"area_{area}" / group
     found = []
-    images: list[Path] = []
+    # Hidden files are leftovers of archives made on a Mac.
+    images = sorted((folder / "rgb").glob("[!.]*.png"))
     with problems.noted():
-        if (folder / "rgb").is_dir():
-            # Hidden files are leftovers of archives made on a Mac.
-            images = [p for p in (folder / "rgb").iterdir() if p.match("[!.]*.png")]
         if not images:
             none = "no panoramas" if group == "pano" else "no photos"
             expected = "camera_….png files"
             raise DataError(folder / "rgb", found=none, expected=expected, remedy=GET_IT)
-    for rgb in sorted(images):
+    for rgb in images:
         with problems.noted(str(rgb), rgb):
             name = FileName.parse(rgb.name)
             semantic, depth, pose = (
                 folder / kind.partition(".")[0] / (rgb.name.removesuffix("rgb.png") + kind)
                 for kind in ("semantic.png", "depth.png", "pose.json")
             )
-            image = ImageFiles(
-                f"area_{area}/{name.room}_{name.room_number}/{name.camera}", rgb, semantic
-            )
-            if with_depth:
-                image = image._replace(depth=depth)
+            title, camera = f"area_{area}/{name.room}_{name.room_number}/{name.camera}", None
             if group == "data":
-                image = image._replace(name=f"{image.name}/{name.frame}", camera=pose)
+                title, camera = f"{title}/{name.frame}", pose
+            image = ImageFiles(title, rgb, semantic, depth if with_depth else None, camera)
             found.append(PictureFiles(area, name, image, pose))
     return found

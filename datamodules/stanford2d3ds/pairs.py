@@ -11,7 +11,8 @@ hard with the overlap, 0.86, that six easy ones have: the split is by figures be
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -35,7 +36,7 @@ _SHORT = 7  # hexadecimal digits of a camera that the paper prints
 
 
 def published_pairs() -> list[PublishedPair]:
-    """The paper's pairs, in the order of their numbers."""
+    """Read the paper's pairs in the order of their numbers."""
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.reader(file))[1:]
     pairs = []
@@ -101,8 +102,8 @@ class StanfordPairs(PanoramaPairs):
             if one.room == other.room
         ]
         if not chosen:
-            found_, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
-            raise DataError(self.root, found=found_, expected=expected, remedy=GET_IT)
+            none, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
+            raise DataError(self.root, found=none, expected=expected, remedy=GET_IT)
         return chosen
 
     def image(self, files: PictureFiles) -> Path:
@@ -128,20 +129,17 @@ def _camera(files: PictureFiles) -> str:
     return files.name.camera[:_SHORT]
 
 
-def _resolve(names: Iterable[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
-    """The files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
+def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
+    """Return the files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
 
     Raises:
         DataError: Some names fit no panorama, or several; the message lists all.
     """
-    by_name: dict[str, list[PictureFiles]] = {}
+    by_name: defaultdict[str, list[PictureFiles]] = defaultdict(list)
     for file in files:
-        by_name.setdefault(f"{_camera(file)}_{_room(file)}", []).append(file)
-    wrong = [
-        f"{name} ({len(by_name.get(name, []))} times)"
-        for name in sorted(names)
-        if len(by_name.get(name, [])) != 1
-    ]
+        by_name[f"{_camera(file)}_{_room(file)}"].append(file)
+    counts = {name: len(by_name[name]) for name in sorted(names)}
+    wrong = [f"{name} ({count} times)" for name, count in counts.items() if count != 1]
     if wrong:
         raise DataError(
             files[0].image.rgb.parent,

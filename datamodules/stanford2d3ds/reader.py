@@ -126,7 +126,7 @@ class StanfordReader(PngReader):
         return {"unknown": self.unknown, "class table": classes}
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes by the class table, 0 where black pixels are masked."""
+        """Return classes by the class table, 0 where black pixels are masked."""
         colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
         labels = self.table.decode(resize_nearest(colors, shape))
@@ -146,7 +146,7 @@ class StanfordReader(PngReader):
         )
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Depth in steps of 1/512 m, as in the files."""
+        """Read depth in steps of 1/512 m, as in the files."""
         return read_depth(files.parts["depth"])
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
@@ -158,12 +158,12 @@ class StanfordReader(PngReader):
         return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix in the pose file."""
+        """Read the camera matrix in the pose file."""
         return read_camera_matrix(files.parts["camera"])
 
 
 def read_depth(path: Path) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, 0 where missing.
+    """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
         DataError: The file is broken.
@@ -174,7 +174,7 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
 
 
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:
-    """The camera matrix of a pose file.
+    """Read the camera matrix of a pose file.
 
     Args:
         path: ``camera_…_domain_pose.json``.
@@ -228,11 +228,11 @@ def read_photo_pose(path: Path) -> PanoramaPose:
 
 
 def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
-    """Numbers in a pose file.
+    """Read numbers in a pose file.
 
     Args:
         path: ``camera_…_domain_pose.json``.
-        keys: What to read, with its shape.
+        keys: Names and shapes of the numbers to read.
 
     Raises:
         DataError: It cannot be read, or lacks one of them.

@@ -22,7 +22,7 @@ from datamodules.core.made_folders import claim_folder
 from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.images.pixel_files import read_rgb
+from datamodules.images.pixel_files import read_rgb, write_pixels
 from datamodules.synthia.reader import (
     FRAMES,
     GET_IT,
@@ -41,10 +41,9 @@ from datamodules.synthia.reader import (
     view_files,
 )
 from tangent_train.errors import DataError, at_least
-from tangent_train.files import write_bytes
 from tangent_train.geometry import (
     equirect_latitudes,
-    equirect_to_lonlat,
+    equirect_longitudes,
     lonlat_to_xyz,
     rotation_about,
 )
@@ -57,7 +56,6 @@ MANIFEST = "tangent_train.json"
 """File in ``pano`` that says that the panoramas there were made here, and how."""
 
 _NOWHERE = -2  # a position outside all images, whatever interpolation reads around it
-_PNG = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 
 
 class ViewStitcher:
@@ -69,7 +67,7 @@ class ViewStitcher:
         height: Rows of the panorama, which is twice as wide.
 
     Attributes:
-        camera_matrix: As given.
+        camera_matrix: ``(3, 3)`` K of all views.
     """
 
     def __init__(
@@ -97,11 +95,11 @@ class ViewStitcher:
         interpolation: Literal["bilinear", "nearest"],
         elsewhere: int = 0,
     ) -> NDArray[Any]:
-        """Panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
+        """Return panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
 
         Args:
             views: The images.
-            interpolation: Of colors; labels and distances are not to be mixed.
+            interpolation: `bilinear` for colors, `nearest` for labels and distances.
             elsewhere: Value outside the views.
         """
         return cv2.remap(
@@ -116,7 +114,7 @@ class ViewStitcher:
 def _view_positions(
     camera_matrix: NDArray[np.float64], height: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.float64]]:
-    """View that owns each column of a panorama, and the column's pixels in that view.
+    """Return the view that owns each column of a panorama, and its pixels in that view.
 
     All pixels of a column belong to the view whose optical axis is nearest, as the views are
     upright: there they are nearest to the image center.
@@ -125,9 +123,7 @@ def _view_positions(
         ``(W,)`` place in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.
     """
     width = 2 * height
-    pixels = np.stack([np.arange(width), np.zeros(width)], axis=-1)
-    lon = equirect_to_lonlat(pixels, (height, width))[:, 0]
-    level = lonlat_to_xyz(np.stack([lon, np.zeros(width)], axis=-1))
+    level = lonlat_to_xyz(np.stack([equirect_longitudes(width), np.zeros(width)], axis=-1))
     turns = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(VIEWS))]
     ahead, right, _ = np.moveaxis(np.stack([level @ turn for turn in turns]), -1, 0)
     owner = ahead.argmax(axis=0)
@@ -182,16 +178,16 @@ def make_panoramas(
 
 
 def _claim(folder: Path, frames: int, height: int) -> bool:
-    """Whether there are panoramas to generate; if so, mark their folder."""
+    """Mark a folder in which panoramas are to be generated; False if there are none."""
     pano = folder / "pano"
-    ready = (pano / MANIFEST).exists() or any(pano.glob("**/[!.]*.png"))
+    is_ours, has_files = (pano / MANIFEST).exists(), any(pano.glob("**/[!.]*.png"))
     if not list_frames(folder):
-        if ready:
+        if is_ours or has_files:
             return False
         raise DataError(
             folder, found="neither views nor panoramas", expected="RGB, GT, Depth", remedy=GET_IT
         )
-    if ready and not (pano / MANIFEST).exists():
+    if has_files and not is_ours:
         return False
     claim_folder(pano, MANIFEST, "OmniSYNTHIA", 1, {"frames": frames, "height": height})
     return True
@@ -200,7 +196,7 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
 def _unfinished(
     root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
 ) -> list[Callable[[], None]]:
-    """Panoramas to generate, after a check of all their sources."""
+    """Return the panoramas to generate, after a check of all their sources."""
     size: tuple[int, int] | None = None
     whole = []
     for frame in frames:
@@ -231,13 +227,11 @@ def _make(
     with problems.noted(target.name):
         depth = [read_first_channel(view.parts["depth"]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
-        rgb = stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear")
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
             "labels": stitcher.stitch([read_ids(v.labels) for v in views], "nearest", INVALID),
-            # The last one: panoramas are those that have this file.
-            "rgb": cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR),
+            # Last: frames with this file have a panorama.
+            "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }
         for part, image in parts.items():
-            encoded = cv2.imencode(".png", image, _PNG)[1]
-            write_bytes(target.parts[part], encoded.tobytes())
+            write_pixels(target.parts[part], image)

@@ -3,7 +3,7 @@
 On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
 
     root/SYNTHIA-SEQS-0X-SUMMER/
-      RGB/Stereo_Left/Omni_F/000000.png        760×1280, 8 bit; Omni_R, Omni_B, Omni_L likewise
+      RGB/Stereo_Left/Omni_F/000000.png        760×1280, 8 bit; and Omni_R, Omni_B, Omni_L
       GT/LABELS/Stereo_Left/Omni_F/000000.png  16-bit RGB: R is the class, the others the instance
       Depth/Stereo_Left/Omni_F/000000.png      16 bit, z-depth in cm, in every channel there is
       CameraParams/intrinsics.txt              focal length, center x and y, baseline
@@ -105,7 +105,7 @@ _LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
 
 
 def sequence_folder(root: Path, sequence: str) -> Path:
-    """Folder of a sequence.
+    """Return folder of a sequence.
 
     Raises:
         DataError: The data set is missing.
@@ -120,7 +120,7 @@ def sequence_folder(root: Path, sequence: str) -> Path:
 
 
 def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
-    """Files of one of `VIEWS` of a frame; `frame` is as ``000000``."""
+    """Return files of one of `VIEWS` of a frame; `frame` is as ``000000``."""
     folder = sequence_folder(root, sequence)
     place = f"Stereo_Left/Omni_{view}/{frame}.png"
     camera = _camera_file(folder)
@@ -134,7 +134,7 @@ def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: 
 
 
 def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -> ImageFiles:
-    """Files of one panorama; `frame` is as ``000000``."""
+    """Return files of one panorama; `frame` is as ``000000``."""
     pano, name = sequence_folder(root, sequence) / "pano", f"{frame}.png"
     return ImageFiles(
         f"sequence_{sequence}/{frame}",
@@ -145,12 +145,12 @@ def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -
 
 
 def list_frames(folder: Path) -> list[str]:
-    """Frames of which a view has a color image, as ``000000``, in order; none is no error."""
+    """List frames with a color image of a view, as ``000000``, in order."""
     return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
 
 
 def list_panoramas(folder: Path) -> list[str]:
-    """Frames that have the color image of a panorama, in order; none is no error."""
+    """List frames with the color image of a panorama, in order."""
     return _names(folder / "pano" / "RGB")
 
 
@@ -160,7 +160,7 @@ def _names(*folders: Path) -> list[str]:
 
 
 def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
-    """The frames that become panoramas: all, or every n-th from the first, about `count`.
+    """Return the frames that become panoramas: all, or every n-th from the first, about `count`.
 
     As OmniSYNTHIA's authors chose them (Zhang et al. 2019): n is the number of frames divided by
     `count`, rounded, halves up.
@@ -177,13 +177,13 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
 
 
 def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Camera matrix of all views of a sequence.
+    """Read camera matrix of all views of a sequence.
 
     From ``CameraParams/intrinsics.txt``: the focal length, x and y of the center, and perhaps the
     baseline. Without that file, the one camera of the release.
 
     Args:
-        folder: Of the sequence.
+        folder: Folder of the sequence.
         size: Rows and columns of the views.
 
     Returns:
@@ -224,17 +224,17 @@ class SynthiaReader(PngReader):
     formats: Formats
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes as in `CLASSES`, 0 where unknown."""
+        """Return classes as in `CLASSES`, 0 where unknown."""
         ids = read_ids(files.labels)
         return cv2.LUT(resize_nearest(ids, shape or (ids.shape[0], ids.shape[1])), _LABELS)
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Depth in steps of 1/512 m."""
+        """Read depth in steps of 1/512 m."""
         centimeters = read_first_channel(files.parts["depth"])
         return meters_to_steps((centimeters / 100).astype(np.float32))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """The camera matrix of the sequence that the view is from."""
+        """Read the camera matrix of the sequence that the view is from."""
         return read_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
 
 
@@ -249,7 +249,7 @@ def read_first_channel(path: Path) -> NDArray[Any]:
 
 
 def read_ids(path: Path) -> NDArray[np.uint8]:
-    """Labels as in the file, ``(H, W)``: 0 to 15, or `INVALID`.
+    """Read labels as in the file, ``(H, W)``: 0 to 15, or `INVALID`.
 
     Raises:
         DataError: The file is broken or holds other labels.

@@ -1,1 +1,1 @@
-"""SynthRooms: furnished rooms, ray-cast and written in Stanford2D3DS's own on-disk format."""
+"""SynthRooms: furnished rooms, ray-cast and written in the on-disk format of Stanford2D3DS."""

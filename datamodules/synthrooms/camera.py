@@ -125,7 +125,7 @@ class PerspectiveView:
     """A square pinhole image; its depth is the z-depth.
 
     Attributes:
-        pose: Its pose.
+        pose: Pose of the camera.
         size: Side in pixels.
         fov_rad: Field of view between the outer pixel edges.
     """

@@ -1,7 +1,7 @@
 """Chairs, sofas, tables, boards and bookcases.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. What does not fit raises `NoPlaceError`.
+back at +y. Items that do not fit raise `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ def add_chair_at(room: Room, frame: Frame) -> None:
 
 
 def _build_chair(room: Room, frame: Frame) -> None:
-    """A chair: four legs, a star base, a sledge, or a tub with arms; with or without armrests."""
+    """Build a chair: four legs, star base, sledge, or tub; with or without armrests."""
     rng = room.rng
     chair = room.item("chair", frame)
     design = room.pick((0.35, 0.3, 0.15, 0.2))
@@ -60,7 +60,7 @@ def _build_chair(room: Room, frame: Frame) -> None:
 def _add_legs(
     item: Item, material: Material, spread: tuple[float, float], height: float, thick: float
 ) -> None:
-    """Four upright legs from the floor, ``±spread`` meters from the middle."""
+    """Add four upright legs from the floor, ``±spread`` meters from the middle."""
     for x in (-spread[0], spread[0]):
         for y in (-spread[1], spread[1]):
             item.box(material, (x, y, height / 2), (thick, thick, height))
@@ -271,7 +271,7 @@ def _add_shelves(
     bottom: float,
     columns: int,
 ) -> None:
-    """Shelves with rows of books or boxes; all of it belongs to the bookcase."""
+    """Add shelves with rows of books or boxes, which belong to the bookcase."""
     wide, deep, high = size
     shelves = max(2, round((high - bottom) / room.rng.uniform(0.32, 0.42)))
     pitch = (high - bottom - _BOARD) / shelves

@@ -20,7 +20,6 @@ from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, rende
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import (
     PANORAMA,
-    SUFFIXES,
     RoomPlan,
     camera_identifier,
     encode_picture,
@@ -73,7 +72,7 @@ class RoomSettings:
 
     @classmethod
     def of(cls, given: RoomSettings | Mapping[str, Any]) -> RoomSettings:
-        """Settings from a config."""
+        """Return settings from a config."""
         return given if isinstance(given, RoomSettings) else cls(**given)
 
     def __post_init__(self) -> None:
@@ -95,7 +94,7 @@ class RoomSettings:
 
 
 def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
-    """All rooms of a data set, in the order of the label table."""
+    """Return all rooms of a data set, in the order of the label table."""
     plans: list[RoomPlan] = []
     numbers = {area[0]: 0 for area in AREAS}
     for area in (area for area, count in settings.rooms.items() for _ in range(count)):
@@ -132,14 +131,7 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
         write_text(labels, json.dumps(label_strings(plans)))
     frames = (PANORAMA, *map(str, range(settings.views_per_camera)))
     unfinished = [
-        plan
-        for plan in plans
-        if not all(
-            (root / plan.file(camera, frame, kind)).exists()
-            for camera in plan.cameras
-            for frame in frames
-            for kind in SUFFIXES
-        )
+        plan for plan in plans if not all((root / file).exists() for file in plan.files(frames))
     ]
     making = in_processes(make_room, [(root, settings, plan) for plan in unfinished], workers)
     before = len(plans) - len(unfinished)

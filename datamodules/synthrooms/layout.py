@@ -19,7 +19,7 @@ _GAP = 0.06
 
 
 class NoPlaceError(Exception):
-    """What does not fit into a room: it is left out."""
+    """An item does not fit into a room: it is left out."""
 
 
 class Frame(NamedTuple):
@@ -38,7 +38,7 @@ class Frame(NamedTuple):
     yaw: float = 0.0
 
     def at(self, x: float, y: float, z: float = 0.0, yaw: float = 0.0) -> Frame:
-        """The frame at (x, y, z) of this one, rotated by `yaw` more."""
+        """Return the frame at (x, y, z) of this frame, rotated by a further `yaw`."""
         cos, sin = math.cos(self.yaw), math.sin(self.yaw)
         return Frame(
             self.x + cos * x - sin * y, self.y + sin * x + cos * y, self.z + z, self.yaw + yaw
@@ -54,7 +54,7 @@ class Rectangle(NamedTuple):
     y1: float
 
     def meets(self, other: Rectangle, gap: float = 0.0) -> bool:
-        """Whether the two come closer than `gap` meters along both axes."""
+        """True if the two come closer than `gap` meters along both axes."""
         return (
             self.x0 < other.x1 + gap
             and other.x0 < self.x1 + gap
@@ -64,7 +64,7 @@ class Rectangle(NamedTuple):
 
     @classmethod
     def around(cls, frame: Frame, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
-        """The smallest one around ``x[0] … x[1]`` by ``y[0] … y[1]`` in `frame`."""
+        """Return the smallest rectangle around ``x[0] … x[1]`` by ``y[0] … y[1]`` in `frame`."""
         corners = [frame.at(a, b) for a in x for b in y]
         xs, ys = [c.x for c in corners], [c.y for c in corners]
         return cls(min(xs), min(ys), max(xs), max(ys))
@@ -85,7 +85,7 @@ class Wall:
     taken: list[tuple[float, float, Zone]] = field(default_factory=list)
 
     def is_free(self, start: float, end: float, zone: Zone) -> bool:
-        """Whether nothing hangs or stands between two positions along the wall."""
+        """True if nothing hangs or stands between two positions along the wall."""
         return not any(
             start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
             for a, b, other in self.taken
@@ -133,7 +133,7 @@ class FloorPlan:
         return sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in self.floors)
 
     def contains(self, area: Rectangle, margin: float = 0.0) -> bool:
-        """Whether a rectangle lies inside, `margin` meters away from every wall."""
+        """True if a rectangle is inside, `margin` meters away from every wall."""
         inside = (
             area.x0 >= margin
             and area.y0 >= margin

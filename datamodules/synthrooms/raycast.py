@@ -42,7 +42,7 @@ class Hits(NamedTuple):
 
 
 def even_directions(count: int) -> Floats:
-    """Directions spread evenly over the sphere (a Fibonacci lattice), ``(count, 3)``."""
+    """Return directions spread evenly over the sphere (a Fibonacci lattice), ``(count, 3)``."""
     k = np.arange(count) + 0.5
     z = 1 - 2 * k / count
     angle = k * math.pi * (3 - math.sqrt(5))
@@ -74,7 +74,7 @@ class RayScene:
         self._ambient = _bounced_light(room)
 
     def cast(self, origin: NDArray[np.float64], directions: Floats) -> Hits:
-        """First hits of rays from one point along ``(n, 3)`` unit `directions`."""
+        """Return first hits of rays from one point along ``(n, 3)`` unit `directions`."""
         start = origin.astype(np.float32)
         origins = np.broadcast_to(start, directions.shape).copy()
         answer = self._tree.run(origins, directions, query="INTERSECT", output=1)
@@ -89,13 +89,13 @@ class RayScene:
         return Hits(found, distance, self._part[triangle], points, normals, np.abs(cosine))
 
     def surface_points(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
-        """Points drawn uniformly from all surfaces, ``(count, 3)``."""
+        """Draw points uniformly from all surfaces, ``(count, 3)``."""
         chosen = rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
         weights = rng.dirichlet(np.ones(3), count)
         return np.einsum("nk,nkd->nd", weights, self._triangles[chosen])
 
     def radiance(self, hits: Hits, place: tuple[float, float], spread: Floats) -> Floats:
-        """Radiance along rays.
+        """Return the radiance along rays.
 
         Lambertian surfaces under the lamps with their shadows, plus light bounced between the
         surfaces, which surfaces within 0.8 m occlude.
@@ -119,7 +119,7 @@ class RayScene:
         return light
 
     def _openness(self, points: Floats, normals: Floats, spread: Floats) -> Floats:
-        """Share of ambient light: less close to other surfaces, and slightly by direction."""
+        """Return the share of ambient light, smaller close to other surfaces."""
         ahead = np.float32(1.001) * normals + spread  # never zero
         ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
         limit = np.full(len(points), _REACH, np.float32)
@@ -130,7 +130,7 @@ class RayScene:
     def _direct(
         self, lamp: Light, points: Floats, normals: Floats, place: tuple[float, float]
     ) -> Floats:
-        """Irradiance by one lamp, 0 in its shadow."""
+        """Return irradiance by one lamp, 0 in its shadow."""
         source = (lamp.center + np.asarray(place) @ lamp.half_sides).astype(np.float32)
         way = source - points
         distance = np.sqrt(np.einsum("ij,ij->i", way, way))
@@ -149,7 +149,7 @@ class RayScene:
 
 
 def _bounced_light(room: Room) -> Floats:
-    """Irradiance by light that was reflected once or more, the same everywhere.
+    """Return the irradiance by light that was reflected once or more, equal in all places.
 
     The integrating sphere's law: flux Φ in an enclosure of area A and reflectance ρ gives
     Φρ / (A(1 − ρ)); a Lambertian lamp of intensity I along its normal emits Φ = πI.

@@ -55,7 +55,7 @@ class Holes(NamedTuple):
     radii: NDArray[np.float64]
 
     def cover(self, points: Floats) -> NDArray[np.bool_]:
-        """Mask of the ``(n, 3)`` points that lie in a hole; the rims are ragged."""
+        """Return mask of the ``(n, 3)`` points that lie in a hole; the rims are ragged."""
         ragged = 1 + 0.25 * np.sin(points @ np.array([23.0, 29.0, 31.0], np.float32))
         covered = np.zeros(len(points), np.bool_)
         for center, radius in zip(self.centers, self.radii, strict=True):
@@ -70,7 +70,7 @@ class Camera:
 
     Attributes:
         location: ``(3,)`` meters.
-        heading: Of the panorama, radians counterclockwise from the room's x axis.
+        heading: Radians from the room's x axis to the middle of the panorama, counterclockwise.
         caps: Radians around the zenith and the nadir that were not photographed.
         gain: ``(3,)`` exposure times white balance.
         noise: Standard deviation of the sensor's noise, display values.
@@ -110,7 +110,7 @@ def _draw_location(
     plan: FloorPlan,
     others: list[NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """The first place with enough room around it, else the best of those tried."""
+    """Draw the first place with enough room around it, or the best of those tried."""
     directions = even_directions(192)
     best, most = np.zeros(3), -math.inf
     for _ in range(_PLACES):
@@ -144,7 +144,7 @@ def render(
         scene: The room.
         view: The picture's pixels; it must look from the camera's place.
         camera: The sensor.
-        holes: Of the scan.
+        holes: Holes of the scan.
         supersample: Rays per pixel side.
         rng: Source of the sensor's noise.
     """
@@ -172,7 +172,7 @@ def render(
 def _colors(
     scene: RayScene, view: View, camera: Camera, shape: tuple[int, int], supersample: int
 ) -> Floats:
-    """Display values ``(h, w, 3)``."""
+    """Return display values ``(h, w, 3)``."""
     steps = (np.arange(supersample) + 0.5) / supersample - 0.5
     spreads = even_directions(supersample**2)
     color = np.zeros((*shape, 3), np.float32)
@@ -187,7 +187,7 @@ def _colors(
 
 
 def _display(light: Floats) -> Floats:
-    """Tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2."""
+    """Apply the tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2."""
     return np.sqrt(np.minimum(light * (1 + light / np.float32(_WHITE)) / (1 + light), 1))
 
 
@@ -197,7 +197,7 @@ def _unscanned(scene: RayScene, hits: Hits, holes: Holes) -> NDArray[np.bool_]:
 
 
 def _bands(shape: tuple[int, int]) -> Iterator[slice]:
-    """Slices of rows that together make a picture, few enough rays in each."""
+    """Yield slices of rows that together make a picture, few enough rays in each."""
     height, width = shape
     step = max(1, _RAYS_AT_ONCE // width)
     for start in range(0, height, step):

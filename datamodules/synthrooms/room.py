@@ -31,7 +31,7 @@ class Part(NamedTuple):
 
     Attributes:
         item: Position in `Room.items`.
-        material: Its surface.
+        material: Material of the surface.
         triangles: ``(n, 3, 3)`` corners in meters.
     """
 
@@ -61,9 +61,9 @@ class Item:
     """One labelled object, composed of parts.
 
     Attributes:
-        parts: The room's parts, to which its own are added.
+        parts: The room's parts, to which the parts of the item are added.
         index: Position in `Room.items`.
-        frame: Its place; all parts are given in this frame.
+        frame: Place of the item; all parts are given in this frame.
     """
 
     parts: list[Part]
@@ -90,9 +90,9 @@ class Room:
     """A room and everything in it.
 
     Attributes:
-        rng: Its source of randomness.
+        rng: Source of randomness.
         plan: Floor plan, with what is taken.
-        palette: Its colors.
+        palette: Colors of the room.
         items: Class name of every item.
         parts: Parts of all items.
         lights: Lamps and windows that shine.
@@ -117,9 +117,9 @@ class Room:
         return bool(self.rng.random() < probability)
 
     def pick(self, shares: Sequence[float]) -> int:
-        """An index, drawn with the given shares."""
+        """Draw an index with the given shares."""
         return int(self.rng.choice(len(shares), p=np.asarray(shares) / np.sum(shares)))
 
     def count(self, least: int, most: int) -> int:
-        """An integer between two limits, both included."""
+        """Draw an integer between two limits, both included."""
         return int(self.rng.integers(least, most + 1))

@@ -65,7 +65,7 @@ def draw_room_type(rng: np.random.Generator) -> str:
 
 
 def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
-    """An empty room: floor, ceiling and walls."""
+    """Make an empty room: floor, ceiling and walls."""
     room = Room(rng, plan, Palette(rng))
     materials = [
         add(room) for add in (structure.add_floor, structure.add_ceiling, structure.add_walls)
@@ -75,7 +75,7 @@ def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
 
 
 def furnish(rng: np.random.Generator, room_type: str) -> Room:
-    """A furnished room.
+    """Make a furnished room.
 
     Args:
         rng: The room's source of randomness.

@@ -1,7 +1,7 @@
 """Floor, ceiling, walls, columns, beams, doors and windows.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. What does not fit raises `NoPlaceError`.
+back at +y. Items that do not fit raise `NoPlaceError`.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def add_beams(room: Room) -> None:
 
 
 def _clear_length(room: Room, place: float, wide: float, along_x: bool) -> float:
-    """Meters from the wall at 0 to the wall opposite, where a beam would run."""
+    """Return the meters from the wall at 0 to the opposite wall, where a beam would run."""
     plan = room.plan
     if plan.notch is None:
         return plan.width if along_x else plan.depth
@@ -140,7 +140,7 @@ _LIT_SIDE = 0.16  # meters in front of the glass, past frame and sill
 
 
 def _add_frame(item: Item, material: Material, wide: float, bottom: float, top: float) -> None:
-    """Two posts and a lintel around an opening."""
+    """Add two posts and a lintel around an opening."""
     for x in (-wide / 2, wide / 2):
         item.box(material, (x, 0.045, (bottom + top) / 2), (0.08, 0.09, top - bottom + 0.08))
     item.box(material, (0, 0.045, top + 0.01), (wide + 0.08, 0.09, 0.08))
@@ -220,7 +220,7 @@ def _add_blind(room: Room, window: Item, wide: float, bottom: float, top: float)
 
 
 def _shine(room: Room, frame: Frame, middle: float, wide: float, high: float) -> None:
-    """Daylight through the window, a lamp of its size."""
+    """Add daylight through the window, a lamp of its size."""
     center = np.array(frame.at(0, _LIT_SIDE, middle)[:3])
     along = np.array([np.cos(frame.yaw), np.sin(frame.yaw), 0.0])
     inward = np.array([-np.sin(frame.yaw), np.cos(frame.yaw), 0.0])

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import uuid
 from collections.abc import Sequence
+from itertools import product
 from pathlib import PurePosixPath
 from typing import Any, NamedTuple
 
@@ -62,8 +63,13 @@ class RoomPlan(NamedTuple):
         """Room type and number, as in file names."""
         return f"{self.kind}_{self.number}"
 
+    def files(self, frames: Sequence[str]) -> list[PurePosixPath]:
+        """Return the paths of all files of some frames of all cameras, see `file`."""
+        every = product(self.cameras, frames, SUFFIXES)
+        return [self.file(camera, frame, kind) for camera, frame, kind in every]
+
     def file(self, camera: str, frame: str, kind: str) -> PurePosixPath:
-        """Path of a file, relative to the data set's folder.
+        """Return the path of a file, relative to the data set's folder.
 
         Args:
             camera: One of `cameras`.
@@ -76,12 +82,12 @@ class RoomPlan(NamedTuple):
 
 
 def camera_identifier(seed: int, area: str, room: str, number: int) -> str:
-    """Identifier of a camera of a room, 32 hexadecimal digits."""
+    """Return the identifier of a camera of a room, 32 hexadecimal digits."""
     return uuid.uuid5(_NAMESPACE, f"{seed}/{area}/{room}/{number}").hex
 
 
 def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
-    """The label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
+    """Return the label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
     labels = [f"{UNKNOWN_CLASS}_0_{UNKNOWN_CLASS}_0_0"]
     for room in rooms:
         labels += [
@@ -93,7 +99,7 @@ def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
 
 
 def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
-    """Index into the label table of every item of a room, ``(n,)``."""
+    """Return index into the label table of every item of a room, ``(n,)``."""
     first = 1 + room.order * sum(INSTANCES.values())
     starts = dict(zip(INSTANCES, np.cumsum([first, *INSTANCES.values()]).tolist(), strict=False))
     seen = dict.fromkeys(INSTANCES, 0)
@@ -106,7 +112,7 @@ def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
 
 
 def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, bytes]:
-    """PNG files of a picture.
+    """Encode a picture as PNG files.
 
     Args:
         picture: The rendered picture.
@@ -134,7 +140,7 @@ def _encode_png(image: NDArray[Any]) -> bytes:
 def pose_record(
     room: RoomPlan, camera: str, frame: str, view: View, original: Pose
 ) -> dict[str, Any]:
-    """Pose file of a picture, with all keys of the real set.
+    """Return the pose file of a picture, with all keys of the real set.
 
     `datamodules.synthrooms.camera` states the formulas. The camera matrix counts from pixel corners
     (the middle of n pixels is n/2), as the real set's. A panorama has, as there, the field of view
@@ -144,7 +150,7 @@ def pose_record(
         room: The room.
         camera: One of its cameras.
         frame: `PANORAMA`, or the number of a perspective view.
-        view: Its camera.
+        view: Camera of the picture.
         original: Pose of the panorama of the same camera.
     """
     pose = view.pose

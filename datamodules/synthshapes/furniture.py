@@ -9,7 +9,7 @@ from tangent_train.geometry import rotation_about
 
 
 def chair(parts: Parts) -> None:
-    """A seat with a back: on legs, a pedestal or solid; perhaps with arms."""
+    """Build a seat with a back: on legs, a pedestal or solid; perhaps with arms."""
     width, depth = parts.between(0.38, 0.65), parts.between(0.36, 0.6)
     height, thick = parts.between(0.32, 0.55), parts.between(0.02, 0.12)
     inner = _plate(parts, width, depth, height, thick, round_share=0.15)
@@ -24,7 +24,7 @@ def chair(parts: Parts) -> None:
 
 
 def stool(parts: Parts) -> None:
-    """A seat without a back, high or low."""
+    """Build a seat without a back, high or low."""
     width = parts.between(0.26, 0.5)
     depth = width * parts.between(0.75, 1.1)
     height, thick = parts.between(0.35, 0.95), parts.between(0.02, 0.12)
@@ -38,7 +38,7 @@ def stool(parts: Parts) -> None:
 
 
 def bench(parts: Parts) -> None:
-    """A long seat, every other one with a back, some with sides."""
+    """Build a long seat, every other one with a back, some with sides."""
     width, depth = parts.between(0.8, 2.0), parts.between(0.3, 0.6)
     height, thick = parts.between(0.32, 0.55), parts.between(0.03, 0.14)
     if parts.chance(0.4):
@@ -56,7 +56,7 @@ def bench(parts: Parts) -> None:
 
 
 def table(parts: Parts) -> None:
-    """A top on legs, a pedestal or boards; low and high, long and round."""
+    """Build a top on legs, a pedestal or boards; low and high, long and round."""
     width = parts.between(0.5, 2.0)
     depth = width * parts.between(0.4, 1.0)
     height, thick = parts.between(0.35, 1.0), parts.between(0.02, 0.08)
@@ -70,7 +70,7 @@ def table(parts: Parts) -> None:
 
 
 def lamp(parts: Parts) -> None:
-    """A shade on a pole with a foot, straight or on an arm; for the floor or a desk."""
+    """Build a shade on a pole with a foot, straight or on an arm; for floor or desk."""
     height = parts.between(0.3, 1.7)
     base = height * parts.between(0.1, 0.24)
     thick = height * parts.between(0.008, 0.03)
@@ -96,7 +96,7 @@ def lamp(parts: Parts) -> None:
 def _plate(
     parts: Parts, width: float, depth: float, height: float, thick: float, *, round_share: float
 ) -> tuple[float, float]:
-    """A seat or the top of a table, its upper side at `height`; width and depth below it."""
+    """Add a seat or table top, its upper side at `height`; return width and depth below."""
     if not parts.chance(round_share):
         parts.box((0, 0, height - thick / 2), (depth, width, thick))
         return width, depth
@@ -110,7 +110,7 @@ def _plate(
 def _support(
     parts: Parts, width: float, depth: float, height: float, *, pedestal: float, solid: float
 ) -> None:
-    """The support of a plate: given shares of pedestals and of boards or blocks, else legs."""
+    """Add the support of a plate: shares of pedestals and of boards or blocks, else legs."""
     drawn = parts.between(0, 1)
     if drawn < pedestal:
         _pedestal(parts, min(width, depth), height)
@@ -152,7 +152,7 @@ def _legs(parts: Parts, width: float, depth: float, height: float) -> None:
 
 
 def _back(parts: Parts, width: float, depth: float, height: float, rise: float) -> None:
-    """A back that leans, as a board, as slats or as bars, at the rear of a seat."""
+    """Add a back that leans, as a board, slats or bars, at the rear of a seat."""
     lean = rotation_about((0, 1, 0), -parts.between(0, 0.35))
     thick = parts.between(0.02, 0.07)
 

@@ -1,4 +1,4 @@
-"""SynthShapes: ten families of shapes, generated in ModelNet40's own tree."""
+"""SynthShapes: ten families of shapes, generated in the tree of ModelNet40."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class ShapeSettings:
 
 
 def plan_shapes(settings: ShapeSettings) -> dict[str, tuple[str, int]]:
-    """Class and number of every shape by its file in ModelNet40's tree, test shapes last."""
+    """Return class and number of every shape by its file, test shapes last."""
     parts = ["train"] * settings.train + ["test"] * settings.test
     return {
         f"{label}/{part}/{label}_{number:04d}.off": (label, number)
@@ -104,7 +104,7 @@ def _write(path: Path, seed: int, label: str, number: int) -> None:
 
 
 def make_shape(seed: int, label: str, number: int) -> Trimesh:
-    """One shape, the same for the same arguments.
+    """Make a shape, the same for the same arguments.
 
     Like models of catalogues it has units and an origin of its own, and about the heading of its
     class.
@@ -135,7 +135,7 @@ def make_shape(seed: int, label: str, number: int) -> Trimesh:
 
 
 def _put_beside(parts: Parts) -> None:
-    """An object that is not a part of the shape, on the ground next to it."""
+    """Put an object next to the shape that is not a part of it."""
     low, high = parts.mesh().bounds
     size = float(np.max(high - low)) * parts.between(0.06, 0.2)
     angle = parts.between(0, 2 * np.pi)

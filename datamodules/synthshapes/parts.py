@@ -28,7 +28,7 @@ class Parts:
         self._pieces: list[Trimesh] = []
 
     def between(self, low: float, high: float) -> float:
-        """A number drawn uniformly."""
+        """Draw a number uniformly."""
         return float(self.rng.uniform(low, high))
 
     def chance(self, share: float) -> bool:
@@ -36,19 +36,19 @@ class Parts:
         return bool(self.rng.random() < share)
 
     def mesh(self) -> Trimesh:
-        """All pieces as one mesh."""
+        """Return all pieces as one mesh."""
         return util.concatenate(self._pieces)
 
     def box(self, center: Point, size: Point, rotation: Any = None) -> None:
-        """A box, rotated (3×3) about its center."""
+        """Add a box, rotated (3×3) about its center."""
         self._add(creation.box(size), center, rotation)
 
     def rod(self, start: Point, end: Point, radius: float) -> None:
-        """A round rod from one point to another."""
+        """Add a round rod from one point to another."""
         self._pieces.append(creation.cylinder(radius, segment=(start, end), sections=12))
 
     def leg(self, top: Point, foot: Point, thickness: float, square: bool) -> None:
-        """A leg of a piece of furniture, round or square."""
+        """Add a leg of a piece of furniture, round or square."""
         if not square:
             self.rod(foot, top, thickness / 2)
             return
@@ -58,20 +58,20 @@ class Parts:
         self._add(creation.box(size), np.add(foot, top) / 2, rotation)
 
     def revolved(self, outline: Sequence[Point], center: Point = (0, 0, 0)) -> None:
-        """The surface of revolution of an outline of (radius, height)."""
+        """Add the surface of revolution of an outline of (radius, height)."""
         self._add(creation.revolve(outline, sections=24), center)
 
     def ring(self, center: Point, radius: float, thickness: float, rotation: Any = None) -> None:
-        """A torus around z before the rotation."""
+        """Add a torus around z before the rotation."""
         torus = creation.torus(radius, thickness, major_sections=20, minor_sections=8)
         self._add(torus, center, rotation)
 
     def ellipsoid(self, center: Point, radii: Point) -> None:
-        """An ellipsoid with these half axes along x, y, z."""
+        """Add an ellipsoid with these half axes along x, y, z."""
         self._add(creation.icosphere(subdivisions=2).apply_scale(radii), center)
 
     def panel(self, corners: Sequence[Point], thickness: float) -> None:
-        """A convex plate with four corners, `thickness` along its normal."""
+        """Add a convex plate with four corners, `thickness` along its normal."""
         points = np.asarray(corners, float)
         normal = np.cross(points[1] - points[0], points[3] - points[0])
         normal *= thickness / 2 / np.linalg.norm(normal)

@@ -13,7 +13,7 @@ from tangent_train.geometry import rotation_about
 
 
 def bottle(parts: Parts) -> None:
-    """A body with a neck, some with a cap or a handle, some without a clear shoulder."""
+    """Build a body with a neck, some with a cap or a handle, some without a clear shoulder."""
     height = parts.between(0.15, 0.4)
     radius = height * parts.between(0.12, 0.32)
     neck = radius * parts.between(0.22, 0.75)
@@ -32,7 +32,7 @@ def bottle(parts: Parts) -> None:
 
 
 def vase(parts: Parts) -> None:
-    """A belly below a mouth, narrow or wide; or straight. Few have handles or a lid."""
+    """Build a belly below a mouth, narrow or wide; or straight. Few have handles or a lid."""
     height = parts.between(0.12, 0.45)
     belly = height * parts.between(0.14, 0.45)
     foot = belly * parts.between(0.4, 1)
@@ -57,7 +57,7 @@ def vase(parts: Parts) -> None:
 
 
 def cup(parts: Parts) -> None:
-    """An open cup with a wall; most have a handle, some a foot."""
+    """Build an open cup with a wall; most have a handle, some a foot."""
     height = parts.between(0.06, 0.15)
     top = height * parts.between(0.28, 0.9)
     bottom = top * parts.between(0.45, 1.05)
@@ -74,7 +74,7 @@ def cup(parts: Parts) -> None:
 
 
 def bowl(parts: Parts) -> None:
-    """Wide and open, deep or flat, some on a foot, few with handles."""
+    """Build a bowl: wide and open, deep or flat, some on a foot, few with handles."""
     radius = parts.between(0.07, 0.2)
     height = radius * parts.between(0.35, 1.8)
     foot = radius * parts.between(0.2, 0.8)
@@ -92,7 +92,7 @@ def bowl(parts: Parts) -> None:
 
 
 def airplane(parts: Parts) -> None:
-    """A fuselage with wings, a tail and engines; liners, gliders, fighters."""
+    """Build a fuselage with wings, a tail and engines; liners, gliders, fighters."""
     length = parts.between(8, 40)
     radius = length * parts.between(0.035, 0.075)
     parts.ellipsoid((0, 0, 0), (length / 2, radius, radius * parts.between(0.85, 1.2)))
@@ -125,7 +125,7 @@ def _wings(
     sweep: float,
     rise: float,
 ) -> None:
-    """Two wings that begin at x and z of `place`; `size` is span, chord and taper."""
+    """Add two wings that begin at x and z of `place`; `size` is span, chord and taper."""
     (x, z), (span, chord, taper) = place, size
     for side in (-1, 1):
         tip = x - sweep
@@ -135,20 +135,20 @@ def _wings(
 
 
 def _walled(parts: Parts, outside: Sequence[tuple[float, float]], wall: float) -> None:
-    """An open vessel with a bottom and a wall; the outline rises."""
+    """Add an open vessel with a bottom and a wall; the outline rises."""
     low = outside[0][1]
     inside = [(max(r - wall, 0.001), max(z, low + wall)) for r, z in reversed(outside)]
     parts.revolved([(0, low), *outside, *inside, (0, low + wall)])
 
 
 def _handle(parts: Parts, x: float, z: float, size: float) -> None:
-    """An upright ring, half of it inside the vessel."""
+    """Add an upright ring, half of it inside the vessel."""
     upright = rotation_about((1, 0, 0), math.pi / 2)
     parts.ring((x, 0, z), size, size * parts.between(0.12, 0.25), upright)
 
 
 def _curve(*groups: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Points of an outline, each group smoothed on its own."""
+    """Return the points of an outline, each group smoothed on its own."""
     outline: list[tuple[float, float]] = []
     for group in groups:
         radius, height = np.array(group).T

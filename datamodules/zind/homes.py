@@ -1,4 +1,4 @@
-"""The homes of ZInD: what ``zind_data.json`` says of their panoramas.
+"""Homes of ZInD: the panoramas in ``zind_data.json``.
 
 Read is its ``merger``: floors, in them complete rooms, in them the parts of rooms that annotators
 drew, in them panoramas. Lengths are in heights of the camera. A place x of a panorama is at
@@ -49,7 +49,7 @@ class HomePanorama:
     Attributes:
         file: ``zind_data.json``.
         path: Names of floor, complete room, partial room and panorama.
-        record: What the file says of it.
+        record: Record of the panorama in the file.
         unit_m: Meters in a unit of the floor; None where unknown.
     """
 
@@ -60,12 +60,12 @@ class HomePanorama:
 
     @property
     def name(self) -> str:
-        """As ``000/floor_01/complete_room_06/partial_room_09/pano_5``."""
+        """Name, e.g. ``000/floor_01/complete_room_06/partial_room_09/pano_5``."""
         return "/".join((self.home, *self.path))
 
     @property
     def home(self) -> str:
-        """As ``000``."""
+        """Name of the home, e.g. ``000``."""
         return self.file.parent.name
 
     @property
@@ -75,16 +75,16 @@ class HomePanorama:
 
     @property
     def has_layout(self) -> bool:
-        """Whether the file says what the camera sees."""
+        """True if the file describes the visible part of the room."""
         return self.record.get("layout_visible") is not None
 
     @property
     def is_inside(self) -> bool:
-        """Whether the camera is inside the partial room."""
+        """True if the camera is inside the partial room."""
         return self.record.get("is_inside") is True
 
     def image(self) -> Path:
-        """Its picture.
+        """Return the path of the picture.
 
         Raises:
             DataError: The file does not name one in ``panos``.
@@ -95,7 +95,7 @@ class HomePanorama:
         return self.file.parent / path
 
     def layout(self) -> Layout:
-        """What the camera sees.
+        """Return the visible part of the room.
 
         Raises:
             DataError: The file does not describe a room around the camera.
@@ -146,14 +146,14 @@ class HomePanorama:
             yield Fixture(np.stack(ends), bottom_z, top_z, label)
 
     def _points(self, kind: str) -> NDArray[np.float64]:
-        """Points of a list of the layout, ``(n, 2)``."""
+        """Return the points of a list of the layout, ``(n, 2)``."""
         points = self._fields({kind: _POINTS}, "layout_visible")[kind]
         if not all(len(point) == 2 and all(abs(c) <= _MOST for c in point) for point in points):
             raise self._wrong(f"{kind}={points}", "pairs of finite numbers", "layout_visible")
         return np.array(points, np.float64).reshape(-1, 2)
 
     def _fields(self, kinds: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-        """Fields of the record, or of a section of it, each of its kind."""
+        """Return fields of the record or of a section, with checked types."""
         content = self._fields({section: dict})[section] if section else self.record
         return check_fields(self.file, content, kinds, _EXPECTED, self._place(section))
 
@@ -166,7 +166,7 @@ class HomePanorama:
 
 
 def list_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
-    """The panoramas of all homes, in the order of their names.
+    """List frames with the color image of a panorama, in order.
 
     Args:
         root: Folder with a folder for every home.
@@ -213,7 +213,7 @@ def _read_home(file: Path) -> list[HomePanorama]:
 
 
 def _named(file: Path, path: Sequence[str], branch: Any) -> Sequence[tuple[str, Any]]:
-    """What a mapping holds, whose names become parts of names of files."""
+    """Return the content of a mapping whose names become parts of file names."""
     if isinstance(branch, Mapping) and all(_NAME.fullmatch(name) for name in branch):
         return list(branch.items())
     place = ".".join(("merger", *path))
@@ -223,7 +223,7 @@ def _named(file: Path, path: Sequence[str], branch: Any) -> Sequence[tuple[str, 
 
 
 def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:
-    """Whether a polygon goes round the origin once."""
+    """True if a polygon goes round the origin once."""
     angles = np.arctan2(vertices[:, 1], vertices[:, 0])
     steps = np.diff(angles, append=angles[:1])
     turned = (steps + np.pi) % (2 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""What a camera sees of a room layout: classes and distances, in closed form.
+"""Classes and distances of a room layout as a camera sees it, in closed form.
 
 Walls stand upright on a polygon around the camera, floor and ceiling are level, and doors, windows
 and openings are rectangles on the walls. A column of a panorama is a vertical plane: it shows the
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.geometry import equirect_latitudes, equirect_to_lonlat
+from tangent_train.geometry import equirect_latitudes, equirect_longitudes
 
 CLASSES: tuple[str, ...] = ("ceiling", "floor", "wall", "door", "window")
 """The classes as labels 1 to 5; 0 is unknown."""
@@ -55,7 +55,7 @@ class Fixture:
 
 
 class _Columns(NamedTuple):
-    """What the columns of a panorama show of the walls.
+    """The walls in the columns of a panorama.
 
     Attributes:
         away: ``(W,)`` horizontal distance of the wall.
@@ -85,7 +85,7 @@ class Layout:
     fixtures: Sequence[Fixture] = ()
 
     def labels(self, shape: tuple[int, int]) -> NDArray[np.uint8]:
-        """Class of every pixel of a panorama of a shape ``(H, W)``."""
+        """Return class of every pixel of a panorama of a shape ``(H, W)``."""
         columns = self._columns(shape[1])
         z = np.tan(equirect_latitudes(shape[0]))[:, None] * columns.away
         labels = np.full(shape, _WALL, np.uint8)
@@ -99,7 +99,7 @@ class Layout:
         return labels
 
     def distances(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Distance from the camera of every pixel of a panorama of a shape ``(H, W)``.
+        """Return distance from the camera of every pixel of a panorama of a shape ``(H, W)``.
 
         NaN on doors, windows and openings: they may show what is behind them.
         """
@@ -111,8 +111,7 @@ class Layout:
         return np.where(known, distances, np.nan)
 
     def _columns(self, width: int) -> _Columns:
-        columns = np.stack([np.arange(width), np.zeros(width)], axis=-1)
-        longitudes = equirect_to_lonlat(columns, (1, width))[:, 0]
+        longitudes = equirect_longitudes(width)
         ahead = np.stack([-np.sin(longitudes), np.cos(longitudes)], axis=-1)
         walls = np.roll(self.vertices, -1, axis=0) - self.vertices
         with np.errstate(divide="ignore", invalid="ignore"):  # walls seen from their end
@@ -127,7 +126,7 @@ class Layout:
 
 
 def _on(fixture: Fixture, columns: _Columns) -> NDArray[np.bool_]:
-    """Which columns see a fixture's part of a wall."""
+    """Return the columns that show a fixture's part of a wall."""
     start, end = fixture.ends
     length = np.linalg.norm(end - start)
     direction = (end - start) / length

@@ -53,7 +53,7 @@ def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
 
 
 def _subdivide(mesh: Icosphere) -> Icosphere:
-    """One step of Loop subdivision of a closed mesh (Loop 1987)."""
+    """Apply one step of Loop subdivision to a closed mesh (Loop 1987)."""
     vertices, faces = mesh
     edges, edge_of_corner = _edges(faces)
     opposite = np.zeros((len(edges), 3))

@@ -56,7 +56,7 @@ class PinholeGrid(ABC):
 
     @abstractmethod
     def _resting_axes(self) -> NDArray[np.float64]:
-        """``(N, 3, 3)`` camera axes before the rotation."""
+        """Return ``(N, 3, 3)`` camera axes before the rotation."""
 
     def _set(self, rotation: ArrayLike | None, **values: Any) -> None:
         """Set the attributes of a new grid."""

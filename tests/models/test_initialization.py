@@ -108,7 +108,9 @@ def test_two_state_dicts_of_equal_right_are_refused(tmp_path: Path) -> None:
     network = _network()
     tensors = network.state_dict()
     torch.save({"model": tensors, "model_ema": _changed(tensors)}, tmp_path / "x.pt")
-    with pytest.raises(DataError, match=r"several state dicts: model, model_ema; .*Save one of"):
+    with pytest.raises(
+        DataError, match=r"networks with different tensors: model, model_ema; .*Save one of"
+    ):
         initialize(network, tmp_path / "x.pt")
     endless: dict[str, Any] = {"a": {"b": torch.ones(1)}}
     endless["a"]["again"] = endless
@@ -134,10 +136,10 @@ def test_two_networks_in_one_state_dict_are_refused(
         if found is tensors:
             initialize(_network(), tmp_path / "x.pt")
             continue
-        with pytest.raises(DataError, match=r"x\.pt: found two networks with different") as raised:
+        with pytest.raises(DataError, match=r"x\.pt: found networks with different") as raised:
             initialize(_network(), tmp_path / "x.pt")
-        assert first in str(raised.value)
-        assert second in str(raised.value)
+        assert first.strip(".") in str(raised.value)
+        assert second.strip(".") in str(raised.value)
 
 
 def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> None:
