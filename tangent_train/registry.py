@@ -170,7 +170,8 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
         at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
         targets = {at: inner["_target_"] for inner, at in _sections(section, place)}
         _refuse(error.__cause__ or error, targets[at], at, None)
-    return partial(make, **given) if section.get("_partial_") else make(**given)
+    make = partial(make.func, *make.args, **make.keywords | given)
+    return make if section.get("_partial_") else make()
 
 
 def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:
@@ -364,8 +365,11 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
 def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
     """The class or function that a section names, with the kinds of its arguments in a file."""
     target = settings.get("_target_") if isinstance(settings, Mapping) else None
-    if file is not None and not isinstance(target, str):
-        raise file.refused(place, settings, "a section with a _target_")
+    if not isinstance(target, str):
+        expected = "a section with a _target_"
+        if file is not None:
+            raise file.refused(place, settings, expected)
+        raise SettingError(place, found=f"{settings}", expected=expected)
     found = _find(str(target))
     if found is not None:
         return found

@@ -1,4 +1,4 @@
-"""Base data modules of labelled images: panoramas and photos."""
+"""Base data modules of labeled images: panoramas and photos."""
 
 from __future__ import annotations
 
@@ -28,14 +28,13 @@ from datamodules.core.panoramas import (
     ImageReader,
     Panorama,
     PanoramaReading,
-    Photo,
     PhotoReading,
     Turn,
     check_headers,
 )
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
-from datamodules.core.reading import SplitReader, Transform
+from datamodules.core.reading import Transform
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Store
@@ -56,14 +55,14 @@ from tangent_train.threads import in_threads
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class ImageDataModule(SplitDataModule[ImageFiles]):
-    """Labelled panoramas or photos of one data set.
+    """Labeled panoramas or photos of one data set.
 
     A data set says which images it has (`find_images`) and its `class_names`, the unknown one (0)
     first.
 
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
-        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
+        color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
         normalizations: The default ones, without and with depth.
@@ -84,7 +83,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         super().__post_init__()
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
-        self.set_normalization(self.normalizations[with_depth], 3 + with_depth)
+        given = self.normalization or self.normalizations[with_depth]
+        self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
 
     @abstractmethod
@@ -101,8 +101,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """
 
     @abstractmethod
-    def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading | PhotoReading]:
-        """What reads one image as it is stored, and the name of that in the store."""
+    def reading(self, reader: ImageReader) -> PanoramaReading | PhotoReading:
+        """Return a function that reads one image as it is stored."""
 
     @abstractmethod
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
@@ -111,9 +111,9 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `SplitDataModule`."""
         reader, splits = self.find_images(problems)
-        name, read = self.reading(reader)
-        store = Store.of(self.store, name, reader.settings, read.layout)
-        index = DatasetIndex(self.noun, splits, read, store)
+        read = self.reading(reader)
+        store = Store.of(self.store, read.store_name, reader.settings, read.layout)
+        index = DatasetIndex(self.noun, splits, read, read.kind, store)
         check = partial(self.check_image, reader=reader, problems=problems)
         for _ in in_threads(check, index.of()):
             pass
@@ -151,17 +151,17 @@ Upright = Literal["pose", "auto"] | None
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PanoramaDataModule(ImageDataModule):
-    """Labelled panoramas of one data set, see `ImageDataModule`.
+    """Labeled panoramas of one data set, see `ImageDataModule`.
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
-        mask: What does not count in training and evaluation, in the panorama's own frame, before
-            it is rotated: labels are unknown there, pixels stay. See `Masks`.
+        mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
+            their labels are unknown. See `Masks`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
             the image.
-        max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
+        max_tilt_deg: Maximum tilt that `auto` estimates: some degrees more than the panoramas have.
 
     Attributes:
         erp_height: Rows of the panoramas read.
@@ -181,11 +181,7 @@ class PanoramaDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_representation(
-            "erp_height",
-            "one for panoramas",
-            "Choose representation=tangent, or photos, as data=synthrooms_perspective.",
-        )
+        self.require_representation("erp_height", "tangent")
         self.erp_height: int = self.representation.erp_height
         self._judge: PanoramaJudge | None = None
         rotation = self.test_rotation
@@ -203,10 +199,10 @@ class PanoramaDataModule(ImageDataModule):
         """Tangent images of base level 0, at level 7."""
         return TangentRepresentation(0, 7 if self.level is None else self.level)
 
-    def reading(self, reader: ImageReader) -> tuple[str, PanoramaReading]:
+    def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
-        height, width = shape = self.erp_height, 2 * self.erp_height
-        return f"{height}x{width}", PanoramaReading(reader, len(self.class_names), shape)
+        shape = self.erp_height, 2 * self.erp_height
+        return PanoramaReading(reader, len(self.class_names), shape)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; there must be a mask, too."""
@@ -215,10 +211,8 @@ class PanoramaDataModule(ImageDataModule):
             with problems.noted(files.name):
                 self._masks.check(files.name)
 
-    def split_reader(
-        self, index: DatasetIndex[ImageFiles], split: Split
-    ) -> SplitReader[ImageFiles, Panorama]:
-        """Panoramas from files or store: masked, rotated, then aligned with gravity."""
+    def transforms(self, split: Split) -> Sequence[Transform[Panorama, Any]]:
+        """See `LabeledData`: masked, rotated, then aligned with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         rotated = None
         if self.mask is not None:
@@ -231,9 +225,9 @@ class PanoramaDataModule(ImageDataModule):
             transforms.append(rotated)
         if self.upright == "auto":
             judge = self._judge if split == "test" else None
-            reading: Any = index.read
+            reading: Any = self.index().read
             transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
-        return SplitReader(index, split, Panorama, transforms)
+        return transforms
 
     def panoramas(self, split: Split) -> LabeledImages:
         """Return the whole panoramas of a split as arrays: masked and rotated if set."""
@@ -263,7 +257,7 @@ class PanoramaDataModule(ImageDataModule):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PhotoDataModule(ImageDataModule):
-    """Labelled photos of one data set, see `ImageDataModule`.
+    """Labeled photos of one data set, see `ImageDataModule`.
 
     The representation is the camera to which all photos are normalized.
 
@@ -280,11 +274,7 @@ class PhotoDataModule(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_representation(
-            "of_camera",
-            "one for photos",
-            "Choose representation=perspective, or panoramas, as data=synthrooms.",
-        )
+        self.require_representation("of_camera", "perspective")
         self.require(
             "inputs",
             "elevation" not in self.inputs,
@@ -297,15 +287,9 @@ class PhotoDataModule(ImageDataModule):
         """Crops of 45° at the resolution of level 7."""
         return PerspectiveRepresentation(7 if self.level is None else self.level)
 
-    def reading(self, reader: ImageReader) -> tuple[str, PhotoReading]:
+    def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return "photos", PhotoReading(reader, len(self.class_names))
-
-    def split_reader(
-        self, index: DatasetIndex[ImageFiles], split: Split
-    ) -> SplitReader[ImageFiles, Photo]:
-        """Photos from files or store."""
-        return SplitReader(index, split, Photo)
+        return PhotoReading(reader, len(self.class_names))
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""

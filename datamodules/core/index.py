@@ -23,7 +23,7 @@ Split = Literal["train", "val", "test"]
 """A part of a data set."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""All of them."""
+"""All parts, in their order."""
 
 SAMPLED = 32
 """Maximum number of images that `DatasetIndex.read_some` decodes."""
@@ -56,9 +56,10 @@ class DatasetIndex(Generic[_Item]):
 
     Attributes:
         noun: Name of the items, in the plural.
-        splits: Their files.
-        read: Reads one from its files, a named tuple of arrays; may have methods `labels`, and
-            `parts` that returns functions which decode each of its files by itself.
+        splits: Files of the images or shapes of each split.
+        read: Reads one from its files; may have methods `labels`, and `parts` for functions that
+            decode each of its files by itself.
+        kind: Named tuple of arrays that `read` returns.
         store: Prepared store, if any.
         in_parallel: The results of some work on each, as they come.
     """
@@ -66,6 +67,7 @@ class DatasetIndex(Generic[_Item]):
     noun: str
     splits: Mapping[Split, Sequence[_Item]]
     read: Callable[[_Item], Any]
+    kind: type[Any]
     store: Store | None = None
     in_parallel: Callable[[Callable[[_Item], Any], Sequence[_Item]], Generator[Any]] = in_threads
 
@@ -91,15 +93,15 @@ class DatasetIndex(Generic[_Item]):
         self._note(problems, parts, items, "Checking")
         return len(items)
 
-    def read_all(self, splits: Sequence[Split], problems: Problems, *, whole: bool = False) -> None:
-        """Read everything once, into the store if there is one; note what is broken.
+    def read_all(self, items: Sequence[_Item], problems: Problems, *, whole: bool) -> None:
+        """Read items once, into the store if there is one; note what is broken.
 
         Args:
-            splits: The splits to read.
+            items: Items of the index.
             problems: Known problems; new ones are added.
             whole: True to check the content of the store too; samples check it on first use.
         """
-        items, store = problems.without(self.of(splits)), self.store
+        items, store = problems.without(items), self.store
         if store is None:
             self._note(problems, partial(_whole, self.read), items, "Checking the data")
             return
@@ -114,7 +116,7 @@ class DatasetIndex(Generic[_Item]):
         """Decode some images from all over the data set, for a second or two; note what is broken.
 
         Args:
-            seed: Others for other seeds.
+            seed: Seed of the choice.
             problems: Known problems; new ones are added.
         """
         items = problems.without(self.of())
@@ -195,7 +197,7 @@ def draw_groups(
     Args:
         groups: All there are; those that come several times count once.
         fraction: Share of them to draw: at least one, never all, so none of a single one.
-        seed: Of the drawing.
+        seed: Seed of the draw.
 
     >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
     ['attic', 'kitchen']

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
@@ -21,7 +22,7 @@ Input = Literal["rgb", "depth", "elevation"]
 """
 
 INPUTS: tuple[Input, ...] = get_args(Input)
-"""All of them."""
+"""All inputs, in channel order."""
 
 _COLORS = ("red", "green", "blue")
 
@@ -36,14 +37,14 @@ MAX_DEPTH_M = 4.0
 
 @dataclass(frozen=True)
 class Normalization:
-    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
+    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (meters).
 
     Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
     see `mesh_spheres`.
 
     Attributes:
         mean: 3, 4 or 6 numbers.
-        std: As many, greater than 0.
+        std: As many numbers, greater than 0.
 
     Raises:
         SettingError: Other numbers.
@@ -54,22 +55,20 @@ class Normalization:
 
     def __post_init__(self) -> None:
         # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
-        try:
-            object.__setattr__(self, "mean", tuple(float(value) for value in self.mean))
-            object.__setattr__(self, "std", tuple(float(value) for value in self.std))
-        except (TypeError, ValueError) as error:
+        mean: tuple[float, ...] = ()
+        std: tuple[float, ...] = ()
+        with suppress(TypeError, ValueError):
+            mean, std = (tuple(map(float, values)) for values in (self.mean, self.std))
+        right = len(mean) == len(std) and len(mean) in (3, 4, 6)
+        if not (right and all(map(math.isfinite, mean + std)) and min(std) > 0):
             raise SettingError(
                 "normalization",
                 found=f"mean {self.mean}, std {self.std}",
-                expected="lists of a number for every channel, such as mean: [0.5, 0.5, 0.5]",
-            ) from error
-        right = len(self.mean) == len(self.std) and len(self.mean) in (3, 4, 6)
-        if not (right and all(map(math.isfinite, [*self.mean, *self.std])) and min(self.std) > 0):
-            raise SettingError(
-                "normalization",
-                found=f"mean {self.mean}, std {self.std}",
-                expected="3 numbers each, 4 with depth, 6 of shapes, std greater than 0",
+                expected="3 numbers each, as mean: [0.5, 0.5, 0.5], 4 with depth, 6 of shapes, std "
+                "greater than 0",
             )
+        object.__setattr__(self, "mean", mean)
+        object.__setattr__(self, "std", std)
 
     @classmethod
     def of(cls, given: Any, channels: int, setting: str = "normalization") -> Self:
@@ -148,7 +147,7 @@ RGBD_NORMALIZATION = Normalization(
 
 
 def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """The channels of an image of these inputs by name, colours apart.
+    """The channels of an image of these inputs by name, colors apart.
 
     >>> channel_names(["rgb", "depth"])
     ('red', 'green', 'blue', 'depth')
@@ -181,7 +180,7 @@ def normalize(
     Args:
         rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
             where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
-        normalization: Of RGB and depth.
+        normalization: Normalization of RGB and depth.
         inputs: Inputs of the network, in the order of `INPUTS`.
 
     Returns:
@@ -213,8 +212,8 @@ def normalize_channels(
 
     Args:
         images: ``(..., C, h, w)`` float32.
-        units: Of every channel, its stored value for 1.
-        normalization: Of C channels.
+        units: Stored value for 1, of each channel.
+        normalization: Normalization of C channels.
 
     Returns:
         The images.

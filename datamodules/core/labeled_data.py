@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -19,7 +19,7 @@ from datamodules.core.index import SPLITS, DatasetIndex, Item, Split
 from datamodules.core.inputs import Normalization
 from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.problems import Problems
-from datamodules.core.reading import SplitReader
+from datamodules.core.reading import SplitReader, Transform
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import is_class_name
@@ -31,7 +31,7 @@ REMEDY = (
     "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
     "broken files out."
 )
-"""What to do about broken items."""
+"""Remedy for broken items."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -39,7 +39,7 @@ class LabeledData(ABC, Generic[_Item]):
     """A data set split for training, validation and test.
 
     A data set is a dataclass: its fields are the settings `data.*` of a config. It defines the
-    items of its splits (`find`), their readers (`split_reader`) and their samples (`dataset`).
+    items of its splits (`find`) and their samples (`dataset`).
 
     Args:
         root: Folder of the data set.
@@ -115,9 +115,10 @@ class LabeledData(ABC, Generic[_Item]):
             DataError: The data set as a whole cannot be used.
         """
 
-    @abstractmethod
-    def split_reader(self, index: DatasetIndex[_Item], split: Split) -> SplitReader[_Item, Any]:
-        """Reader of the items of a split."""
+    def transforms(self, split: Split) -> Sequence[Transform[Any, _Item]]:
+        """Return changes to every item of a split, in their order."""
+        del split
+        return ()
 
     @abstractmethod
     def dataset(self, split: Split) -> Dataset[Any]:
@@ -156,37 +157,20 @@ class LabeledData(ABC, Generic[_Item]):
             found = list(found) if isinstance(found, tuple) else found
             raise SettingError(f"data.{setting}", found=found, expected=expected, remedy=remedy)
 
-    def set_normalization(self, default: Normalization, channels: int) -> None:
-        """Make the setting a `Normalization`.
-
-        Args:
-            default: Value without a setting.
-            channels: Required number of channels.
-
-        Raises:
-            SettingError: It is something else, or has other channels.
-        """
-        given = self.normalization or default
-        self.normalization = Normalization.of(given, channels, "data.normalization")
-
-    def require_representation(self, attribute: str, expected: str, remedy: str) -> None:
+    def require_representation(self, attribute: str, choice: str) -> None:
         """Refuse a representation of another kind of images.
 
         Args:
             attribute: Attribute of all representations of the right kind.
-            expected: The right kind, for the message.
-            remedy: Remedy, for the message.
+            choice: One of them, for the message.
 
         Raises:
             SettingError: It is of another kind.
         """
         if not hasattr(self.representation, attribute):
-            raise SettingError(
-                "representation",
-                found=type(self.representation).__name__,
-                expected=expected,
-                remedy=remedy,
-            )
+            found, expected = type(self.representation).__name__, f"one for {self.noun}"
+            remedy = f"Choose representation={choice}, or other data."
+            raise SettingError("representation", found=found, expected=expected, remedy=remedy)
 
     def check_classes(self) -> None:
         """Check that the data set names its classes, in names that checkpoints can hold.
@@ -259,8 +243,7 @@ class LabeledData(ABC, Generic[_Item]):
         if not self.skip_broken:
             problems.refuse(self.root, REMEDY)
         items = part(index.of())
-        part_of = replace(index, splits={"train": items, "val": [], "test": []})
-        part_of.read_all(SPLITS, problems, whole=True)
+        index.read_all(items, problems, whole=True)
         if not self.skip_broken:
             problems.refuse(self.root, REMEDY)
         return len(problems.without(items))
@@ -297,7 +280,7 @@ class LabeledData(ABC, Generic[_Item]):
                 index.read_some(self.seed, problems)
             problems.refuse(self.root, REMEDY)
             return index
-        index.read_all(SPLITS, problems, whole=whole)
+        index.read_all(index.of(), problems, whole=whole)
         usable = index.without(problems)
         for split in SPLITS:
             if index.splits[split] and not usable.splits[split]:
@@ -325,7 +308,7 @@ class LabeledData(ABC, Generic[_Item]):
     def source(self, split: Split) -> SplitReader[_Item, Any]:
         """Return the reader of a split; with `in_memory`, everything is read now."""
         if split not in self._readers:
-            reader = self.split_reader(self.index(), split)
+            reader = SplitReader(self.index(), split, self.transforms(split))
             if self.in_memory:
                 reader.keep_in_memory(self.root)
             self._readers[split] = reader

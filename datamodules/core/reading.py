@@ -26,11 +26,10 @@ class SplitReader(Generic[_Item, _Image]):
     Args:
         index: All images; arrays of its store are memory-mapped, not copied.
         split: The split.
-        kind: Named tuple that they are, which stored arrays are wrapped in too.
         transforms: Changes to every image, in their order.
 
     Attributes:
-        items: Their files.
+        items: Files of each image.
         transforms: Changes to every image, in their order.
     """
 
@@ -38,12 +37,11 @@ class SplitReader(Generic[_Item, _Image]):
         self,
         index: DatasetIndex[_Item],
         split: Split,
-        kind: type[_Image],
         transforms: Sequence[Transform[_Image, _Item]] = (),
     ) -> None:
         self.items = index.splits[split]
         self._decode, self._store = index.read, index.store
-        self._kind = kind
+        self._kind = index.kind
         self.transforms = transforms
         self._kept: list[_Image] = []
 
@@ -71,12 +69,9 @@ class SplitReader(Generic[_Item, _Image]):
     def labels(self, index: int) -> NDArray[np.uint8]:
         """The labels of one image, cheaper than the whole image."""
         decode: Any = self._decode
-        image: Any = None
-        if self._kept or self.transforms or self._store is not None:
-            image = self.read(index)
-        labels: NDArray[np.uint8] = (
-            decode.labels(self.items[index]) if image is None else image.labels
-        )
+        is_decoded = self._kept or self.transforms or self._store is not None
+        image: Any = self.read(index) if is_decoded else None
+        labels: NDArray[np.uint8] = image.labels if is_decoded else decode.labels(self.items[index])
         return labels
 
     def keep_in_memory(self, root: object) -> None:
@@ -107,6 +102,5 @@ class SplitReader(Generic[_Item, _Image]):
         arrays = store.read(item.name, item.parts)
         # Prepared with depth, they also serve runs without.
         read = {key: a for key, a in arrays.items() if key != "depth" or "depth" in item.parts}
-        kind: Any = self._kind
-        image: _Image = kind(**{**dict.fromkeys(kind._fields), **read})
+        image: _Image = self._kind(**{**dict.fromkeys(self._kind._fields), **read})
         return image

@@ -82,7 +82,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         if not self.skip_broken and index.store is not None:
             problems = Problems()
             splits: Sequence[Split] = ("test",) if stage == TrainerFn.TESTING else SPLITS
-            index.read_all(splits, problems, whole=whole)
+            index.read_all(index.of(splits), problems, whole=whole)
             problems.refuse(self.root, REMEDY)
 
     def setup(self, stage: str | None = None) -> None:

@@ -15,10 +15,10 @@ from typing import Any, ClassVar
 from torch import Tensor
 
 from datamodules.core.index import DatasetIndex, Split, draw_groups
+from datamodules.core.inputs import Normalization
 from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
-from datamodules.core.reading import SplitReader
 from datamodules.core.split_module import SplitDataModule
 from datamodules.core.store import Declared, Store
 from datamodules.modelnet40.meshes import CHANNELS
@@ -72,17 +72,14 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_representation(
-            "erp_height",
-            "one for panoramas, such as the spheres of shapes",
-            "Choose representation=tangent.",
-        )
+        self.require_representation("erp_height", "tangent")
         self.require(
             "test_rotation", self.test_rotation in (None, "yaw", "so3"), "null, yaw or so3"
         )
         self.erp_height: int = self.representation.erp_height
         self.class_names = self.find_classes()
-        self.set_normalization(SPHERE_NORMALIZATION, CHANNELS)
+        given = self.normalization or SPHERE_NORMALIZATION
+        self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
 
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 5."""
@@ -108,13 +105,9 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         shape = self.erp_height, 2 * self.erp_height
         folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
         store = Store(folder, {"spheres": Declared("uint16", (*shape, CHANNELS), MOST_STEPS)})
-        return DatasetIndex(self.noun, splits, partial(make_spheres, shape), store, _in_processes)
-
-    def split_reader(
-        self, index: DatasetIndex[ShapeFile], split: Split
-    ) -> SplitReader[ShapeFile, Spheres]:
-        """The spheres in the store."""
-        return SplitReader(index, split, Spheres)
+        return DatasetIndex(
+            self.noun, splits, partial(make_spheres, shape), Spheres, store, _in_processes
+        )
 
     def dataset(self, split: Split) -> ShapeViews:
         """See `LabeledData`: samples `ShapeSample`; the test shapes are rotated if set."""

@@ -183,10 +183,11 @@ class ImportSettings:
     overwrite: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class KeypointSettings:
     """Settings of ``configs/keypoints.yaml``, except for data and fields of `Comparer`."""
 
+    data: dict[str, Any] | None = None
     output: Path
     left: Path | None = field(metadata=_EXISTS)
     right: Path | None = field(metadata=_EXISTS)
@@ -196,10 +197,19 @@ class KeypointSettings:
     export: bool
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RunSettings:
     """Settings of every run, see ``configs/train.yaml``."""
 
+    data: dict[str, Any]
+    representation: dict[str, Any]
+    network: dict[str, Any]
+    task: dict[str, Any]
+    optimizer: dict[str, Any]
+    scheduler: dict[str, Any] | None = None
+    trainer: dict[str, Any]
+    logger: dict[str, Any] | None = None
+    callbacks: dict[str, Any] | None = None
     seed: int
     level: int
     panels: int
@@ -208,7 +218,7 @@ class RunSettings:
     ema: float | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TrainSettings(RunSettings):
     """See ``configs/train.yaml``; `name` is a folder."""
 
@@ -229,6 +239,7 @@ class ClassMapSettings:
 class EvaluateSettings(RunSettings):
     """See ``configs/evaluate.yaml``; stages of a transfer may have no class map."""
 
+    network: dict[str, Any] | None = None  # type: ignore[assignment]
     checkpoint: Path = field(metadata=_EXISTS)
     class_map: str | Path | None = field(default=None, metadata=_CLASS_MAP)
 
@@ -237,6 +248,7 @@ class EvaluateSettings(RunSettings):
 class TransferSettings(EvaluateSettings):
     """See ``configs/transfer.yaml``."""
 
+    network: dict[str, Any]
     checkpoint: Path | None = field(metadata=_EXISTS)  # type: ignore[assignment]
 
 

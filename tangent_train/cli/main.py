@@ -15,7 +15,6 @@ import threading
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
     _prepare_process()
-    _import_own_packages()
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -59,6 +57,8 @@ def _main(command: str) -> None:
 
         if stored is not None:
             arguments = stored.arguments
+        # Hydra takes no null for a group on the command line.
+        arguments = ["logger=none" if a == "logger=null" else a for a in arguments]
         if command == "import":
             # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
             arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]
@@ -90,21 +90,6 @@ def _prepare_process() -> None:
     os.environ["PYTHONSAFEPATH"] = "1"
 
 
-def _import_own_packages() -> None:
-    """Import our ``models`` and ``datamodules``, whatever else on PYTHONPATH is called so."""
-    root = str(Path(__file__).parents[2])
-    for name in ("datamodules", "models"):
-        other = find_spec(name)
-        sys.path.insert(0, root)
-        own = import_module(name)
-        sys.path.remove(root)
-        if other is not None and other.origin != own.__file__:
-            sys.stderr.write(
-                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
-                "folder to use what is in it in a config.\n"
-            )
-
-
 train = partial(_main, "train")
 evaluate = partial(_main, "evaluate")
 prepare = partial(_main, "prepare")
@@ -131,8 +116,13 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from omegaconf import OmegaConf
 
     from tangent_train.cli.command_settings import check_settings
+    from tangent_train.cli.run_folder import folder_settings
+    from tangent_train.cli.setting_names import check_names, declared_settings
     from tangent_train.cli.sweep import in_sweep, run_job
 
+    composed: Any = OmegaConf.to_container(config)
+    whole = OmegaConf.to_container(HydraConfig.instance().cfg)
+    check_names(command, composed, f"{composed} {whole} {folder_settings}")
     if in_sweep():
         return run_job(command, config, () if stored is None else stored.added, visible_gpus)
     logging.getLogger().handlers.clear()  # Hydra's would print again what Lightning prints
@@ -141,8 +131,10 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
     name = "import_network" if command == "import" else command  # a word of Python
     settings: Any = OmegaConf.to_container(config, resolve=True)
-    if command == "import":
-        settings["network"] = (settings["network"] or {}).get("name")
+    settings = {n: value for n, value in settings.items() if n in declared_settings(command)}
+    if command == "import" and isinstance(settings["network"], dict):
+        network = dict(settings["network"])
+        settings["network"] = network if len(network) > 1 else network["name"]
     check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)

@@ -15,6 +15,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.loading import explained
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
@@ -127,12 +128,19 @@ class Run:
         if getattr(self.data, "upright", None) == "auto":
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        noun = self.data.noun
-        record = self.task.record(self.task.result, noun)
-        total = len(self.data.source("test"))
-        if record.images != total:
-            raise RuntimeError(f"{record.images} of {total} test {noun} were counted")
-        self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+        noun, total = self.data.noun, len(self.data.source("test"))
+        tested = sum(trainer.num_test_batches) > 0  # else the result is that of a validation
+        record = self.task.record(self.task.result, noun) if tested else None
+        images = record.images if record else 0
+        if record and images == total:
+            self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+            return
+        if not getattr(trainer, "fast_dev_run", False) and str(trainer.limit_test_batches) == "1.0":
+            raise RuntimeError(f"{images} of {total} test {noun} were counted")
+        rank_zero_only(print_text)(
+            f"{images} of {total} test {noun} were evaluated, as trainer.limit_test_batches or "
+            "trainer.fast_dev_run says: no results are written."
+        )
 
     def _as_trained(self) -> TrainedNetwork:
         """The network of the run, with what it was trained on."""
@@ -207,9 +215,18 @@ def build(
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
     count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
     outputs = count_outputs(data.num_classes)
-    section = completed_settings(settings["network"], data.in_channels, outputs, restored=restored)
+    section = completed_settings(
+        settings.get("network"), data.in_channels, outputs, restored=restored
+    )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
+    if getattr(data, "upright", None) == "auto" and task.predicts != PIXEL_CLASSES:
+        raise SettingError(
+            "data.upright",
+            found=f"auto, with {type(task).__name__}",
+            expected=f"null or pose: a network that predicts {PIXEL_CLASSES} estimates which way "
+            "is up",
+        )
     try_network(task, data.in_channels)
     if trains:
         try_training(task, data, settings)

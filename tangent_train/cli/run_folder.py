@@ -24,6 +24,9 @@ _OF_SETTINGS = {_LOCK, "config.yaml", "multirun.yaml"}
 _RANKS = ("RANK", "LOCAL_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
 """Where Lightning finds the number of a process of a run."""
 
+folder_settings: list[str] = []
+"""Names of folders as the config gives them, with their ``${…}``."""
+
 folders = ExitStack()
 """The folders of this process. Closing it gives them back."""
 
@@ -56,6 +59,7 @@ class RunFolder(Callback):
 def _take(config: DictConfig, section: str, *, lock: bool) -> None:
     named = OmegaConf.to_container(config.hydra[section], resolve=False)
     is_new = isinstance(named, dict) and bool(re.search(r"(?<!\\)\$\{now:", str(named["dir"])))
+    folder_settings.append(str(named))
     place = Path(config.hydra[section].dir)
     if "${" in str(place.absolute()):
         raise SystemExit from SettingError(

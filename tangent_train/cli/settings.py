@@ -14,13 +14,14 @@ from tangent_train.errors import SettingError
 
 _Settings = TypeVar("_Settings")
 
-_SAID = {
+_DESCRIPTIONS = {
     bool: "true or false",
     int: "a whole number",
     float: "a number",
     str: "a name or path",
     Path: "a file or folder",
     NoneType: "null",
+    dict: "a section of settings",
 }
 
 
@@ -34,8 +35,8 @@ class Trust:
 def parse_settings(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
     """Build a dataclass of settings; values are checked where they are used.
 
-    Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples
-    and unions of these. A single value may stand for a tuple.
+    Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples,
+    sections (``dict``) and unions of these. A single value may stand for a tuple.
 
     Args:
         kind: The class.
@@ -47,7 +48,7 @@ def parse_settings(kind: type[_Settings], config: Mapping[str, Any]) -> _Setting
     defaults = {one.name for one in fields(kind) if one.default is not MISSING}  # type: ignore[arg-type]
     hints = get_type_hints(kind).items()
     named = [(name, hint) for name, hint in hints if name in config or name not in defaults]
-    return kind(**{name: _converted(name, config[name], hint) for name, hint in named})
+    return kind(**{name: _converted(name, config.get(name), hint) for name, hint in named})
 
 
 def names_of(arguments: Sequence[str]) -> set[str]:
@@ -78,7 +79,7 @@ def _converted(name: str, value: Any, hint: Any) -> Any:
         with suppress(TypeError, ValueError):
             return _as(option, value)
     found = "none" if value is None else value
-    raise SettingError(name, found=found, expected=" or ".join(map(_said, options)))
+    raise SettingError(name, found=found, expected=" or ".join(map(_description, options)))
 
 
 def _as(kind: Any, value: Any) -> Any:
@@ -89,6 +90,8 @@ def _as(kind: Any, value: Any) -> Any:
         values = value if isinstance(value, list | tuple) else [value]
         kinds = arguments[:1] * len(values) if arguments[-1] is ... else arguments
         return tuple(_as(each, one) for one, each in zip(values, kinds, strict=True))
+    if get_origin(kind) is dict and isinstance(value, Mapping):
+        return dict(value)
     if kind is Path and isinstance(value, str):
         return Path(value)
     if kind is float and type(value) in (int, float) and math.isfinite(value):
@@ -98,9 +101,9 @@ def _as(kind: Any, value: Any) -> Any:
     raise TypeError
 
 
-def _said(kind: Any) -> str:
+def _description(kind: Any) -> str:
     if get_origin(kind) is Literal:
         return " or ".join(map(str, get_args(kind)))
     if get_origin(kind) is tuple:
-        return f"a list (each {_said(get_args(kind)[0])})"
-    return _SAID[get_origin(kind) or kind]
+        return f"a list (each {_description(get_args(kind)[0])})"
+    return _DESCRIPTIONS[get_origin(kind) or kind]

@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_type_hints
+from types import NoneType
+from typing import Any, get_args, get_origin, get_type_hints
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli.command_settings import RunSettings
@@ -21,7 +22,14 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
 
-_SECTIONS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer")
+_DECLARED = get_type_hints(RunSettings)
+_SECTIONS = {
+    name: dict | None if get_args(kind)[1:] == (NoneType,) else dict
+    for name, kind in _DECLARED.items()
+    if dict in (get_origin(kind), *map(get_origin, get_args(kind))) and from_file(name)
+}
+"""Sections that a checkpoint keeps, with their kinds."""
+
 _NEVER_STORED = ("callbacks", "debug", "logger")
 """Groups whose settings are never taken from a file: a resumed run composes its options again."""
 
@@ -31,7 +39,7 @@ GROUPS = ("experiment", "recipe", *_SECTIONS, *_NEVER_STORED)
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
-    **get_type_hints(RunSettings),
+    **{name: kind for name, kind in _DECLARED.items() if name not in GROUPS},
 }
 """Settings outside of the sections."""
 
@@ -80,12 +88,11 @@ class StoredRun:
         own |= {"representation.level"} if "level" in own else set()
         own |= {"data.seed"} if "seed" in own else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
-        sections = {name: dict | None if name == "scheduler" else dict for name in _SECTIONS}
-        of_run |= check_fields(self.path, self.config, sections, _EXPECTED)
+        of_run |= check_fields(self.path, self.config, _SECTIONS, _EXPECTED)
         settings = dict(said)
         settings |= {name: value for name, value in of_run.items() if name not in own}
         local: set[str] = set()
-        for name in sections.keys() - own:
+        for name in _SECTIONS.keys() - own:
             if settings[name] is not None:
                 settings[name], names = self._section(name, said.get(name) or {}, own)
                 local |= names
@@ -248,9 +255,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     if command != "train":  # a file does not choose who sees the evaluation
         choices = {g: name for g, name in choices.items() if g not in _NEVER_STORED}
     own = {a.partition("=")[0] for a in left}.intersection(GROUPS)
-    if own.intersection(
-        _SECTIONS
-    ):  # what an experiment sets of a section is not meant for another option of it
+    if own & _SECTIONS.keys():  # an experiment's settings of a section are of another option of it
         choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
     added = [f"level={known['level']}", f"seed={known['seed']}"]
     added += [f"{group}={name}" for group, name in choices.items() if group not in own]

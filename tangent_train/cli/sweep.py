@@ -47,7 +47,7 @@ def run_job(
 
     Raises:
         CompactHydraException: The run failed. Hydra prints it without a traceback.
-        SettingError: The sweep compares scores that its runs would not have.
+        SettingError: The sweep compares scores that its runs do not have, or looks for the worse.
     """
     hydra = HydraConfig.get()
     searches = not hydra.sweeper["_target_"].endswith("BasicSweeper")
@@ -71,5 +71,14 @@ def run_job(
     status = run_process(command_line(command, [*options, *overrides], folder), environment)
     if status:
         raise CompactHydraException(f"job {hydra.job.num} in {folder} ended with status {status}")
-    figure = folder / OBJECTIVE_FILE
-    return float(parse_json(figure.read_bytes())["best"]) if figure.is_file() else None
+    if not (folder / OBJECTIVE_FILE).is_file():
+        return None
+    objective = parse_json((folder / OBJECTIVE_FILE).read_bytes())
+    direction = hydra.sweeper.get("direction") if searches else None
+    if isinstance(direction, str) and not direction.startswith(objective["mode"]):
+        raise SettingError(
+            "hydra.sweeper.direction",
+            found=direction,
+            expected=f"{objective['mode']}imize, for {objective['figure']}",
+        )
+    return float(objective["best"])

@@ -106,7 +106,9 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
     built: dict[Any, tuple[Stage, Any]] = {}
     tried: list[Any] = []
     for stage in stages:
-        parts = [stage.config[name] for name in ("data", "representation", "level")]
+        names = ["data", "representation", "level"]
+        names += ["optimizer", "scheduler"] if stage.command == "train" else []
+        parts = [stage.config.get(name) for name in names]
         if parts in tried:
             continue
         tried.append(parts)

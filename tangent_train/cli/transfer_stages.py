@@ -28,6 +28,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
+from tangent_train.cli.setting_names import declared_settings
 from tangent_train.cli.transfer_views import conditions_of, numbers
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
@@ -36,12 +37,6 @@ from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]
 """Progress of a stage. One that only evaluates is either new or finished."""
-
-_OF_THE_TRANSFER = (
-    *("photos", "fine_tuning", "compare", "conditions", "folds", "seeds", "checkpoint"),
-    *("study_levels", "study_max_rows", "class_map", "unmapped", "trust"),
-)
-"""Settings that a stage's config does not have."""
 
 _HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
 _SLOWER = 10  # fine-tuning: 1e-5 after 1e-4 (paper, supplement, "Transfer learning")
@@ -177,13 +172,13 @@ class _Planner:
         settings: dict[str, Any],
         command: Literal["train", "evaluate"] = "evaluate",
     ) -> Stage:
-        own = {key: value for key, value in settings.items() if key not in _OF_THE_TRANSFER}
+        declared = declared_settings(command).keys() - {"checkpoint"}
+        if settings["class_map"] is None:
+            declared -= {"class_map", "unmapped"}
+        own = {key: value for key, value in settings.items() if key in declared}
         own |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
         if name[0] == "P":
             own |= {key: settings["photos"][key] for key in ("data", "representation")}
-        if command == "evaluate":
-            mapping = () if settings["class_map"] is None else ("class_map", "unmapped")
-            own |= {key: settings[key] for key in ("trust", *mapping)}
         trained = self._folder / "P" / "checkpoints" / "best.ckpt"
         scratch = name == "P" and not self._given
         return Stage(

@@ -495,3 +495,23 @@ def test_a_pipe_that_is_closed_early_and_tab_completion(tmp_path: Path) -> None:
         )
         assert done.stdout.startswith(told)
         assert not done.stderr
+
+
+@pytest.mark.parametrize("limit", ["debug=fast", "+trainer.limit_test_batches=1", "batches=0"])
+def test_an_incomplete_test_leaves_no_results(
+    limit: str, rooms: str, tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    typed = limit.replace("batches=0", "+trainer.limit_test_batches=0")
+    run("train", *SETTINGS, rooms, "trainer.max_epochs=1", typed, "hydra.run.dir=run")
+    count = 0 if limit == "batches=0" else 1
+    assert (
+        f"{count} of 2 test panoramas were evaluated, as trainer.limit" in capsys.readouterr().out
+    )
+    assert not list((tmp_path / "run").glob("results.*"))
+    checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"
+    run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=whole")
+    assert results(tmp_path / "whole")["images"] == 2
+    one = ("+trainer.limit_test_batches=0.5", "hydra.run.dir=part")
+    run("evaluate", f"checkpoint={checkpoint}", rooms, *one)
+    assert "1 of 2 test panoramas were evaluated" in capsys.readouterr().out
+    assert not list((tmp_path / "part").glob("results.*"))

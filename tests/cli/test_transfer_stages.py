@@ -59,10 +59,10 @@ def test_the_stages_in_their_order(rooms: DictConfig) -> None:
         ("S-FT-10", "train", "P"),
     ]
     assert all(s.folder == FOLDER / "fold_2" / "seed_3" / s.name for s in stages)
-    ordinary = set(composed("train")) - {"sweep", "launcher", "trust"}
+    ordinary = set(composed("train"))
     for stage in stages:
         config, photos = stage.config, stage.name[0] == "P"
-        assert set(config) == ordinary | ({"trust"} if stage.command == "evaluate" else set())
+        assert set(config) == ordinary
         assert (config["seed"], config["data"]["seed"], config["data"]["fold"]) == (3, 3, 2)
         assert config["name"] == f"rooms/transfer/{stage.name}"
         assert config["data"]["_target_"].endswith("Perspective") == photos

@@ -135,7 +135,7 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
         return panorama._replace(labels=panorama.labels * 0 + index)
 
     items = SplitReader(
-        DatasetIndex("panoramas", {"test": FILES}, decode), "test", Panorama, [double]
+        DatasetIndex("panoramas", {"test": FILES}, decode, Panorama), "test", [double]
     )
     items.keep_in_memory("data")
     for index in (0, 1):
@@ -146,5 +146,5 @@ def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
     broken = [file._replace(name="broken", rgb=Path(f"b{file.name}")) for file in FILES]
     with pytest.raises(DataError, match=r"data: found 2 problems(.|\n)*b0(.|\n)*b1"):
         SplitReader(
-            DatasetIndex("panoramas", {"test": broken}, decode), "test", Panorama
+            DatasetIndex("panoramas", {"test": broken}, decode, Panorama), "test"
         ).keep_in_memory("data")

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.tiny_runs import SETTINGS, Run, results
+from tests.cli.tiny_runs import SETTINGS, SMALL_ROOMS, Run, results
+from tests.running import ROOT
 
 # Optuna 2.10, all that hydra-optuna-sweeper works with, is written for an old one.
 OLD_SQLALCHEMY = pytest.mark.filterwarnings("ignore:Deprecated API features detected")
@@ -105,3 +106,16 @@ def test_a_search_without_a_validation_split_is_refused(
     with pytest.raises(SystemExit, match=message):
         run("train", "-m", "sweep=optuna", *without)
     assert not list(tmp_path.rglob("checkpoints"))
+
+
+@OLD_SQLALCHEMY
+def test_a_search_for_the_worse_score_is_refused(
+    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    package = ROOT / "tests" / "tasks" / "toy_regression"
+    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{package.parent}")
+    own = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
+    settings = (*SMALL_ROOMS, rooms, "network.widths=[4,8]", "trainer.max_epochs=1")
+    study = ("sweep=optuna", "hydra.sweeper.n_trials=1")
+    with pytest.raises(SystemExit, match="found maximize; expected minimize, for val/mae"):
+        run("train", "-m", *own, *settings, *study)

@@ -1,0 +1,85 @@
+"""Names of the settings of a command: its config declares them, all others are refused."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import fields
+from functools import cache
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
+
+from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.cli.compose import config_folder
+from tangent_train.errors import SettingError
+from tangent_train.registry import nearest
+
+_COMPLETED = "fine_tuning.optimizer"
+"""A section without a class: its further settings are those of ``optimizer``."""
+
+
+@cache
+def declared_settings(command: str) -> Mapping[str, Any]:
+    """Return the settings of a command by name, and the names inside sections of its own.
+
+    Args:
+        command: The command, such as transfer.
+
+    Returns:
+        For a section without a class, such as ``fine_tuning``, a mapping; else anything.
+    """
+    content = yaml.safe_load((config_folder() / f"{command}.yaml").read_text("utf-8"))
+    bases = [name for name in content["defaults"] if isinstance(name, str) and name != "_self_"]
+    declared = {n: value for base in bases for n, value in declared_settings(base).items()}
+    declared |= {n: value for n, value in content.items() if n not in ("defaults", "hydra")}
+    return declared | dict.fromkeys(field.name for field in fields(SETTINGS[command]))
+
+
+def check_names(command: str, settings: Mapping[str, Any], references: str) -> None:
+    """Refuse settings that nothing reads.
+
+    Sections with a class are left to it: it refuses arguments that it does not have.
+
+    Args:
+        command: The command.
+        settings: Its composed config, resolved or not.
+        references: Text with all ``${…}`` of the config and of Hydra. A setting at the top that is
+            named in one of them is read there.
+
+    Raises:
+        SettingError: There is one; the message names the nearest setting.
+    """
+    declared = declared_settings(command)
+    for name, value in _undeclared(settings, declared):
+        if not re.search(rf"\$\{{\s*([\w.]+:\s*)?\.*{re.escape(name)}\b", references):
+            raise SettingError(
+                name,
+                found=f"{value}, which tangent-{command} does not read",
+                expected=f"a setting that tangent-{command} --help lists",
+                remedy=f"{nearest(name, [*_names(declared), *_names(settings, name)])}Remove it.",
+            )
+
+
+def _undeclared(
+    settings: Mapping[str, Any], declared: Mapping[str, Any], section: str = ""
+) -> Iterator[tuple[str, Any]]:
+    """Names and values of undeclared settings."""
+    for key, value in settings.items():
+        name = f"{section}{key}"
+        has_class = isinstance(value, Mapping) and "_target_" in value
+        of_class = section and key in declared_settings("train") and has_class
+        if key not in declared and not of_class:
+            yield name, value
+        inner = declared.get(key)
+        if isinstance(value, Mapping) and isinstance(inner, Mapping) and not has_class:
+            yield from _undeclared(value, inner, f"{name}.") if name != _COMPLETED else ()
+
+
+def _names(settings: Mapping[str, Any], left_out: str = "", section: str = "") -> Iterator[str]:
+    for key, value in settings.items():
+        name = f"{section}{key}"
+        if name != left_out:
+            yield name
+            if isinstance(value, Mapping):
+                yield from _names(value, left_out, f"{name}.")
