@@ -117,7 +117,5 @@ def test_a_search_for_the_worse_score_is_refused(
     own = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
     settings = (*SMALL_ROOMS, rooms, "network.widths=[4,8]", "trainer.max_epochs=1")
     study = ("sweep=optuna", "hydra.sweeper.n_trials=1")
-    with pytest.raises(
-        SystemExit, match="found maximize; expected minimize, for val/mae"
-    ):
+    with pytest.raises(SystemExit, match="found maximize; expected minimize, for val/mae"):
         run("train", "-m", *own, *settings, *study)
