@@ -29,6 +29,11 @@ def counted(count: int, plural: str) -> str:
     return f"{count} {plural.removesuffix('s') if count == 1 else plural}"
 
 
+def first_line(error: object) -> str:
+    """The first line of an error's message: those of other libraries may be pages long."""
+    return str(error).strip().partition("\n")[0]
+
+
 def width_height(size: Sequence[float]) -> str:
     """The size of an image as people read it.
 

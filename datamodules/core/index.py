@@ -23,7 +23,7 @@ Split = Literal["train", "val", "test"]
 """A part of a data set."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""All of them."""
+"""All parts, in their order."""
 
 SAMPLED = 32
 """Maximum number of images that `DatasetIndex.read_some` decodes."""
@@ -56,7 +56,7 @@ class DatasetIndex(Generic[_Item]):
 
     Attributes:
         noun: Name of the items, in the plural.
-        splits: Their files.
+        splits: Files of the images or shapes of each split.
         read: Reads one from its files; may have methods `labels`, and `parts` for functions that
             decode each of its files by itself.
         kind: Named tuple of arrays that `read` returns.
@@ -116,7 +116,7 @@ class DatasetIndex(Generic[_Item]):
         """Decode some images from all over the data set, for a second or two; note what is broken.
 
         Args:
-            seed: Others for other seeds.
+            seed: Seed of the choice.
             problems: Known problems; new ones are added.
         """
         items = problems.without(self.of())
@@ -197,7 +197,7 @@ def draw_groups(
     Args:
         groups: All there are; those that come several times count once.
         fraction: Share of them to draw: at least one, never all, so none of a single one.
-        seed: Of the drawing.
+        seed: Seed of the draw.
 
     >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
     ['attic', 'kitchen']

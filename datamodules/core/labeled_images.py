@@ -22,7 +22,7 @@ class LabeledImage(NamedTuple):
         name: Unique short name; ``/`` between groups.
         rgb: ``(H, W, 3)`` uint8.
         labels: ``(H, W)`` uint8 places in the class names of the data set, 0 where unknown.
-        distance_m: ``(H, W)`` float32 metres from the center of the camera, NaN where missing; None
+        distance_m: ``(H, W)`` float32 meters from the center of the camera, NaN where missing; None
             without depth among the inputs of the data set.
         pose: Pose; None if the data set has none. In the axes of a photo, x is its optical axis, y
             points to the right and z up in the image.

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, first_line
 from tangent_train.files import load_plain, write_text
 from tangent_train.registry import Text, check_fields, check_plain
 
@@ -85,8 +85,8 @@ def read_settings(path: Path) -> dict[str, Any]:
     try:
         content = _Loader(path.read_text(encoding="utf-8")).get_single_data()
     except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        first_line = f"{type(error).__name__}: {error}".partition("\n")[0]
-        raise DataError(path, found=first_line, expected=expected) from error
+        found = first_line(f"{type(error).__name__}: {error}")
+        raise DataError(path, found=found, expected=expected) from error
     if not isinstance(content, dict):
         raise DataError(path, found=type(content).__name__, expected=expected)
     settings: dict[str, Any] = check_plain(path, content, "settings")

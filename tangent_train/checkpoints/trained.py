@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
@@ -15,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError, safe_open
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
@@ -28,7 +28,7 @@ from tangent_train.checkpoints.content import (
     read_checkpoint,
 )
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
 from tangent_train.registry import SettingsFile, Text, build_from_config, check_fields, check_plain
 
@@ -208,8 +208,7 @@ def describe_network(path: Path) -> NetworkDescription | None:
         DataError: The file is missing, or its description cannot be used.
     """
     if path.suffix.lower() == ".safetensors":
-        with _safetensors(path) as file:
-            metadata = file.metadata() or {}
+        metadata = _metadata(path)
         if METADATA_KEY not in metadata:
             return None
         content = _described(path, metadata)
@@ -289,10 +288,9 @@ def _from_onnx(source: SettingsFile) -> TrainedNetwork:
 
 
 def _from_safetensors(source: SettingsFile) -> TrainedNetwork:
-    with _safetensors(source.path) as file:
-        metadata = file.metadata() or {}
-        described = _described(source.path, metadata)
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    metadata = _metadata(source.path)
+    described = _described(source.path, metadata)
+    tensors = load_file(source.path)
     _check_tensors(source.path, metadata, tensor_checksum(tensors))
     return _trained(described, _network(described, tensors, source), source)
 
@@ -385,17 +383,11 @@ def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
     return check_fields(path, check_plain(path, content, where), _KINDS, _EXPORTED, where)
 
 
-@contextmanager
-def _safetensors(path: Path) -> Iterator[Any]:
-    """An open file.
-
-    Raises:
-        DataError: It is no such file.
-    """
+def _metadata(path: Path) -> dict[str, str]:
+    """Metadata of a safetensors file."""
     try:
         with safe_open(path, framework="pt") as file:
-            yield file
+            return file.metadata() or {}
     except (SafetensorError, OSError) as error:
-        first_line = str(error).strip().partition("\n")[0]
-        found = f"an unreadable file ({first_line})" if path.is_file() else "no such file"
+        found = f"an unreadable file ({first_line(error)})" if path.is_file() else "no such file"
         raise DataError(path, found=found, expected=_EXPORTED) from error

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
     from tangent_train.inference.photo_networks import PhotoNetwork
 
 
-_LIBRARIES = ("torchvision", "huggingface", "smp", "onnx")
+_LIBRARIES = ("torchvision", "huggingface", "smp")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
 
 
-_SAID: dict[ScoreKind, str] = {
+_OUTPUTS: dict[ScoreKind, str] = {
     "logits": "scores before a softmax",
     "probabilities": "probabilities after a softmax",
     "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
@@ -49,10 +49,10 @@ def import_network(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or impossible, or the file exists.
     """
     settings = parse_settings(Settings, config)
+    output = settings.output
     with elsewhere():
         from tangent_train.inference import photo_networks
 
-    output = settings.output
     suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
@@ -88,27 +88,26 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
 
 def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
-    name = settings.network
+    name, classes = settings.network, settings.classes
     if name in _LIBRARIES:
         with elsewhere():
             library = import_module(f"tangent_train.inference.photo_networks.{name}")
+        model, weights = settings.model, settings.weights
         network: PhotoNetwork = library.load(
-            model=settings.model,
-            weights=settings.weights,
-            file=settings.file,
-            classes=settings.classes,
-            normalization=normalization,
+            model=model, weights=weights, classes=classes, normalization=normalization
         )
         return network
-    from tangent_train.inference.photo_networks import of_config
+    from tangent_train.inference.photo_networks import own_files
 
+    if name == "onnx":
+        return own_files.load_onnx(settings.file, classes, normalization)
     try:
         config: Any = compose("import", [f"+network@section={name}"])
     except MissingConfigException as error:
-        known = ", ".join((*_LIBRARIES, *(error.options or ())))
+        known = ", ".join((*_LIBRARIES, "onnx", *(error.options or ())))
         raise SettingError("network", found=name, expected=f"of {known}") from error
     section: Any = OmegaConf.to_container(config.section)
-    return of_config.load(section, settings.weights, settings.classes, normalization)
+    return own_files.load_config(section, settings.weights, classes, normalization)
 
 
 def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
@@ -122,15 +121,15 @@ def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB",
         f"{len(names)} classes: {', '.join(names)}",
-        f"the network returns {_SAID[trained.score_kind]}",
+        f"the network returns {_OUTPUTS[trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
         f"photos of {settings.fov:g}° → panoramas of level {trained.level} as "
         f"{20 * 4**base_level} tangent images (base level {base_level}) of {dim}×{dim}",
     ]
-    own = trained.source.trust if trained.source is not None else ()
-    if own:
-        lines.append(f"of your own: every command that reads it needs trust=[{','.join(own)}]")
+    if trained.source is not None and trained.source.trust:
+        trust = ",".join(trained.source.trust)
+        lines.append(f"your own network: every command that reads it needs trust=[{trust}]")
     if settings.unknown_classes:
         effect = "written as unknown" if settings.unknown_wins else "never win"
         lines.insert(2, f"{', '.join(settings.unknown_classes)}: {effect}")

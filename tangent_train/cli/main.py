@@ -15,7 +15,6 @@ import threading
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
     _prepare_process()
-    _import_own_packages()
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -59,6 +57,8 @@ def _main(command: str) -> None:
 
         if stored is not None:
             arguments = stored.arguments
+        # Hydra takes no null for a group on the command line.
+        arguments = ["logger=none" if a == "logger=null" else a for a in arguments]
         if command == "import":
             # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
             arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]
@@ -88,21 +88,6 @@ def _prepare_process() -> None:
     # Of all processes that are started, whatever starts them: the working directory is not on their
     # path, as it is not on that of the console scripts.
     os.environ["PYTHONSAFEPATH"] = "1"
-
-
-def _import_own_packages() -> None:
-    """Import our ``models`` and ``datamodules``, whatever else on PYTHONPATH is called so."""
-    root = str(Path(__file__).parents[2])
-    for name in ("datamodules", "models"):
-        other = find_spec(name)
-        sys.path.insert(0, root)
-        own = import_module(name)
-        sys.path.remove(root)
-        if other is not None and other.origin != own.__file__:
-            sys.stderr.write(
-                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
-                "folder to use what is in it in a config.\n"
-            )
 
 
 train = partial(_main, "train")

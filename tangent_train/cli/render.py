@@ -230,15 +230,18 @@ def _back(settings: Settings) -> tuple[list[Job], int, _Work]:
     root = settings.cameras or back
     of_one = root if root.is_file() else root / CAMERAS_FILE
     found = sorted(path.parent.relative_to(root) for path in root.rglob(CAMERAS_FILE))
-    cameras = {output / name: root / name / CAMERAS_FILE for name in found}
-    jobs = [Job(output / name, back / name) for name in found if (back / name).is_dir()]
+    jobs = [
+        Job(output / name, back / name, root / name / CAMERAS_FILE)
+        for name in found
+        if (back / name).is_dir()
+    ]
     if of_one.is_file():
         if output.suffix.lower() not in PIXEL_SUFFIXES:
             raise SettingError(
                 "output", found=output, expected=f"a name ending in {', '.join(PIXEL_SUFFIXES)}"
             )
         check_new(settings, output)
-        cameras, jobs = {output: of_one}, [Job(output, back)]
+        jobs = [Job(output, back, of_one)]
     if not jobs:
         raise DataError(
             root,
@@ -248,15 +251,14 @@ def _back(settings: Settings) -> tuple[list[Job], int, _Work]:
         )
 
     def work(job: Job, _: Callable[[float], object]) -> Path:
-        path: Path = job.item
-        of = read_cameras(cameras[path])
-        results = TangentResults.read(result_files(job.path, of), of.grid, settings.kind)
+        path, cameras = job.item, read_cameras(job.value)
+        results = TangentResults.read(result_files(job.path, cameras), cameras.grid, settings.kind)
         if not of_one.is_file():
             path = path.with_name(path.name + results.suffix)
             check_new(settings, path)
         rows = settings.height
-        shape = of.shape if rows is None else (rows, 2 * rows)
+        shape = cameras.shape if rows is None else (rows, 2 * rows)
         results.write(path, shape, settings.blend, z_depth=settings.z_depth)
-        return path
+        return Path(path)
 
     return jobs, len(jobs), work

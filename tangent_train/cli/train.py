@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import sys
@@ -166,8 +167,9 @@ def _remember(run: Run) -> Collection[str]:
 
 def _typed_local(remembered: Collection[str]) -> list[str]:
     """Typed machine-specific settings that a resumed run needs again: no file holds them."""
-    overrides = [text.lstrip("+") for text in HydraConfig.get().overrides.task]
-    named = [(text, *text.partition("=")[::2]) for text in overrides]
+    # Added settings are in the config of a resumed run, or not: ++ sets them in both cases.
+    overrides = [re.sub(r"^\++", "++", text) for text in HydraConfig.get().overrides.task]
+    named = [(text, *text.lstrip("+").partition("=")[::2]) for text in overrides]
     return [
         text
         for text, name, value in named

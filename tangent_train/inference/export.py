@@ -21,7 +21,7 @@ from tangent_train.checkpoints.trained import (
     tensor_checksum,
     write_metadata,
 )
-from tangent_train.errors import SettingError, of_extra
+from tangent_train.errors import SettingError, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
 
@@ -72,16 +72,16 @@ def export_network(
         SettingError: A setting does not fit the format, the network cannot be exported, or the
             scores differ by more than `TOLERANCE` of their range.
     """
-    suffix = path.suffix.lower()
     _check(trained, path, image_size, opset)
+    is_onnx = path.suffix.lower() == ".onnx"
     sizes = [image_size or trained.fixed_size]
-    if suffix == ".onnx" and sizes == [None]:
+    if is_onnx and sizes == [None]:
         sizes.append(trained.image_size)
     failure: Exception | None = None
     for size in sizes:
         try:
             with atomic_path(path) as temporary:
-                if suffix == ".onnx":
+                if is_onnx:
                     _write_onnx(trained, size, temporary, opset)
                 else:
                     _write_safetensors(trained, temporary)
@@ -90,12 +90,12 @@ def export_network(
             raise
         except Exception as error:  # whatever the exporter cannot do with dynamic sizes
             failure = error
-    cause: BaseException | None = failure
-    while cause is not None and cause.__cause__ is not None:
+    cause: Any = failure
+    while getattr(cause, "__cause__", None):
         cause = cause.__cause__
     raise SettingError(
         "output",
-        found=f"{path.name}, which cannot be written ({str(cause).strip().partition(chr(10))[0]})",
+        found=f"{path.name}, which cannot be written ({first_line(cause)})",
         expected="a network that torch's exporter supports",
         remedy="A .safetensors file takes every network.",
     ) from failure

@@ -17,7 +17,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
-from tangent_train.keypoints.spherical import angles_between
+from tangent_train.keypoints.spherical import Floats, angles_between
 from tangent_train.rendering.sampling import bilinear_equirect_taps
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
@@ -43,9 +43,7 @@ class DepthView:
     distance_m: NDArray[np.floating]
     pose: PanoramaPose
 
-    def distances(
-        self, directions_xyz: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def distances(self, directions_xyz: Floats) -> tuple[Floats, Floats]:
         """Distances in directions.
 
         Between four pixels of one surface 1/d is interpolated, which is linear in the direction on
@@ -77,9 +75,7 @@ class DepthView:
         return distance, distance * np.where(smooth, 1.0, _SMOOTH)
 
 
-def visible_from(
-    directions_xyz: NDArray[np.float64], source: DepthView, target: DepthView
-) -> NDArray[np.bool_]:
+def visible_from(directions_xyz: Floats, source: DepthView, target: DepthView) -> NDArray[np.bool_]:
     """Mask of the directions of one panorama whose points are visible in another.
 
     A panorama has no borders: a point is visible unless the target's distance in its direction is
@@ -142,8 +138,8 @@ class MatchTruth(NamedTuple):
 
 
 def correct_matches(
-    left_xyz: NDArray[np.float64],
-    right_xyz: NDArray[np.float64],
+    left_xyz: Floats,
+    right_xyz: Floats,
     left: DepthView,
     right: DepthView,
     max_error_deg: float = 1.0,
@@ -168,11 +164,8 @@ def correct_matches(
 
 
 def _transfer_errors_deg(
-    source_xyz: NDArray[np.float64],
-    target_xyz: NDArray[np.float64],
-    source: DepthView,
-    target: DepthView,
-) -> NDArray[np.float64]:
+    source_xyz: Floats, target_xyz: Floats, source: DepthView, target: DepthView
+) -> Floats:
     """Angles between where the target sees the source's points and where it should."""
     distance_m, _ = source.distances(source_xyz)
     seen_xyz, _ = target.pose.seen(source.pose.points_m(source_xyz, distance_m))

@@ -11,9 +11,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tangent_train.keypoints.spherical import angles_between
+from tangent_train.keypoints.spherical import Floats, angles_between
 
 _SHIFTS = 16
 _PRECISION_RAD = math.radians(0.01)
@@ -28,8 +27,8 @@ class Motion(NamedTuple):
         translation: ``(3,)`` t of length 1; None if both were taken at one place.
     """
 
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64] | None = None
+    rotation: Floats
+    translation: Floats | None = None
 
     @property
     def sample(self) -> int:
@@ -37,9 +36,7 @@ class Motion(NamedTuple):
         return 2 if self.translation is None else 5
 
 
-def motion_errors(
-    left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64], motion: Motion
-) -> NDArray[np.float64]:
+def motion_errors(left_xyz: Floats, right_xyz: Floats, motion: Motion) -> Floats:
     """Angular error of matches under a motion.
 
     Args:
@@ -60,9 +57,7 @@ def motion_errors(
     )
 
 
-def _arc_angles(
-    points_xyz: NDArray[np.float64], starts_xyz: NDArray[np.float64], end_xyz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _arc_angles(points_xyz: Floats, starts_xyz: Floats, end_xyz: Floats) -> Floats:
     """Angles between points and the shorter arcs from ``(m, 3)`` starts to one end."""
     normals = np.cross(starts_xyz, end_xyz)
     sines = np.linalg.norm(normals, axis=1)
@@ -75,12 +70,7 @@ def _arc_angles(
     return np.where(beside, np.arcsin(np.minimum(across, 1.0)), ends)
 
 
-def is_by_chance(
-    left_xyz: NDArray[np.float64],
-    right_xyz: NDArray[np.float64],
-    motion: Motion,
-    max_error_rad: float,
-) -> bool:
+def is_by_chance(left_xyz: Floats, right_xyz: Floats, motion: Motion, max_error_rad: float) -> bool:
     """True if a motion would fit as many matches by chance.
 
     The expected number of such motions is ``(m − s) · C(m, k) · C(k, s) · pᵏ⁻ˢ`` (Moisan and Stival
@@ -110,9 +100,7 @@ def _log_choices(of: int, chosen: int) -> float:
     return math.lgamma(of + 1) - math.lgamma(chosen + 1) - math.lgamma(of - chosen + 1)
 
 
-def prefers_rotation(
-    general_errors: NDArray[np.float64], rotation_errors: NDArray[np.float64], max_error_rad: float
-) -> bool:
+def prefers_rotation(general_errors: Floats, rotation_errors: Floats, max_error_rad: float) -> bool:
     """True if a rotation alone explains the matches: Torr's GRIC (1998).
 
     ``Σ min(e²/σ², 2 (4 − d)) + n d ln 4 + k ln 4n`` with d = 3, k = 5 for a general motion and
@@ -130,7 +118,7 @@ def prefers_rotation(
     sigma = max(1.4826 * float(np.median(general_errors[fits])), _PRECISION_RAD)
     either = fits | (rotation_errors <= max_error_rad)
 
-    def cost(errors: NDArray[np.float64], dimension: int, freedom: int) -> float:
+    def cost(errors: Floats, dimension: int, freedom: int) -> float:
         count = int(either.sum())
         misfit = np.minimum((errors[either] / sigma) ** 2, 2 * (4 - dimension)).sum()
         return float(misfit + count * dimension * math.log(4) + freedom * math.log(4 * count))

@@ -11,6 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.geometry import lonlat_to_equirect, xyz_to_lonlat
 
+Floats = NDArray[np.float64]
+"""Directions, rotations and other float64 arrays."""
+
 
 @dataclass(frozen=True, eq=False)
 class SphericalKeypoints:
@@ -27,9 +30,9 @@ class SphericalKeypoints:
         images: ``(n,)`` int32, the face each was detected in; 0 for a panorama.
     """
 
-    directions_xyz: NDArray[np.float64]
+    directions_xyz: Floats
     sizes_rad: NDArray[np.float32]
-    orientations_xyz: NDArray[np.float64]
+    orientations_xyz: Floats
     responses: NDArray[np.float32]
     descriptors: NDArray[np.float32]
     images: NDArray[np.int32]
@@ -50,21 +53,19 @@ class SphericalKeypoints:
         """Some of the keypoints, by a mask or by indices."""
         return type(self)(*(values[chosen] for values in self._arrays()))
 
-    def equirect_pixels(self, shape: tuple[int, int]) -> NDArray[np.float64]:
+    def equirect_pixels(self, shape: tuple[int, int]) -> Floats:
         """``(n, 2)`` columns and rows in a panorama ``(H, W)``; pixel centers are integers."""
         return lonlat_to_equirect(xyz_to_lonlat(self.directions_xyz), shape)
 
 
-def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> NDArray[np.float64]:
+def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> Floats:
     """``(...)`` angles between ``(..., 3)`` unit vectors in radians, precise near 0 and π alike."""
     first, second = np.asarray(first_xyz, np.float64), np.asarray(second_xyz, np.float64)
     halves = (np.linalg.norm(first + sign * second, axis=-1) for sign in (-1, 1))
     return np.asarray(2 * np.arctan2(*halves))
 
 
-def equirect_jacobian(
-    directions_xyz: NDArray[np.float64], shape: tuple[int, int]
-) -> NDArray[np.float64]:
+def equirect_jacobian(directions_xyz: Floats, shape: tuple[int, int]) -> Floats:
     """Jacobian of directions by pixel in a panorama, ``∂d/∂(u, v)``.
 
     With east e = (−sin λ, cos λ, 0) and north n: ``∂d/∂u = 2π/W · cos φ · e``,
@@ -87,8 +88,8 @@ def equirect_jacobian(
 
 
 def local_to_sphere(
-    jacobian: NDArray[np.float64], sizes: NDArray[np.floating], angles_rad: NDArray[np.floating]
-) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
+    jacobian: Floats, sizes: NDArray[np.floating], angles_rad: NDArray[np.floating]
+) -> tuple[NDArray[np.float32], Floats]:
     """Sizes and orientations of keypoints, from the image they were detected in to the sphere.
 
     A disc of the image becomes an ellipse on the sphere; its size is the diameter of the disc of

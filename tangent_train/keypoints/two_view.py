@@ -13,7 +13,7 @@ import numpy as np
 
 from tangent_train.errors import of_extra
 from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors, prefers_rotation
-from tangent_train.keypoints.spherical import angles_between
+from tangent_train.keypoints.spherical import Floats, angles_between
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -49,8 +49,8 @@ class TwoView:
     """
 
     inliers: NDArray[np.bool_]
-    rotation: NDArray[np.float64] | None = None
-    translation: NDArray[np.float64] | None = None
+    rotation: Floats | None = None
+    translation: Floats | None = None
 
     @property
     def kind(self) -> Literal["general", "rotation", "none"]:
@@ -84,11 +84,7 @@ class TwoView:
 
 
 def estimate_two_view(
-    left_xyz: NDArray[np.float64],
-    right_xyz: NDArray[np.float64],
-    max_error_deg: float = 1.0,
-    *,
-    seed: int = 0,
+    left_xyz: Floats, right_xyz: Floats, max_error_deg: float = 1.0, *, seed: int = 0
 ) -> TwoView:
     """Find the motion between two panoramas from putative matches, all around the sphere.
 
@@ -128,12 +124,12 @@ def estimate_two_view(
 class _Search:
     """Matches among which a motion is sought."""
 
-    left_xyz: NDArray[np.float64]
-    right_xyz: NDArray[np.float64]
+    left_xyz: Floats
+    right_xyz: Floats
     max_error_rad: float
     seed: int
 
-    def errors(self, motion: Motion) -> NDArray[np.float64]:
+    def errors(self, motion: Motion) -> Floats:
         return motion_errors(self.left_xyz, self.right_xyz, motion)
 
     def cost(self, motion: Motion) -> float:
@@ -225,9 +221,7 @@ def colmap() -> Any:
     return pycolmap
 
 
-def rigid_matrix(
-    rotation: NDArray[np.float64], translation: NDArray[np.float64] | None
-) -> NDArray[np.float64]:
+def rigid_matrix(rotation: Floats, translation: Floats | None) -> Floats:
     """``(3, 4)`` [R | t] in COLMAP's axes of a motion in those of `tangent_train.geometry`."""
     axes = _CAMERA_FROM_PANORAMA
     shift = np.zeros(3) if translation is None else axes @ translation
@@ -251,11 +245,9 @@ def _twins(start: Motion) -> list[Motion]:
     return [Motion(r, sign * t) for r in (rotation, half_turn @ rotation) for sign in (1, -1)]
 
 
-def _rotations(
-    left_xyz: NDArray[np.float64], right_xyz: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _rotations(left_xyz: Floats, right_xyz: Floats) -> Floats:
     """``(..., 3, 3)`` least-squares rotations from left to right (Kabsch)."""
     u, _, vt = np.linalg.svd(np.swapaxes(right_xyz, -1, -2) @ left_xyz)
     u[..., -1] *= np.linalg.det(u @ vt)[..., None]
-    rotations: NDArray[np.float64] = u @ vt
+    rotations: Floats = u @ vt
     return rotations

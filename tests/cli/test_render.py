@@ -21,6 +21,7 @@ from tangent_train.rendering import (
 )
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents
+from tests.running import Patch
 
 _read = partial(read_pixels, indices=True)
 
@@ -164,7 +165,7 @@ def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim:
 
 @pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])
 def test_features_of_another_resolution(
-    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
+    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: Patch
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
     monkeypatch.setattr("datamodules.images.tangent_results._GROUP_BYTES", 200_000)
@@ -246,10 +247,7 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
     said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
     assert "2 of 4 panoramas could not be rendered" in said
     assert "in/b.png" in said
-    assert (
-        "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice as wide"
-        in said
-    )
+    assert "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice" in said
     assert sorted(path.name for path in (tmp_path / "tan").iterdir()) == ["a", "c"]
     (tmp_path / "tan" / "a" / "face_019.png").unlink()
     said = refused(back=tmp_path / "tan", output=tmp_path / "back")
@@ -323,30 +321,28 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
 
 # What is refused.
 
+_IN = {"input": "in", "output": "tan"}
+
 
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
         ({"input": "in"}, "output: found none"),
-        ({"input": "in", "output": "tan", "faces": [80]}, "80"),
-        ({"input": "in", "output": "tan", "format": "gif"}, r"\.gif.*expected .*\.png"),
+        ({**_IN, "faces": [80]}, "80"),
+        ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
-            {"input": "in", "output": "tan", "interpolation": "nearest", "format": "jpg"},
-            "format: found jpg; .* others change pixels",
+            {**_IN, "interpolation": "nearest", "format": "jpg"},
+            "found jpg; .* others change pix",
         ),
         ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
-        ({"input": "in", "output": "tan", "mask": "in/room.png"}, "none without colmap=true"),
+        ({**_IN, "mask": "in/room.png"}, "none without colmap=true"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],
 )
 def test_settings_that_cannot_work(
-    settings: dict[str, Any],
-    message: str,
-    room: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    refused: Refused,
+    settings: dict[str, Any], message: str, room: Path, monkeypatch: Patch, refused: Refused
 ) -> None:
     monkeypatch.chdir(room.parents[1])
     assert re.search(message, refused(**settings), re.DOTALL)
@@ -362,7 +358,7 @@ def test_settings_that_cannot_work(
         (
             {"face_003.png": (16, 16, 3)},
             {},
-            r"003\.png: found uint8 of shape \(16, 16, 3\); expected squares, all alike: 32×32",
+            r"003\.png: found uint8 .*; expected squares, .* 32×",
         ),
         ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),
@@ -375,7 +371,7 @@ def test_results_that_cannot_be_used(
     message: str,
     rendered: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
     refused: Refused,
 ) -> None:
     monkeypatch.chdir(tmp_path)

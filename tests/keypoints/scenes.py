@@ -25,12 +25,7 @@ class Scene(NamedTuple):
 
 
 def two_views(
-    count: int,
-    *,
-    baseline_m: float = 0.5,
-    wrong: int = 0,
-    noise_deg: float = 0.0,
-    seed: int = 0,
+    count: int, *, baseline_m: float = 0.5, wrong: int = 0, noise_deg: float = 0.0, seed: int = 0
 ) -> Scene:
     """Points 1.5 to 5 m around the left camera, in all directions."""
     rng = np.random.default_rng(seed)

@@ -30,11 +30,8 @@ def reference(
 
 @example(1300, 5, 0.8, False, 3)  # more than a block
 @given(
-    st.integers(0, 9),
-    st.integers(0, 9),
-    st.sampled_from([0.5, 0.8, 1.0, 1.5]),
-    st.booleans(),
-    st.integers(0, 2**32 - 1),
+    *(st.integers(0, 9), st.integers(0, 9), st.sampled_from([0.5, 0.8, 1.0, 1.5])),
+    *(st.booleans(), st.integers(0, 2**32 - 1)),
 )
 @settings(max_examples=150, deadline=None)
 def test_matches_are_those_of_the_definition(

@@ -50,11 +50,10 @@ def _train(
     rates = Rates(until)
     task = shape_task(scheduler=scheduler, optimizer=partial(torch.optim.SGD, lr=LR, momentum=0.9))
     made = quiet_trainer(
-        callbacks=[rates, LastCheckpoint(folder)],
+        callbacks=[rates, LastCheckpoint(folder), Scores()],
         enable_checkpointing=True,
-        limit_val_batches=0,
         plugins=[AtomicCheckpointIO()],
-        **trainer,
+        **{"limit_val_batches": 0, **trainer},
     )
     path = folder / "last.ckpt" if resume else None
     with nullcontext() if until is None else pytest.raises(CutError):
@@ -145,3 +144,67 @@ def test_others_continue_for_longer_or_shorter(name: str, epochs: int, tmp_path:
     found = _train(tmp_path, scheduler, max_epochs=4, until=2)
     found += _train(tmp_path, scheduler, resume=True, max_epochs=epochs)
     assert found[::STEPS] == pytest.approx([LR * factor(epoch) for epoch in range(epochs)])
+
+
+@pytest.mark.parametrize("interval", ["epoch", "step"])
+def test_warm_up_and_cosine_have_their_closed_form(interval: Any) -> None:
+    length = {"epoch": 8, "step": 24}
+    schedule = Schedule(partial(warmup_cosine, warmup_share=0.25, total_steps=_NULL), interval)
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=LR)
+    configured = schedule.configure(optimizer, lambda: length, [1], ("val/miou", "max"))
+    total = length[interval]
+    for step in range(total + 1):
+        rise = 0.01 + 0.99 * step / (total / 4)
+        fall = (1 + math.cos(math.pi * (step - total / 4) / (total * 3 / 4))) / 2
+        expected = LR * (rise if step <= total / 4 else fall)
+        assert optimizer.param_groups[0]["lr"] == pytest.approx(expected, abs=1e-9), step
+        optimizer.step()
+        configured["scheduler"].step()
+
+
+class Scores(lightning.Callback):
+    """Logs a made score after every validation; the best is the second one."""
+
+    def on_validation_epoch_end(self, trainer: Any, pl_module: Any) -> None:
+        pl_module.log("val/made", float(trainer.current_epoch == 1))
+
+
+@pytest.mark.parametrize("until", [3, 4, 5])
+def test_a_plateau_is_resumed_exactly(until: int, tmp_path: Path) -> None:
+    plateau: Any = partial(lr_scheduler.ReduceLROnPlateau, mode=_NULL, factor=0.5, patience=1)
+    schedule = Schedule(plateau, monitor="val/made")
+    more: dict[str, Any] = {"limit_val_batches": 1, "max_epochs": 7}
+    whole = _train(tmp_path / "whole", schedule, **more)
+    # Better in epoch 1; patience ends after epoch 3 and again after epoch 5.
+    assert whole[::STEPS] == pytest.approx([LR * f for f in (1, 1, 1, 1, 0.5, 0.5, 0.25)])
+    begun = _train(tmp_path, schedule, until=until, **more)
+    assert begun + _train(tmp_path, schedule, resume=True, **more) == pytest.approx(whole)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"interval": "day"}, r"scheduler\.interval: found day"),
+        ({"frequency": 0}, r"scheduler\.frequency: found 0"),
+        ({"monitor": "val/mio"}, r"scheduler\.monitor: found val/mio after epoch 1; .*val/acc"),
+        ({"interval": "step"}, r"scheduler\.interval: found step; expected epoch"),
+    ],
+)
+def test_impossible_settings_are_refused(
+    settings: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        _train(
+            tmp_path,
+            Schedule(lr_scheduler.ReduceLROnPlateau, **settings),
+            max_epochs=1,
+            limit_val_batches=1,
+        )
+
+
+def test_the_length_of_an_endless_training_is_not_made_up(tmp_path: Path) -> None:
+    endless = Schedule(partial(warmup_cosine, total_steps=_NULL), "step")
+    with pytest.raises(SettingError, match=r"trainer\.max_epochs: found no end"):
+        _train(tmp_path, endless, max_epochs=-1)
+    given = Schedule(partial(warmup_cosine, warmup_share=0.5, total_steps=4), "step")
+    assert _train(tmp_path, given, max_epochs=1)[0] == pytest.approx(0.01 * LR)

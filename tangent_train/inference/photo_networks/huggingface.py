@@ -12,7 +12,7 @@ from torch import Tensor
 
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceNetwork, architecture
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, first_line
 from tangent_train.imports import hide_output, offline
 from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
@@ -114,7 +114,7 @@ def _processor(folder: Path) -> dict[str, Any]:
     except Exception as error:  # whatever a processor raises about its settings
         raise DataError(
             path,
-            found=f"no normalization in {content} ({str(error).partition(chr(10))[0]})",
+            found=f"no normalization in {content} ({first_line(error)})",
             expected=f"settings of {kind.__name__} that multiply three channels",
         ) from error
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
@@ -146,19 +146,19 @@ def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[A
 
 
 def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:
-    own, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
+    path, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
     if shared.is_file():
         inside = json_in(folder, shared.name).get("image_processor")
         if isinstance(inside, dict):
             return shared, inside
-    if not own.is_file():
+    if not path.is_file():
         raise DataError(
             folder,
-            found=f"no {own.name}",
+            found=f"no {path.name}",
             expected="the image processor of the network: its normalization and image size",
             remedy="Copy that file from the model that this one was fine-tuned from.",
         )
-    return own, json_in(folder, own.name)
+    return path, json_in(folder, path.name)
 
 
 def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
@@ -211,7 +211,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
     except Exception as error:  # whatever a tokenizer raises about its files
         raise DataError(
             folder,
-            found=f"an unusable tokenizer ({str(error).partition(chr(10))[0]})",
+            found=f"an unusable tokenizer ({first_line(error)})",
             expected=expected,
         ) from error
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)

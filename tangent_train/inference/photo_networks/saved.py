@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from models.pretrained import read_tensors
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import read_json
 
 _WEIGHTS = "model.safetensors"
@@ -38,11 +38,11 @@ def saved_folder(model: str | None) -> Path:
 
         return Path(snapshot_download(model, allow_patterns=list(_FILES)))
     except Exception as error:  # no connection, no such name, or one must sign in for it
-        first_line = str(error).strip().partition("\n")[0]
         fetch = f"hf download {model} --local-dir {model.rpartition('/')[2] or 'network'}"
         raise DataError(
             model,
-            found=f"no such folder, and no way to fetch it ({type(error).__name__}: {first_line})",
+            found="no such folder, and no way to fetch it "
+            f"({type(error).__name__}: {first_line(error)})",
             expected="a folder, or the name of a model on huggingface.co that you may read",
             remedy=f"On a machine that can, run `{fetch}` (first `hf auth login` if its page asks "
             "you to agree to terms), and set model= to the path of that folder.",

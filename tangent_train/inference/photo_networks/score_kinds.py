@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.scores import plain_scores
-from tangent_train.errors import SettingError, width_height
+from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 
 _MASK_NAMES = 2
@@ -155,7 +155,7 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
         raise SettingError(
             "image_size",
             found=f"{width_height(image.shape[2:])}, which the network does not take "
-            f"({type(error).__name__}: {str(error).partition(chr(10))[0]})",
+            f"({type(error).__name__}: {first_line(error)})",
             expected="the size of its RGB images",
             remedy="Set image_size=[rows,columns]. Networks for other images cannot be imported.",
         ) from error

@@ -7,7 +7,7 @@ from typing import Any
 
 from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.imports import offline
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
 from tangent_train.inference.photo_networks.saved import json_in, saved_folder, tensors_in
@@ -72,7 +72,7 @@ def _of_encoder(config: dict[str, Any]) -> Normalization:
         with offline():  # a file named the encoder
             given = encoders.get_preprocessing_params(name, weights)
     except Exception as error:  # of the library, or because its file was never fetched
-        found = f"none, and none known of {name} ({str(error).partition(chr(10))[0]})"
+        found = f"none, and none known of {name} ({first_line(error)})"
         raise SettingError("normalization", found=found, expected=_NORMALIZATION) from error
     if given["input_space"] != "RGB":
         found = f"none, and {name} takes {given['input_space']}"

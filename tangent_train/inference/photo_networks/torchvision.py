@@ -13,6 +13,7 @@ from datamodules.core.inputs import Normalization
 from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
+from tangent_train.registry import build_from_config
 
 _AUXILIARY = "aux_classifier."
 
@@ -50,10 +51,9 @@ def load(
         "weights": None,
         "weights_backbone": None,
     }
-    builder = models.get_model_builder(model)
-    if "aux_loss" in inspect.signature(builder).parameters:
+    if "aux_loss" in inspect.signature(models.get_model_builder(model)).parameters:
         settings["aux_loss"] = False
-    network = builder(**{name: value for name, value in settings.items() if name != "_target_"})
+    network = build_from_config(settings, "network")
     file = Path(weights)
     tensors = tensors_for(network, file) if is_file else fetch_tensors(chosen)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}

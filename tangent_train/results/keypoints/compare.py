@@ -33,6 +33,7 @@ from tangent_train.keypoints.covisibility import (
     fov_overlap,
     visible_from,
 )
+from tangent_train.keypoints.spherical import Floats
 from tangent_train.rendering import rotate_equirect
 
 if TYPE_CHECKING:
@@ -210,7 +211,7 @@ class Comparer:
     def _figures(
         self,
         found: MatchedPair,
-        rotation: NDArray[np.float64],
+        rotation: Floats,
         left: DepthView | None,
         right: DepthView | None,
     ) -> Row:
@@ -243,7 +244,7 @@ _TRUTH = (
 
 def _truth(
     found: MatchedPair,
-    rotation: NDArray[np.float64],
+    rotation: Floats,
     left: DepthView,
     right: DepthView,
     max_error_deg: float,

@@ -80,13 +80,6 @@ def test_a_network_for_images_of_one_size(tmp_path: Path) -> None:
     trained = networks.imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
     network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
-    import_network(network, tmp_path / "large.ckpt", level=8, base_level=0)
-    large = load_trained(tmp_path / "large.ckpt")  # tangent images are divided
-    assert (large.fixed_size, large.image_size) == ((64, 64), (256, 256))
-    images = torch.randn(1, 3, 64, 128)
-    with torch.no_grad():
-        parts = [trained.network(images[..., :64]), trained.network(images[..., 64:])]
-        torch.testing.assert_close(large.network(images), torch.cat(parts, dim=-1))
     with pytest.raises(SettingError, match=r"image_size: found 64 × 65 .*, which the network"):
         import_network(network, tmp_path / "large.ckpt", image_size=(65, 64))
 
@@ -186,8 +179,8 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
         ("config.json", {"id2label": {"0": "wall", "1": "a\x1b[2J"}}, "name of every score"),
         (
             "config.json",
-            {"id2label": {"0": "wall", "1": "floor"}},
-            r"classifier.weight of shape \(6, 16, 1, 1\) instead of \(2,",
+            {"id2label": {"0": "a", "1": "b"}},
+            r"shape \(6, 16, 1, 1\) instead of \(2",
         ),
         ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
         ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
@@ -281,9 +274,8 @@ def test_settings_that_transformers_does_not_declare(
             with watched(tmp_path / "forbidden") as happened:
                 path.write_text(json.dumps(_with(honest, place, attack)))
                 networks.imported(tmp_path / "net")
-                torch.save(
-                    _with(content, ("config", "network", "config", *place), attack), checkpoint
-                )
+                inner = ("config", "network", "config", *place)
+                torch.save(_with(content, inner, attack), checkpoint)
                 with pytest.raises(DataError, match=r"imported\.ckpt: found .*network\.config"):
                     load_trained(checkpoint)
             assert happened == [], attack
@@ -303,10 +295,7 @@ def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
         {"model_type": "timm_backbone", "backbone": f"hf-hub:{CANARY}/x"},
         {"model_type": "timm_backbone", "backbone": f"local-dir:{CANARY}"},
         # A class whose own network inside is not of the kind that it says.
-        {
-            "model_type": "sam3",
-            "vision_config": {"model_type": "timm_backbone", "backbone": "gpt2"},
-        },
+        {"model_type": "sam3", "vision_config": _GPT2},
         {"model_type": "dpt", "backbone": "gpt2", "use_timm_backbone": False},
         {"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}--x.Config"}},
         {"backbone": "gpt2"},

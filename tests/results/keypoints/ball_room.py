@@ -30,9 +30,5 @@ def ball_pair(name: str = "ball", shape: tuple[int, int] = SHAPE) -> PanoramaPai
     rng = np.random.default_rng(1)
     left = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.1, 0.2, -0.1])
     right = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.4, -0.2, -0.1])
-    return PanoramaPair(
-        name,
-        None,
-        ball_panorama(f"{name}_l", left, shape),
-        ball_panorama(f"{name}_r", right, shape),
-    )
+    sides = (ball_panorama(f"{name}_l", left, shape), ball_panorama(f"{name}_r", right, shape))
+    return PanoramaPair(name, None, *sides)

@@ -1,4 +1,4 @@
-"""Networks that a config describes, with weights from a file."""
+"""Networks of the user's own files: ONNX, and a config with a state dict."""
 
 from __future__ import annotations
 
@@ -7,20 +7,46 @@ from pathlib import Path
 from typing import Any
 
 from datamodules.core.inputs import Normalization
+from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors, tensors_for
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
-from tangent_train.inference.photo_networks.network import PhotoNetwork, class_names_in
+from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.registry import build_from_config
 
 
-def load(
+def load_onnx(file: Path | None, classes: Path | None, normalization: Any) -> PhotoNetwork:
+    """Load the network of an ONNX file, see `OnnxNetwork`.
+
+    Args:
+        file: ONNX file.
+        classes: JSON file of the class names.
+        normalization: See `Normalization.of`.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing.
+    """
+    if file is None:
+        raise SettingError("file", found="none", expected="an ONNX file")
+    network = OnnxNetwork(file)
+    return PhotoNetwork(
+        network=network,
+        settings=None,
+        score_names=class_names_in(classes),
+        normalization=Normalization.of(normalization, 3),
+        image_size=network.image_size or USUAL_SIZE,
+        fixed_size=network.image_size is not None,
+    )
+
+
+def load_config(
     settings: Mapping[str, Any],
     weights: str | Path | None,
     classes: Path | None,
     normalization: Any,
 ) -> PhotoNetwork:
-    """A network of ``configs/network``.
+    """Load a network of ``configs/network``.
 
     Args:
         settings: Section of the network.
