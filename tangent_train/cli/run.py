@@ -172,8 +172,8 @@ class Run:
 
     @rank_zero_only
     def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
-        own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
-        name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
+        is_inside = checkpoint.is_relative_to(self.folder)  # the same wherever the folder is
+        name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
