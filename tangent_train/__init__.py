@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tangent_train.imports import import_own_packages
+
 if TYPE_CHECKING:
     from tangent_train.geometry import TangentGrid
     from tangent_train.inference.network import load
@@ -26,6 +28,8 @@ __all__ = [
     "tangent_to_equirect",
     "tangent_to_labels",
 ]
+
+import_own_packages()
 
 _HOMES = {"TangentGrid": "geometry", "load": "inference.network"}
 

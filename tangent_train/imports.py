@@ -6,11 +6,38 @@ import io
 import logging
 import multiprocessing  # noqa: F401 - notes the working directory, where its processes start
 import os
+import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
+
+
+def import_own_packages() -> None:
+    """Import our ``models`` and ``datamodules``, whatever else on the path is called so.
+
+    Raises:
+        ImportError: Another module of this name is imported already.
+    """
+    root = str(Path(__file__).parents[1])
+    for name in ("datamodules", "models"):
+        other = None if name in sys.modules else find_spec(name)
+        sys.path.insert(0, root)
+        own = import_module(name)
+        sys.path.remove(root)
+        if own.__file__ != str(Path(root, name, "__init__.py")):
+            raise ImportError(
+                f"{own.__file__} is imported, but tangent-train has a package of this name. "
+                "Import tangent_train first, or rename the other one."
+            )
+        if other is not None and other.origin != own.__file__:
+            sys.stderr.write(
+                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
+                "folder to use what is in it in a config.\n"
+            )
 
 
 @contextmanager

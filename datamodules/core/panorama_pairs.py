@@ -28,7 +28,7 @@ class PairedPanorama(NamedTuple):
         name: Unique in the data set: the same panorama in another pair has the same name.
         rgb: ``(H, W, 3)`` uint8.
         file: The image it was read from.
-        distance_m: ``(H, W)`` float32 metres from the centre, NaN where missing; or None.
+        distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
     """
 

@@ -28,9 +28,9 @@ def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> P
 
     Args:
         masks: Where panoramas count.
-        panorama: Its colours and depth stay.
+        panorama: Panorama, whose colors and depth stay.
         index: Ignored.
-        files: Of the panorama.
+        files: Files of the panorama.
     """
     del index
     counts = masks.read(files.name, whole_area(files.rgb, panorama.labels.shape))
@@ -58,7 +58,7 @@ class EstimatedUp:
 
     Args:
         max_tilt_deg: Maximum tilt, see `estimate_up`.
-        rgb: Reads the colours of a file.
+        rgb: Reads the colors of a file.
         rotated: Rotates the panoramas, if they are.
         judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
             its process.
@@ -109,7 +109,7 @@ class RotatedPanoramas:
         rotation: Tilt in degrees about a random horizontal axis, after a random rotation about the
             vertical; or `so3`, uniform over all rotations.
         seed: Seed of the rotations.
-        known: Whether the up direction is known, as from a camera with a gravity sensor.
+        known: True if the up direction is known, e.g. from a camera with a gravity sensor.
     """
 
     def __init__(self, rotation: float | Literal["so3"], seed: int, *, known: bool = False) -> None:

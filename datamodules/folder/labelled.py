@@ -40,8 +40,8 @@ class LabelledFolder(ImageDataModule):
 
     Args:
         test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
-            `validation_fraction` is that of the training scenes, likewise.
-        split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
+            `validation_fraction` is a share of the training scenes.
+        split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
         depth_units_per_m: Units in a meter of depth files of whole numbers, 1000 for millimeters.
 

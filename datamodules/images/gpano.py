@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -125,8 +126,9 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
         _number(path, name, tags[name], 1e9) for name in _SIZES
     )
     inside = 0 < width <= full_width and height > 0 and top >= 0 and top + height <= full_height
+    agree = partial(math.isclose, rel_tol=_TOLERANCE)
     if not (
-        inside and _agree(full_width, 2 * full_height) and _agree(size[1] / width, size[0] / height)
+        inside and agree(full_width, 2 * full_height) and agree(size[1] / width, size[0] / height)
     ):
         raise DataError(
             path,
@@ -166,7 +168,7 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
         )
     width = east - west if east > west else east - west + 360
     pixels_deg = width / size[1], (north - south) / size[0]
-    if not _agree(*pixels_deg):
+    if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
         raise SettingError(
             "crop",
             found=f"{list(crop)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
@@ -257,7 +259,3 @@ def _area(
     height = min(height, full_height)
     top = min(round(down[0] * full_height), full_height - height)
     return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
-
-
-def _agree(one: float, other: float) -> bool:
-    return abs(one - other) <= _TOLERANCE * max(one, other)

@@ -62,13 +62,13 @@ class SynthiaSequences(ImageDataModule):
     short for streets.
 
     Args:
-        train_sequences: As ``01``.
-        test_sequences: As ``04``.
+        train_sequences: Sequences for training, e.g. ``01``.
+        test_sequences: Sequences for test, e.g. ``04``.
         frames: Approximate number of frames per sequence, see `choose_frames`.
 
     Attributes:
-        formats: Of the files.
-        remedy: Where there are no images.
+        formats: Formats of the files.
+        remedy: Remedy if there are no images.
 
     Raises:
         SettingError: A setting is invalid.
@@ -96,7 +96,7 @@ class SynthiaSequences(ImageDataModule):
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Those of training, then those of the test."""
+        """Sequences for training, then those for test."""
         return (*self.train_sequences, *self.test_sequences)
 
     @abstractmethod
@@ -135,7 +135,7 @@ def divide(
     sequence.
 
     Args:
-        frames: Of every sequence, in order: the images of each frame.
+        frames: Images of each frame, by sequence and in order.
         test: Sequences for the test; all others are for training.
         validation_fraction: Share of each training sequence for validation: at least one frame,
             never all, so none of a single one; 0 for no validation.

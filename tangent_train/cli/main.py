@@ -15,7 +15,6 @@ import threading
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
 from io import StringIO, TextIOWrapper
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
     _prepare_process()
-    _import_own_packages()
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
@@ -70,9 +68,9 @@ def _main(command: str) -> None:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
             if {"--help", "-h"}.intersection(arguments):
-                with suppress(SystemExit), redirect_stdout(StringIO()) as told:
+                with suppress(SystemExit), redirect_stdout(StringIO()) as printed:
                     run()
-                sys.stdout.write(annotate(told.getvalue(), folder, command))
+                sys.stdout.write(annotate(printed.getvalue(), folder, command))
             else:
                 run()
         except (HydraException, OmegaConfBaseException) as error:
@@ -90,21 +88,6 @@ def _prepare_process() -> None:
     # Of all processes that are started, whatever starts them: the working directory is not on their
     # path, as it is not on that of the console scripts.
     os.environ["PYTHONSAFEPATH"] = "1"
-
-
-def _import_own_packages() -> None:
-    """Import our ``models`` and ``datamodules``, whatever else on PYTHONPATH is called so."""
-    root = str(Path(__file__).parents[2])
-    for name in ("datamodules", "models"):
-        other = find_spec(name)
-        sys.path.insert(0, root)
-        own = import_module(name)
-        sys.path.remove(root)
-        if other is not None and other.origin != own.__file__:
-            sys.stderr.write(
-                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
-                "folder to use what is in it in a config.\n"
-            )
 
 
 train = partial(_main, "train")
@@ -215,7 +198,7 @@ def _errors_once() -> Iterator[None]:
 
 
 def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
-    """Exit as a shell says it; commands have said how to go on."""
+    """Exit with the status of a shell; the command has printed how to continue."""
     from tangent_train.cli.processes import SigtermError
 
     received = signal.SIGTERM if isinstance(interrupt, SigtermError) else signal.SIGINT

@@ -49,6 +49,16 @@ class SegmentationScores(NamedTuple):
     accuracy: NDArray[np.float64]
     share: NDArray[np.float64]
 
+    @property
+    def means(self) -> dict[str, float]:
+        """Scores over all classes by name."""
+        return {"miou": self.miou, "macc": self.macc}
+
+    @property
+    def of_classes(self) -> dict[str, NDArray[np.float64]]:
+        """Scores of the classes by name."""
+        return {"iou": self.iou, "accuracy": self.accuracy}
+
 
 def segmentation_scores(
     confusion: ArrayLike, absent_class: AbsentClass = "skip"

@@ -76,13 +76,6 @@ class Row:
         """Its latitude bands."""
         return tuple(dict.fromkeys(band for record in self.records for band in record.bands))
 
-    @property
-    def band_scores(self) -> tuple[str, ...]:
-        """Names of the scores of its latitude bands, in the order of the tables."""
-        record = self.records[0]
-        bands = record.latitude_bands
-        return tuple(name for name in record.headings if bands and name in bands[0])
-
     def of_fold(self, fold: int | None) -> Row:
         """Its part of a fold, with its partner's."""
         records = tuple(record for record in self.records if record.fold == fold)

@@ -10,10 +10,10 @@ import pytest
 
 from tangent_train.cli.check import check
 from tests.datamodules.folder.folder_format import save, write_classes
-from tests.running import composed_settings
+from tests.running import Capture, composed_settings
 
 
-def _checked(root: Path, capsys: pytest.CaptureFixture[str]) -> tuple[str, str]:
+def _checked(root: Path, capsys: Capture) -> tuple[str, str]:
     settings = ["data=folder", "level=4", f"data.root='{root}'", "data.validation_fraction=0"]
     check(composed_settings("check", *settings))
     return capsys.readouterr()
@@ -31,9 +31,7 @@ def root(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_shares_and_classes_that_do_not_occur(
-    root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> None:
     write_classes(root, [None, "door", "wall", "floor", "sofa"])
     out, err = _checked(root, capsys)
     assert out == "", "problems alone"
@@ -54,7 +52,7 @@ def test_shares_and_classes_that_do_not_occur(
     assert "0 problems and 2 warnings; 3 panoramas of" in err
 
 
-def test_classes_of_other_labels(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
     """By one off, almost everything is unknown."""
     classes: dict[str, Any] = {"door": 11, "wall": 12, "floor": 13, "sofa": 4}
     write_classes(root, classes)
@@ -65,7 +63,7 @@ def test_classes_of_other_labels(root: Path, capsys: pytest.CaptureFixture[str])
     assert "Warning: 100.0 % of the pixels for test are unknown." in err
 
 
-def test_nothing_is_wrong(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:
     write_classes(root, [None, None, "wall", "floor", None])
     out, err = _checked(root, capsys)
     assert out == f"Nothing is wrong; 3 panoramas of {root} checked.\n"

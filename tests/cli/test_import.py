@@ -21,6 +21,7 @@ from tangent_train.inference.photo_networks.importing import representation_of
 from tangent_train.inference.representations import PanoramaViews
 from tests.cli.tiny_runs import Run
 from tests.models.onnx_files import write_linear
+from tests.running import Capture, Patch
 from tests.tasks.small_networks import with_statistics
 
 NAMES = ["background", "dark", "green", "bright"]
@@ -41,9 +42,7 @@ OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalizati
 
 
 @pytest.mark.parametrize("wins", [True, False])
-def test_an_onnx_file_labels_panoramas(
-    wins: bool, here: Path, run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys: Capture) -> None:
     """Blocks of one colour: the labels are those of every pixel's own scores."""
     unknown = ("unknown_classes=[background]", f"unknown_wins={wins}".lower())
     run("import", *OF_ONNX, *unknown, "fov=90", "output=ours.onnx")
@@ -66,7 +65,7 @@ def test_an_onnx_file_labels_panoramas(
 
 @pytest.mark.parametrize("size", [(48, 96), (96, 48), (32, 64), (20, 50)])
 def test_a_file_for_images_that_are_not_square(
-    size: tuple[int, int], here: Path, run: Run, capsys: pytest.CaptureFixture[str]
+    size: tuple[int, int], here: Path, run: Run, capsys: Capture
 ) -> None:
     """Larger images are divided into tiles: labels are those of every pixel's own scores."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
@@ -99,9 +98,7 @@ def test_any_network_is_given_one_size_if_asked(here: Path, run: Run) -> None:
             run("import", *given, wrong, "output=other.ckpt")
 
 
-def test_published_weights_without_internet(
-    here: Path, run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: Patch) -> None:
     """The remedy works: the file, fetched elsewhere, where torch looks for it."""
     name = "lraspp_mobilenet_v3_large"
     monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
@@ -140,9 +137,7 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: 
         torch.testing.assert_close(again.network(images), expected)
 
 
-def test_a_network_of_ones_own_is_imported(
-    here: Path, run: Run, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_network_of_ones_own_is_imported(here: Path, run: Run, capsys: Capture) -> None:
     (here / "own" / "network").mkdir(parents=True)
     (here / "own" / "network" / "mine.yaml").write_text(
         "_target_: tests.tasks.small_networks.with_statistics\nnetwork:\n  _target_: models.UNet\n"
@@ -160,7 +155,7 @@ def test_a_network_of_ones_own_is_imported(
 
 
 def test_torchvision_gives_the_scores_of_its_own_transform(
-    here: Path, run: Run, capsys: pytest.CaptureFixture[str]
+    here: Path, run: Run, capsys: Capture
 ) -> None:
     torch.manual_seed(0)
     name = "lraspp_mobilenet_v3_large"

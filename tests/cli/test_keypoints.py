@@ -17,6 +17,7 @@ import pytest
 from tangent_train.results.keypoints.compare import Comparer, Comparison
 from tests.cli.tiny_runs import Run, results
 from tests.results.keypoints.ball_room import ball_pair
+from tests.running import Capture, Patch
 
 pycolmap = pytest.importorskip("pycolmap")
 
@@ -43,9 +44,7 @@ def pairs_in(folder: Path) -> list[str]:
     return list(dict.fromkeys(row["pair"] for row in results(folder)["rows"]))
 
 
-def test_two_panoramas(
-    run: Run, panoramas: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_panoramas(run: Run, panoramas: Path, tmp_path: Path, capsys: Capture) -> None:
     pair = (f"left={panoramas}/a.png", f"right={panoramas}/b.png")
     run(*pair, "base_level=[0]", "level=5", "output=out (1)")
     output = tmp_path / "out (1)"
@@ -75,11 +74,7 @@ def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
 
 
 def test_an_interrupted_run_goes_on(
-    run: Run,
-    panoramas: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    run: Run, panoramas: Path, tmp_path: Path, monkeypatch: Patch, capsys: Capture
 ) -> None:
     arguments = (f"input={panoramas}", "pairing=all", *SMALL, "output=out")
     true_compare = Comparer.compare
@@ -110,7 +105,7 @@ def test_an_interrupted_run_goes_on(
 
 
 def test_a_broken_pair_is_named_and_the_others_are_compared(
-    run: Run, tmp_path: Path, panoramas: Path, capsys: pytest.CaptureFixture[str]
+    run: Run, tmp_path: Path, panoramas: Path, capsys: Capture
 ) -> None:
     (tmp_path / "in" / "c").mkdir(parents=True)
     for name in ("a.png", "b.png"):
@@ -154,9 +149,7 @@ def test_settings_that_cannot_work_are_named(
     assert not list(tmp_path.iterdir())
 
 
-def test_pycolmap_is_missed_before_any_work(
-    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pycolmap_is_missed_before_any_work(run: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     (tmp_path / "in").mkdir()
     with pytest.raises(SystemExit, match=re.escape("tangent-train[keypoints]")):

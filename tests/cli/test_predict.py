@@ -26,11 +26,10 @@ from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import PERSPECTIVE, sphere, write_checkpoint
 from tests.rendering.drawn_room import draw_room
+from tests.running import Capture, Patch
 
 
-def test_a_folder_of_panoramas(
-    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     """Names that command lines and shells dislike, several formats and sizes, broken files."""
     folder = tmp_path / "my, panoramas (2)"
     output = folder / "out='1'"
@@ -90,10 +89,7 @@ def test_earlier_results_stay_and_are_not_labelled_again(tmp_path: Path, predict
 
 
 def test_an_interruption_keeps_what_is_done(
-    tmp_path: Path,
-    predict: Predict,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, predict: Predict, monkeypatch: Patch, capsys: Capture
 ) -> None:
     for name in ("a", "b", "c"):
         write_pixels(tmp_path / "in" / f"{name}.png", sphere(16))
@@ -125,7 +121,7 @@ def test_an_interruption_keeps_what_is_done(
 
 
 def test_a_prediction_killed_between_any_two_files_is_continued(
-    tmp_path: Path, predict: Predict, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, predict: Predict, monkeypatch: Patch
 ) -> None:
     for name in ("a", "b"):
         write_pixels(tmp_path / "in" / f"{name}.png", sphere(16))
@@ -192,7 +188,7 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(tmp_path: Path, predict: 
     assert not (tmp_path / "p" / "color").exists(), "written only if wanted"
 
 
-def test_photos(tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]) -> None:
+def test_photos(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     checkpoint = write_checkpoint(tmp_path / "photos.ckpt", PERSPECTIVE)
     write_pixels(tmp_path / "in" / "a.png", sphere(64)[10:40, 20:70])
     settings = {"checkpoint": checkpoint, "projection": "perspective"}
@@ -205,7 +201,7 @@ def test_photos(tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[
 
 
 def test_the_network_judges_which_way_is_up(
-    tmp_path: Path, predict: Predict, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, predict: Predict, monkeypatch: Patch
 ) -> None:
     even = np.full(6, 1 / 6)
     monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)

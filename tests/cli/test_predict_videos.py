@@ -18,6 +18,7 @@ from datamodules.images.videos import read_frames
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import hide_start, read_png
 from tests.inference.trained import CLASS_NAMES, sphere
+from tests.running import Capture, Patch
 
 av: Any = pytest.importorskip("av")
 
@@ -91,9 +92,7 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
 
 
-def test_every_third_frame(
-    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_every_third_frame(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     """With the numbers and times that they have in the video."""
     video = _write_video(tmp_path / "in" / "walk.mp4")
     cv2.imwrite(str(tmp_path / "in" / "a.png"), sphere(32))
@@ -123,7 +122,7 @@ def test_every_third_frame(
 
 
 def test_hidden_frames_are_neither_counted_nor_shown(
-    tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, predict: Predict, capsys: Capture
 ) -> None:
     video = _write_video(tmp_path / "in" / "walk.mp4")
     hide_start(video, 4 / 16)  # the fourth frame's time
@@ -135,10 +134,7 @@ def test_hidden_frames_are_neither_counted_nor_shown(
 
 
 def test_an_interrupted_video_is_resumed(
-    tmp_path: Path,
-    predict: Predict,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path, predict: Predict, monkeypatch: Patch, capsys: Capture
 ) -> None:
     video = _write_video(tmp_path / "in" / "walk.mp4")
 
@@ -178,10 +174,7 @@ def _without_pictures(video: Path) -> bytes:
 
 
 def test_videos_that_cannot_be_used(
-    tmp_path: Path,
-    predict: Predict,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, predict: Predict, capsys: Capture, monkeypatch: Patch
 ) -> None:
     """Each is named once, and the others are labelled."""
     folder = tmp_path / "in"

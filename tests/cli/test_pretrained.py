@@ -20,7 +20,7 @@ from tangent_train.inference.export import export_network
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.registry import build_from_config
 from tests.cli.tiny_runs import SETTINGS, Run, results
-from tests.running import composed, composed_settings
+from tests.running import Capture, Patch, composed, composed_settings
 from tests.tasks.small_networks import with_statistics
 
 IMAGENET = {"mean": [0.485, 0.456, 0.406], "std": [0.229, 0.224, 0.225]}
@@ -45,7 +45,7 @@ def _write_imported(path: Path, classes: int, **stated: Any) -> Path:
 
 
 def test_a_network_that_returns_probabilities_is_not_trained(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     path = _write_imported(tmp_path / "net.ckpt", 21, score_kind="probabilities")
     with pytest.raises(DataError, match=r"returns probabilities; expected scores before a softmax"):
@@ -59,7 +59,7 @@ def imported(tmp_path: Path) -> Path:
     return _write_imported(tmp_path / "net.ckpt", 21)
 
 
-def _begun(monkeypatch: pytest.MonkeyPatch, path: Path, *overrides: str) -> tuple[Any, Any]:
+def _begun(monkeypatch: Patch, path: Path, *overrides: str) -> tuple[Any, Any]:
     """What such a command line begins with: settings, and where they come from."""
     config = composed("train", "level=5", *overrides, return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
@@ -83,8 +83,8 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
     widths: list[int],
     imported: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    monkeypatch: Patch,
+    capsys: Capture,
 ) -> None:
     export_network(load_trained(imported), tmp_path / "net.safetensors")
     for path in (imported, tmp_path / "net.safetensors"):
@@ -102,9 +102,7 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
         assert task(torch.zeros(1, 3, 32, 32)).shape == (1, 13, 32, 32)
 
 
-def test_depth_is_added_to_a_network_for_photos(
-    imported: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_depth_is_added_to_a_network_for_photos(imported: Path, monkeypatch: Patch) -> None:
     settings, _ = _begun(monkeypatch, imported)
     assert settings["network"] == UNET | {"in_channels": None, "num_classes": None}
     mean, std = RGBD_NORMALIZATION.mean[3], RGBD_NORMALIZATION.std[3]
@@ -112,9 +110,7 @@ def test_depth_is_added_to_a_network_for_photos(
     assert settings["data"]["normalization"] == expected
 
 
-def test_a_network_that_holds_the_file_s_is_kept(
-    imported: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_network_that_holds_the_file_s_is_kept(imported: Path, monkeypatch: Patch) -> None:
     """As an experiment with cross-image context that starts from a network without."""
     config = composed("train", "level=5", return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
@@ -125,7 +121,7 @@ def test_a_network_that_holds_the_file_s_is_kept(
 
 
 def test_files_that_do_not_describe_their_network_change_nothing(
-    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    imported: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     tensors = torch.load(imported, weights_only=True)["state_dict"]
     torch.save(tensors, tmp_path / "state.pt")
@@ -138,7 +134,7 @@ def test_files_that_do_not_describe_their_network_change_nothing(
 
 
 def test_classes_of_files_are_called_only_where_they_are_known(
-    imported: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    imported: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     content = torch.load(imported, weights_only=True)
     content["config"]["network"] = {"_target_": "torch.nn.Flatten"}
@@ -154,7 +150,7 @@ def test_classes_of_files_are_called_only_where_they_are_known(
 
 
 def test_fine_tuning_leaves_a_run_of_its_own(
-    tmp_path: Path, rooms: str, run: Run, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, rooms: str, run: Run, capsys: Capture
 ) -> None:
     """Here with the data's number of classes, but of other names."""
     path = _write_imported(tmp_path / "net.ckpt", 13)

@@ -21,6 +21,7 @@ from tangent_train.rendering import (
 )
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents
+from tests.running import Patch
 
 _read = partial(read_pixels, indices=True)
 
@@ -164,7 +165,7 @@ def test_z_depth_of_floats_becomes_distance(rendered: Path, tmp_path: Path, dim:
 
 @pytest.mark.parametrize(("dim", "blend"), [(32, "nearest"), (16, "feather")])
 def test_features_of_another_resolution(
-    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: pytest.MonkeyPatch
+    rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: Patch
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
     monkeypatch.setattr("datamodules.images.tangent_results._GROUP_BYTES", 200_000)
@@ -341,11 +342,7 @@ _IN = {"input": "in", "output": "tan"}
     ],
 )
 def test_settings_that_cannot_work(
-    settings: dict[str, Any],
-    message: str,
-    room: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    refused: Refused,
+    settings: dict[str, Any], message: str, room: Path, monkeypatch: Patch, refused: Refused
 ) -> None:
     monkeypatch.chdir(room.parents[1])
     assert re.search(message, refused(**settings), re.DOTALL)
@@ -363,7 +360,7 @@ def test_settings_that_cannot_work(
             {},
             r"003\.png: found uint8 .*; expected squares, .* 32×",
         ),
-        ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
+        ({}, {"kind": "labels"}, "expected labels.*Choose kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),
         ({}, {"output": "folder"}, r"expected a name ending in \.png"),
     ],
@@ -374,7 +371,7 @@ def test_results_that_cannot_be_used(
     message: str,
     rendered: Path,
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    monkeypatch: Patch,
     refused: Refused,
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -14,6 +14,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.results import report
 from tests.cli.pretended_runs import HERE, OF_SEED_0, PretendedRuns, run_transfer
 from tests.inference.trained import write_checkpoint
+from tests.running import Capture, Patch
 
 STAGES = ["P", "S", "S-erp", "S-cubemap", "P-FT-1", "S-FT-1"]
 REFUSED = (DataError, SettingError)
@@ -21,7 +22,7 @@ SHORT = ("compare=[]", "fine_tuning.epochs=[]")
 
 
 @pytest.fixture
-def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
+def runs(monkeypatch: Patch, tmp_path: Path) -> PretendedRuns:
     """In place of the stages of a transfer, in an empty folder."""
     pretended = PretendedRuns()
     monkeypatch.chdir(tmp_path)
@@ -33,7 +34,7 @@ def runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> PretendedRuns:
 
 
 def test_all_stages_run_in_order_and_the_tables_are_written(
-    runs: PretendedRuns, capsys: pytest.CaptureFixture[str]
+    runs: PretendedRuns, capsys: Capture
 ) -> None:
     run_transfer()
     trained = ("P", "P-FT-1", "S-FT-1")
@@ -56,9 +57,7 @@ def test_all_stages_run_in_order_and_the_tables_are_written(
     assert "| P | SynthRoomsPerspective | photos | 50.0 | – | 50.0 | – |" in table
 
 
-def test_finished_stages_are_not_run_again(
-    runs: PretendedRuns, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_finished_stages_are_not_run_again(runs: PretendedRuns, capsys: Capture) -> None:
     run_transfer(*SHORT)
     runs.started.clear()
     capsys.readouterr()
@@ -75,7 +74,7 @@ def test_finished_stages_are_not_run_again(
 
 
 def test_a_failing_stage_leaves_the_others_and_the_command_goes_on(
-    runs: PretendedRuns, capsys: pytest.CaptureFixture[str]
+    runs: PretendedRuns, capsys: Capture
 ) -> None:
     runs.failing = "P-FT-1"
     with pytest.raises(SystemExit) as stopped:

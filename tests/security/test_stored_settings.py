@@ -22,6 +22,7 @@ from tangent_train.cli.run import build
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, build_from_config
 from tests.cli.tiny_runs import results, run_command
+from tests.running import Patch
 from tests.security.honest import SETTINGS, settled, with_config
 from tests.security.watch import CANARY, watched
 
@@ -79,7 +80,7 @@ def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
 
 
 def test_names_of_options_are_no_paths(
-    content: dict[str, Any], forbidden: Path, monkeypatch: pytest.MonkeyPatch
+    content: dict[str, Any], forbidden: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(forbidden.parent)
     (forbidden / "data").mkdir()
@@ -117,7 +118,7 @@ def test_where_the_best_epoch_is_does_not_come_out_of_a_file(name: str, tmp_path
 
 
 def test_what_cannot_be_resumed_is_said_in_a_line(
-    run: Path, content: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    run: Path, content: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(run.parent)
     theirs = tmp_path / "theirs"
@@ -159,7 +160,7 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
 
 @pytest.mark.parametrize("override", ["+network.inner={a.b:1}", "name='a\x1b[2J'"])
 def test_what_no_reader_takes_is_not_trained(
-    override: str, run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    override: str, run: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """A network of one's own takes any settings; its checkpoints must be readable."""
     monkeypatch.chdir(run.parent)
@@ -216,11 +217,7 @@ def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_pa
 
 @pytest.mark.parametrize("section", ["optimizer", "scheduler"])
 def test_an_evaluation_needs_no_trust_for_what_only_trains(
-    section: str,
-    run: Path,
-    content: dict[str, Any],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    section: str, run: Path, content: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(run.parent)
     named = {section: {"_target_": _FIRE, "_partial_": True}}

@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import pytest
-
 from tangent_train.imports import elsewhere, is_private
 from tangent_train.rendering.compiled import cache_folder
-from tests.running import run_python
+from tests.running import Patch, run_python
 
 
 def test_the_working_directory_is_kept_and_on_no_path_after_imports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("LD_LIBRARY_PATH", "/libraries")
@@ -24,9 +22,7 @@ def test_the_working_directory_is_kept_and_on_no_path_after_imports(
     assert os.environ["LD_LIBRARY_PATH"] == "/libraries"
 
 
-def test_a_cache_is_used_if_only_its_owner_can_open_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_cache_is_used_if_only_its_owner_can_open_it(tmp_path: Path, monkeypatch: Patch) -> None:
     for mode, expected in ((0o750, False), (0o702, False), (0o700, True)):
         tmp_path.chmod(mode)
         assert is_private(tmp_path) == expected
@@ -48,7 +44,7 @@ print(compiled.cache_folder(), {loop.stats.cache_path for loop in loops})
 
 
 def test_loops_are_compiled_where_no_folder_can_be_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: Patch
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "cache"))
@@ -56,7 +52,7 @@ def test_loops_are_compiled_where_no_folder_can_be_written(
     assert done.stdout.split("\n")[:2] == ["{1}", "None {None}"], done.stderr
 
 
-def test_the_cache_is_a_private_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_is_a_private_folder(tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     folder = cache_folder()
     assert folder is not None
