@@ -203,6 +203,7 @@ class SegmentationTask(Task):
         images: Float[Tensor, "images channels height width"],
         shape: tuple[int, ...],
         rotation: NDArray[np.float64] | None = None,
+        target: Tensor | None = None,
     ) -> Integer[Tensor, ...]:
         """Class index of every pixel of one panorama, or of the crops of a photo.
 
@@ -211,20 +212,31 @@ class SegmentationTask(Task):
             shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
                 crops.
             rotation: Rotation of the representation.
+            target: The ground truth, to add the loss of the views to the validation loss.
 
         Returns:
             Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
         if len(shape) > 2:  # each crop by itself
-            parts = view_scores(self, images.__getitem__, len(images), self.images_per_forward)
-            best = torch.cat([scores.argmax(dim=1) for _, scores in parts])
+            best = images.new_empty(shape, dtype=torch.int64)
+            for part, scores in view_scores(
+                self, images.__getitem__, len(images), self.images_per_forward
+            ):
+                best[part] = scores.argmax(dim=1)
+                if target is not None:
+                    self._add_loss_of(scores, target[part])
         else:
-            best = self._mosaic(images, (shape[0], shape[1]), rotation).labels().long()
+            mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target)
+            best = mosaic.labels().long()
             best = best.to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
     def _mosaic(
-        self, images: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None
+        self,
+        images: Tensor,
+        shape: tuple[int, int],
+        rotation: NDArray[np.float64] | None,
+        target: Tensor | None,
     ) -> ScoreMosaic:
         upright: Any = self.representation
         seen = upright if rotation is None else upright.with_rotation(rotation)
@@ -234,7 +246,23 @@ class SegmentationTask(Task):
         rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
         count, several = self._num_scores, len(sets) > 1
         mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
-        return fill(mosaic, self, zip(sets, of_sets, rays, strict=True), self.images_per_forward)
+        given = zip(sets, of_sets, rays, strict=True)
+        if target is None:
+            return fill(mosaic, self, given, self.images_per_forward)
+
+        def add_loss(scores: Tensor, views: Any) -> None:
+            if target.is_cpu:
+                labels = torch.from_numpy(views.render(target.numpy(), "nearest"))
+            else:
+                labels = views.render(target[None], "nearest")[:, 0]
+            self._add_loss_of(scores, labels)
+
+        return fill(mosaic, self, given, self.images_per_forward, scored=add_loss)
+
+    def _add_loss_of(self, scores: Tensor, labels: Tensor) -> None:
+        """Add the cross-entropy of some views to the validation loss; not of auxiliary scores."""
+        loss = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
+        self.add_validation_loss(loss, labels)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; returns the predictions."""
@@ -242,7 +270,12 @@ class SegmentationTask(Task):
         for images, target, rotation in zip(
             batch.images, batch.target, batch.rotation, strict=True
         ):
-            labels = self.predict_labels(images, tuple(target.shape), rotation.cpu().numpy())
+            labels = self.predict_labels(
+                images,
+                tuple(target.shape),
+                rotation.cpu().numpy(),
+                None if self.is_tested else target,
+            )
             predictions.append(labels)
             self.metric.update(labels, target)
         return torch.stack(predictions)
