@@ -12,7 +12,6 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
@@ -373,14 +372,13 @@ class _Reading:
         return labels
 
     def parts(
-        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str], files: ImageFiles
-    ) -> list[Callable[[], object]]:
-        """Functions that decode each of its files separately.
+        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str]
+    ) -> dict[str, Callable[[ImageFiles], object]]:
+        """Return functions that decode the file of a part, by part.
 
         Args:
             label_counts: The pixels of each label are added under the name of the image.
             warnings: Warnings of labels are added.
-            files: Files of the image.
         """
 
         def count_labels(files: ImageFiles) -> None:
@@ -389,8 +387,9 @@ class _Reading:
             if warning := self.reader.label_warning(files):
                 warnings.append(warning)
 
-        read = {"labels": count_labels}
-        return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
+        reader = self.reader
+        parts = {"rgb": reader.rgb, "depth": reader.depth, "camera": reader.camera}
+        return {"labels": count_labels, **parts}
 
 
 class PanoramaReading(_Reading):

@@ -110,15 +110,13 @@ class TangentResults:
         """
         arrays = list(in_threads(partial(read_pixels, indices=kind != "color"), files))
         first = arrays[0]
-        square = f"{first.shape[0]}×{first.shape[0]} pixels of {first.dtype}"
+        height, width = first.shape[:2]
         for file, array in zip(files, arrays, strict=True):
-            if (array.shape, array.dtype) != (first.shape, first.dtype) or array.shape[
-                0
-            ] != array.shape[1]:
+            if (array.shape, array.dtype) != (first.shape, first.dtype) or height != width:
                 raise DataError(
                     file,
                     found=f"{array.dtype} of shape {array.shape}",
-                    expected=f"squares, all alike: {square}",
+                    expected=f"squares, all alike: {height}×{height} pixels of {first.dtype}",
                 )
         decided = _kind_of(files[0], first) if kind == "auto" else kind
         channels = _CHANNELS.get(decided, (first.shape[2:],))

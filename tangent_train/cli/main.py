@@ -68,9 +68,9 @@ def _main(command: str) -> None:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
             if {"--help", "-h"}.intersection(arguments):
-                with suppress(SystemExit), redirect_stdout(StringIO()) as told:
+                with suppress(SystemExit), redirect_stdout(StringIO()) as printed:
                     run()
-                sys.stdout.write(annotate(told.getvalue(), folder, command))
+                sys.stdout.write(annotate(printed.getvalue(), folder, command))
             else:
                 run()
         except (HydraException, OmegaConfBaseException) as error:
@@ -198,7 +198,7 @@ def _errors_once() -> Iterator[None]:
 
 
 def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
-    """Exit as a shell says it; commands have said how to go on."""
+    """Exit with the status of a shell; the command has printed how to continue."""
     from tangent_train.cli.processes import SigtermError
 
     received = signal.SIGTERM if isinstance(interrupt, SigtermError) else signal.SIGINT

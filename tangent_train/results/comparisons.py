@@ -36,11 +36,11 @@ _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
 
 
 def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
-    """The report over finished runs: mean and spread of each group, beside the paper's figures.
+    """Report finished runs: mean and spread of each group, beside the paper's figures.
 
     Args:
-        records: Of the runs.
-        notes: Further ones.
+        records: Records of the runs.
+        notes: Notes to add.
     """
     rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
     together = sorted(
@@ -63,7 +63,7 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
 def transfer_report(
     stages: Mapping[str, Sequence[Record]], cells: Mapping[str, Cell] | None = None
 ) -> Report:
-    """The report of a transfer from photos to panoramas, beside the paper's.
+    """Report a transfer from photos to panoramas, beside the paper's.
 
     Args:
         stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
@@ -95,7 +95,7 @@ def _photos_of(stage: str) -> str:
 
 
 def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) -> Report:
-    """The report over one network at several levels of the panoramas.
+    """Report one network at several levels of the panoramas.
 
     The paper's third transfer experiment: photos are normalized to the angular resolution of one
     level; scores fall the further that of the panoramas is from it.
@@ -161,11 +161,11 @@ def _base_level(record: Record) -> str:
 
 
 def published(records: Sequence[Record], *, transfer: bool = False) -> list[Row]:
-    """Published scores for the data and resolutions of some evaluations.
+    """Return published scores for the data and resolutions of some evaluations.
 
     Args:
         records: Evaluations; those on other data, other classes or rotated data match nothing.
-        transfer: Whether to take the figures of the network transfer.
+        transfer: True for the figures of the network transfer.
 
     Returns:
         Rows in the order of the file.
