@@ -94,6 +94,7 @@ def fill(
     sets: Iterable[tuple[Views, ViewImages, Tensor | None]],
     per_forward: int,
     progress: Callable[[int], object] = lambda count: None,
+    scored: Callable[[Tensor, Views], object] = lambda scores, views: None,
 ) -> ScoreMosaic:
     """Add the scores of sets of views to a mosaic.
 
@@ -103,10 +104,12 @@ def fill(
         sets: Views that cover the whole image, their images, and the rays that the network takes.
         per_forward: Views per call of the network.
         progress: Called with the number of views done since its last call.
+        scored: Called with the scores of some views.
     """
     for views, images, rays in sets:
         for part, scores in view_scores(network, images, len(views), per_forward, rays):
             mosaic.add(scores, views[part])
+            scored(scores, views[part])
             progress(part.stop - part.start)
     return mosaic
 
