@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from datamodules.images.gpano import up_of, whole_area
+from datamodules.images.gpano import read_up, whole_area
 from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
@@ -46,7 +46,7 @@ class PosedUp:
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
         """The panorama with `up`."""
         if index not in self._ups:
-            self._ups[index] = up_of(files.rgb)
+            self._ups[index] = read_up(files.rgb)
         return panorama._replace(up=self._ups[index])
 
 

@@ -96,7 +96,7 @@ class PanoramaArea:
         return resize_nearest(rows, (height, 1))[:, 0], resize_nearest(columns, (1, width))[0]
 
 
-def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
+def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
     """Return the place of an image on the sphere by its GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
@@ -202,7 +202,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
     return PanoramaArea((height, 2 * height), (0, height), (0, 2 * height), size)
 
 
-def up_of(path: Path) -> NDArray[np.float64] | None:
+def read_up(path: Path) -> NDArray[np.float64] | None:
     """Return the direction of up by the GPano tags of a panorama, see `up_from_pose`.
 
     Args:

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_crop, read_area, whole_area
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.images.videos import VIDEO_SUFFIXES
 from tangent_train.errors import SettingError
@@ -49,10 +49,10 @@ def panorama_area(
     if crop is not None:
         return area_of_crop(size, crop)
     is_tagged = path.suffix.lower() not in (".npy", ".exr", *VIDEO_SUFFIXES)
-    return area_of(path, size) if is_tagged else whole_area(path, size)
+    return read_area(path, size) if is_tagged else whole_area(path, size)
 
 
-def read_panorama(
+def read_placed(
     path: Path,
     interpolation: Interpolation,
     crop: Sequence[float] | None = None,

@@ -34,9 +34,9 @@ from datamodules.synthia.reader import (
     choose_frames,
     list_frames,
     panorama_files,
-    read_camera,
     read_first_channel,
     read_ids,
+    read_view_camera,
     sequence_folder,
     view_files,
 )
@@ -211,7 +211,7 @@ def _unfinished(
             whole.append((views, target))
     if size is None or not whole:
         return []
-    stitcher = ViewStitcher(read_camera(sequence_folder(root, sequence), size), size, height)
+    stitcher = ViewStitcher(read_view_camera(sequence_folder(root, sequence), size), size, height)
     return [partial(_make, stitcher, views, target, problems) for views, target in whole]
 
 

@@ -38,7 +38,7 @@ from datamodules.synthia.reader import (
     SynthiaReader,
     choose_frames,
     list_frames,
-    list_panoramas,
+    list_panorama_frames,
     panorama_files,
     sequence_folder,
     view_files,
@@ -196,7 +196,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `SplitDataModule`; panoramas that could not be generated count as broken."""
+        """See `LabeledData`; panoramas that could not be generated count as broken."""
         problems.add_all(self._not_made)
         return super().find(problems)
 
@@ -204,7 +204,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         """See `SynthiaSequences`."""
         return [
             [panorama_files(self.root, sequence, frame, with_depth=with_depth)]
-            for frame in list_panoramas(sequence_folder(self.root, sequence))
+            for frame in list_panorama_frames(sequence_folder(self.root, sequence))
         ]
 
 

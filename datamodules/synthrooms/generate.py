@@ -14,9 +14,9 @@ from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.stanford2d3ds.files import AREAS
-from datamodules.synthrooms.camera import PanoramaView, Pose, View, ViewKind, draw_view
+from datamodules.synthrooms.camera import PanoramaRays, PictureRays, Pose, ViewKind, draw_rays
 from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render
+from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import (
     PANORAMA,
@@ -156,11 +156,11 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
         camera = draw_camera(rng, scene, room.plan, cameras)
         cameras.append(camera)
         original = Pose.looking(camera.location, camera.heading)
-        views: dict[str, View] = {PANORAMA: PanoramaView(original, settings.height)}
+        views: dict[str, PictureRays] = {PANORAMA: PanoramaRays(original, settings.height)}
         for k in range(settings.views_per_camera):
-            views[str(k)] = draw_view(rng, settings.views, camera.location, settings.view_size)
+            views[str(k)] = draw_rays(rng, settings.views, camera.location, settings.view_size)
         for frame, view in views.items():
-            picture = render(scene, view, camera, holes, settings.supersample, rng)
+            picture = render_picture(scene, view, camera, holes, settings.supersample, rng)
             files = encode_picture(picture, labels)
             pose = pose_record(plan, identifier, frame, view, original)
             files["pose"] = json.dumps(pose).encode() + b"\n"

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import View
+from datamodules.synthrooms.camera import PictureRays
 from datamodules.synthrooms.layout import FloorPlan
 from datamodules.synthrooms.raycast import RayScene, even_directions
 
@@ -127,9 +127,9 @@ def _draw_location(
     return best
 
 
-def render(
+def render_picture(
     scene: RayScene,
-    view: View,
+    view: PictureRays,
     camera: Camera,
     holes: Holes,
     supersample: int,
@@ -171,7 +171,7 @@ def render(
 
 
 def _colors(
-    scene: RayScene, view: View, camera: Camera, shape: tuple[int, int], supersample: int
+    scene: RayScene, view: PictureRays, camera: Camera, shape: tuple[int, int], supersample: int
 ) -> Floats:
     """Return display values ``(h, w, 3)``."""
     steps = (np.arange(supersample) + 0.5) / supersample - 0.5

@@ -14,7 +14,7 @@ from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paire
 from datamodules.core.panoramas import resize_area
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
-from datamodules.zind.homes import HomePanorama, list_panoramas
+from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError
 
 
@@ -44,7 +44,7 @@ class ZindPairs(PanoramaPairs):
         """
         problems, root = Problems(), Path(self.root)
         most_m = math.inf if self.max_distance_m is None else self.max_distance_m
-        listed = list_panoramas(root, problems)
+        listed = list_home_panoramas(root, problems)
         problems.refuse(root)
         usable = [p for p in listed if p.has_layout and p.is_inside and p.unit_m is not None]
         location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}

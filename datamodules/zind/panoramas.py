@@ -48,7 +48,7 @@ from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_image_size, read_rgb
-from datamodules.zind.homes import HomePanorama, list_panoramas
+from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
@@ -126,7 +126,7 @@ class Zind(PanoramaDataModule):
 
     def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
-        panoramas = [p for p in list_panoramas(self.root, problems) if p.has_layout]
+        panoramas = [p for p in list_home_panoramas(self.root, problems) if p.has_layout]
         split_of = self._divided(panoramas)
         layouts: dict[str, Layout] = {}
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}

@@ -22,7 +22,7 @@ from datamodules.images.pixel_files import (
 from datamodules.images.tangent_folders import (
     face_name,
     panorama_area,
-    read_panorama,
+    read_placed,
     replaced_folder,
     shrink_to_level,
     write_tangent_folder,
@@ -108,7 +108,7 @@ def _forward(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
     check_new(settings, *folders, settings.figure)
 
     def work(job: Job, progress: Callable[[float], object]) -> Path:
-        image, _ = read_panorama(job.path, settings.interpolation, settings.crop, job.value)
+        image, _ = read_placed(job.path, settings.interpolation, settings.crop, job.value)
         shape = image.shape[0], image.shape[1]
         grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
@@ -175,7 +175,7 @@ def _colmap(settings: RenderSettings) -> None:
 
         def work(job: Job, progress: Callable[[float], object]) -> Path:
             name, path = job.item, job.path
-            image, area = read_panorama(path, settings.interpolation, settings.crop, job.value)
+            image, area = read_placed(path, settings.interpolation, settings.crop, job.value)
             file = name if is_video(path) else name.removesuffix(path.suffix) + path.suffix
             project.add(names[name], file, image, masks.read(name, area), progress)
             return output

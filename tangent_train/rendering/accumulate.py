@@ -20,7 +20,7 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
 
 if TYPE_CHECKING:
-    from tangent_train.rendering.representations.views import Placement
+    from tangent_train.rendering.representations.views import Views
 
 _NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
@@ -37,7 +37,7 @@ _SPANS = 2**23
 
 def add_to_canvas(
     scores: NDArray[np.float32],
-    images: Placement,
+    images: Views,
     shape: tuple[int, int],
     rows: slice,
     owner: NDArray[np.integer],
@@ -65,7 +65,7 @@ def add_to_canvas(
 
 def label_canvas(
     scores: NDArray[np.float32],
-    images: Placement,
+    images: Views,
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:

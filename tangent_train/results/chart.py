@@ -27,7 +27,7 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     the images of a single run; hatched bars are published.
 
     Args:
-        title: Of the chart.
+        title: Title of the chart.
         rows: Rows of the same scores and classes.
 
     Returns:
@@ -50,10 +50,10 @@ def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str, unit
     """Bars of one score of every view, in groups of one condition.
 
     Args:
-        title: Of the chart.
+        title: Title of the chart.
         grid: Rows by view, every one with all conditions.
         score: Name of the score over all images.
-        unit: Its unit.
+        unit: Unit of the score.
 
     Returns:
         A PNG file.

@@ -115,7 +115,7 @@ class Record:
         confusion: Integer counts, rows truth, columns prediction; empty without classes.
         intervals: 95 % bootstrap intervals over the images, of those means that have one.
         checkpoint: File of the network; that of a run itself is relative to its folder.
-        class_map: What gave the network the classes of the data; None for its own classes.
+        class_map: File or name of the map to the classes of the data; None for its own classes.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Folder of the run.
     """
@@ -215,7 +215,7 @@ def load_record(folder: Path) -> Record:
     """Read the results and settings of a finished run.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
 
     Raises:
         DataError: A file is missing, or is not what ``tangent-train`` writes.

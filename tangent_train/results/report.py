@@ -31,7 +31,7 @@ class Report:
     """Rows of the same scores over the same classes.
 
     Attributes:
-        title: Of the report.
+        title: Title of the report.
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
         compared: Explains the column "change"; empty without one.
@@ -167,7 +167,7 @@ class Report:
 
         Args:
             folder: Output folder.
-            name: Of the files.
+            name: Name of the files.
         """
         write_text(folder / f"{name}.md", self._markdown())
         figures = list(self.figures())

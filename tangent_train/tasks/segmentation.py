@@ -136,7 +136,7 @@ class SegmentationTask(Task):
         """Scores of every pixel.
 
         Args:
-            images: Of one or several spheres.
+            images: Images of one or several spheres.
             rays: Viewing rays, see `Views.rays`, for networks that take them.
 
         Raises:
