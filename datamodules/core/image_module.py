@@ -109,7 +109,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """Make sure, without decoding them, that files are whole and fit the settings."""
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `SplitDataModule`."""
+        """See `LabeledData`."""
         reader, splits = self.find_images(problems)
         read = self.reading(reader)
         store = Store.of(self.store, read.store_name, reader.settings, read.layout)
@@ -138,7 +138,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         return len(channel_names(self.inputs))
 
     def normalized(self, batch: Any) -> Tensor:
-        """See `SplitDataModule`."""
+        """See `LabeledData`."""
         normalization: Any = self.normalization
         return normalize(batch.images, normalization, self.inputs)
 

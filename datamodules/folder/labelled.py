@@ -88,7 +88,7 @@ class LabelledFolder(ImageDataModule):
         image_paths(self.root / "images", tell=print_on_rank_zero)
 
     def check(self) -> tuple[Problems, int]:
-        """See `SplitDataModule`; files that training would pass over are named too."""
+        """See `LabeledData`; files that training would pass over are named too."""
         problems, count = super().check()
         with problems.noted():
             note_ignored(self.root, problems)

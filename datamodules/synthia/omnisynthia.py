@@ -180,7 +180,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `SplitDataModule`; panoramas that could not be generated count as broken."""
+        """See `LabeledData`; panoramas that could not be generated count as broken."""
         problems.add_all(self._not_made)
         return super().find(problems)
 

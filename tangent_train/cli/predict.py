@@ -1,4 +1,4 @@
-"""``tangent-predict``: label maps of the user's own panoramas and photos."""
+"""``tangent-predict``: label maps of user panoramas and photos."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ _DECISIVE = (
     "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
-"""Settings that results depend on: those of resumed predictions must be the same."""
+"""Settings that results depend on: resumed predictions must have the same."""
 
 _SAVED_EVERY_S = 10.0
-"""So much work is done again after a process was killed."""
+"""Seconds of work that may be lost when a process is killed."""
 
 
 def predict(config: Mapping[str, Any]) -> None:
@@ -176,8 +176,8 @@ class _Labeller:
     """Reads images, predicts their labels and writes these.
 
     Args:
-        settings: Of the command.
-        original: The network with its own classes, which tells which way is up.
+        settings: Settings of the command.
+        original: The network before classes are mapped, which estimates up.
         trained: The network.
         folder: Output folder.
         shown: Names of the images of the report.
@@ -276,7 +276,7 @@ def _make_videos(
 
 
 def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork]:
-    """The network with its own classes, and with those of the class map."""
+    """The network with its original classes, and with those of the class map."""
     if settings.class_map is None:
         return (load_trained(settings.checkpoint, settings.trust),) * 2
     class_map = load_class_map(settings.class_map)
