@@ -40,16 +40,17 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
         SettingError: There is no such class, or transformers is missing.
     """
     with of_extra("huggingface", "network"):
-        from transformers import CONFIG_MAPPING, AutoConfig, PreTrainedConfig
+        import transformers
 
-    if kind in (None, AutoConfig):
+    if kind in (None, transformers.AutoConfig):
         name = config.get("model_type")
-        if not isinstance(name, str) or name not in CONFIG_MAPPING:
+        if not isinstance(name, str) or name not in transformers.CONFIG_MAPPING:
             found, expected = name or "none", "a kind of network that transformers has"
             raise SettingError("network.config.model_type", found=found, expected=expected)
-        kind = CONFIG_MAPPING[name]
+        kind = transformers.CONFIG_MAPPING[name]
     # Those of every network are about labels, results, and how a file was written.
-    declared = signature(kind).parameters.keys() - signature(PreTrainedConfig).parameters.keys()
+    of_all = signature(transformers.PreTrainedConfig).parameters.keys()
+    declared = signature(kind).parameters.keys() - of_all
     names = {name.removeprefix("_") for name in declared}
     names |= {alias for alias, name in kind.attribute_map.items() if name in declared}
 
@@ -108,17 +109,11 @@ class HuggingFaceNetwork(nn.Module):
                 found="a value",
                 expected=f"settings that transformers declares for {known['model_type']}",
             )
-        from transformers import (
-            MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING,
-            MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING,
-            AutoConfig,
-            AutoModelForSemanticSegmentation,
-            AutoModelForUniversalSegmentation,
-        )
+        import transformers as hf
 
         kind = config.get("model_type")
-        semantic = {made.model_type for made in MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING}
-        universal = {made.model_type for made in MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING}
+        semantic = {made.model_type for made in hf.MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING}
+        universal = {made.model_type for made in hf.MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING}
         if kind not in semantic | universal:
             raise SettingError(
                 "network.config.model_type",
@@ -126,11 +121,11 @@ class HuggingFaceNetwork(nn.Module):
                 expected="a network for semantic segmentation "
                 f"({', '.join(sorted(semantic | universal))})",
             )
-        made = AutoConfig.for_model(**known, num_labels=num_classes)
+        made = hf.AutoConfig.for_model(**known, num_labels=num_classes)
         self.is_universal = kind not in semantic
-        auto: Any = AutoModelForSemanticSegmentation
+        auto: Any = hf.AutoModelForSemanticSegmentation
         if self.is_universal:
-            auto = AutoModelForUniversalSegmentation
+            auto = hf.AutoModelForUniversalSegmentation
         self.network: Any = auto.from_config(made, trust_remote_code=False)
         self._bgr = bgr
         self._patch = _patch_size(made)

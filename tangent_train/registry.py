@@ -152,12 +152,7 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
     """Build a section of the user's own config as Hydra does."""
     from hydra.utils import instantiate
 
-    for inner, at in _sections(section, place):
-        maker, kinds = _maker(inner, at, None)
-        arguments = [name for name in inner if name not in _HYDRA]
-        for name in arguments:
-            _check_whole(inner[name], f"{at}.{name}", kinds.get(name))
-        _check_taken(maker, inner["_target_"], arguments, at, None)
+    check_arguments(section, place)
     # References of the config are resolved already; Hydra would resolve what they gave twice.
     whole = {"_convert_": "all", **section, "_partial_": True}
     whole = without_interpolation(without_interpolation(whole))
@@ -172,6 +167,24 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
         _refuse(error.__cause__ or error, targets[at], at, None)
     make = partial(make.func, *make.args, **make.keywords | given)
     return make if section.get("_partial_") else make()
+
+
+def check_arguments(section: Any, place: str) -> None:
+    """Refuse arguments that the classes in a section of the user's own config do not take.
+
+    Args:
+        section: The section, or None.
+        place: Place of the section, for messages.
+
+    Raises:
+        SettingError: A class cannot be imported, or gets an unknown argument or text for a number.
+    """
+    for inner, at in _sections(section, place):
+        maker, kinds = _maker(inner, at, None)
+        arguments = [name for name in inner if name not in _HYDRA]
+        for name in arguments:
+            _check_whole(inner[name], f"{at}.{name}", kinds.get(name))
+        _check_taken(maker, inner["_target_"], arguments, at, None)
 
 
 def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:

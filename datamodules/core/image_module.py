@@ -1,4 +1,4 @@
-"""Base data modules of labelled images: panoramas and photos."""
+"""Base data modules of labeled images: panoramas and photos."""
 
 from __future__ import annotations
 
@@ -55,14 +55,14 @@ from tangent_train.threads import in_threads
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class ImageDataModule(SplitDataModule[ImageFiles]):
-    """Labelled panoramas or photos of one data set.
+    """Labeled panoramas or photos of one data set.
 
     A data set says which images it has (`find_images`) and its `class_names`, the unknown one (0)
     first.
 
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
-        color_jitter: Strength of the colour augmentation, 0 (none) to 1, see `jitter_colors`.
+        color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
         normalizations: The default ones, without and with depth.
@@ -109,7 +109,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """Make sure, without decoding them, that files are whole and fit the settings."""
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `SplitDataModule`."""
+        """See `LabeledData`."""
         reader, splits = self.find_images(problems)
         read = self.reading(reader)
         store = Store.of(self.store, read.store_name, reader.settings, read.layout)
@@ -138,7 +138,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         return len(channel_names(self.inputs))
 
     def normalized(self, batch: Any) -> Tensor:
-        """See `SplitDataModule`."""
+        """See `LabeledData`."""
         normalization: Any = self.normalization
         return normalize(batch.images, normalization, self.inputs)
 
@@ -151,17 +151,17 @@ Upright = Literal["pose", "auto"] | None
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PanoramaDataModule(ImageDataModule):
-    """Labelled panoramas of one data set, see `ImageDataModule`.
+    """Labeled panoramas of one data set, see `ImageDataModule`.
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
-        mask: What does not count in training and evaluation, in the panorama's own frame, before
-            it is rotated: labels are unknown there, pixels stay. See `Masks`.
+        mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
+            their labels are unknown. See `Masks`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
             the image.
-        max_tilt_deg: Of `auto`: some degrees more than they are tilted, see `estimate_up`.
+        max_tilt_deg: Maximum tilt that `auto` estimates: some degrees more than the panoramas have.
 
     Attributes:
         erp_height: Rows of the panoramas read.
@@ -257,7 +257,7 @@ class PanoramaDataModule(ImageDataModule):
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class PhotoDataModule(ImageDataModule):
-    """Labelled photos of one data set, see `ImageDataModule`.
+    """Labeled photos of one data set, see `ImageDataModule`.
 
     The representation is the camera to which all photos are normalized.
 

@@ -23,7 +23,7 @@ Split = Literal["train", "val", "test"]
 """A part of a data set."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""All of them."""
+"""All parts, in their order."""
 
 SAMPLED = 32
 """Maximum number of images that `DatasetIndex.read_some` decodes."""
@@ -46,8 +46,10 @@ class Item(Protocol):
 
 
 _Item = TypeVar("_Item", bound=Item)
-_Failures = tuple[Item, list[Exception]]
-"""An image or shape, and what is wrong with it."""
+_Reads = Mapping[str, Callable[[Any], object]]
+"""Functions that read a part of an item, by part."""
+
+_WHOLE = "whole item"
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,9 @@ class DatasetIndex(Generic[_Item]):
 
     Attributes:
         noun: Name of the items, in the plural.
-        splits: Their files.
+        splits: Files of the images or shapes of each split.
         read: Reads one from its files; may have methods `labels`, and `parts` for functions that
-            decode each of its files by itself.
+            decode the files of a part.
         kind: Named tuple of arrays that `read` returns.
         store: Prepared store, if any.
         in_parallel: The results of some work on each, as they come.
@@ -87,10 +89,9 @@ class DatasetIndex(Generic[_Item]):
         """
         items = problems.without(self.of())
         read: Any = self.read
-        parts = partial(_whole, read)
-        if hasattr(read, "parts"):
-            parts = partial(read.parts, label_counts, problems.warnings)
-        self._note(problems, parts, items, "Checking")
+        parts = hasattr(read, "parts")
+        reads = read.parts(label_counts, problems.warnings) if parts else {_WHOLE: read}
+        self._note(problems, reads, items, "Checking")
         return len(items)
 
     def read_all(self, items: Sequence[_Item], problems: Problems, *, whole: bool) -> None:
@@ -103,20 +104,20 @@ class DatasetIndex(Generic[_Item]):
         """
         items, store = problems.without(items), self.store
         if store is None:
-            self._note(problems, partial(_whole, self.read), items, "Checking the data")
+            self._note(problems, {_WHOLE: self.read}, items, "Checking the data")
             return
         is_current = partial(store.is_current, whole=whole)
         missing = [item for item in items if not is_current(item.name, item.parts)]
         if missing:
             before = len(items) - len(missing)
-            make = partial(_stored, self.read, store)
+            make = {_WHOLE: partial(_store_item, self.read, store)}
             self._note(problems, make, missing, f"Preparing {self.noun}", before)
 
     def read_some(self, seed: int, problems: Problems) -> None:
         """Decode some images from all over the data set, for a second or two; note what is broken.
 
         Args:
-            seed: Others for other seeds.
+            seed: Seed of the choice.
             problems: Known problems; new ones are added.
         """
         items = problems.without(self.of())
@@ -124,9 +125,7 @@ class DatasetIndex(Generic[_Item]):
         strata = np.array_split(np.arange(len(items)), min(SAMPLED, len(items)) or 1)
         chosen = rng.permutation([rng.choice(stratum) for stratum in strata if len(stratum)])
         until = time.monotonic() + _SECONDS
-        check = partial(_failures, partial(_whole, self.read))
-        for failed in in_threads(check, [items[place] for place in chosen]):
-            _add(problems, *failed)
+        for _ in self._read(problems, {_WHOLE: self.read}, [items[place] for place in chosen]):
             if time.monotonic() > until:
                 return
 
@@ -136,48 +135,36 @@ class DatasetIndex(Generic[_Item]):
         return replace(self, splits=splits)
 
     def _note(
-        self,
-        problems: Problems,
-        reads: Callable[[Any], Iterable[Callable[[], object]]],
-        items: Sequence[_Item],
-        what: str,
-        before: int = 0,
+        self, problems: Problems, reads: _Reads, items: Sequence[_Item], what: str, before: int = 0
     ) -> None:
-        """Do what is to be done with every image, and note what is broken."""
+        """Read items in parallel, note what is broken, and show the progress."""
+        with closing(self._read(problems, reads, items)) as done:
+            show_progress(done, what, self.noun, before + len(items), before)
 
-        def noted() -> Generator[None]:
-            for failed in work:
-                _add(problems, *failed)
+    def _read(self, problems: Problems, reads: _Reads, items: Sequence[_Item]) -> Generator[None]:
+        """Read items in parallel and note what is broken; yield after each."""
+        with closing(self.in_parallel(partial(_errors, reads), items)) as results:
+            for item, errors in results:
+                for error in errors:
+                    with problems.noted(item.name, next(iter(item.parts.values()))):
+                        raise error
                 yield
 
-        with closing(self.in_parallel(partial(_failures, reads), items)) as work:
-            total = before + len(items)
-            show_progress(noted(), what, self.noun, total, before)
 
-
-def _add(problems: Problems, item: Item, errors: Iterable[Exception]) -> None:
-    for error in errors:
-        with problems.noted(item.name, next(iter(item.parts.values()))):
-            raise error
-
-
-def _failures(reads: Callable[[Any], Iterable[Callable[[], object]]], item: Item) -> _Failures:
-    """Problems of one image; runs in worker processes too."""
+def _errors(reads: _Reads, item: Item) -> tuple[Item, list[Exception]]:
+    """Errors of reading one item; runs in worker processes too."""
     errors: list[Exception] = []
-    for read in reads(item):
-        try:
-            read()
-        except (DataError, SettingError, OSError) as error:
-            errors.append(error)
+    for part, read in reads.items():
+        if part == _WHOLE or part in item.parts:
+            try:
+                read(item)
+            except (DataError, SettingError, OSError) as error:
+                errors.append(error)
     return item, errors
 
 
-def _whole(read: Callable[[Any], object], item: Item) -> list[Callable[[], object]]:
-    return [partial(read, item)]
-
-
-def _stored(read: Callable[[Any], object], store: Store, item: Item) -> list[Callable[[], object]]:
-    return [partial(store.make, item.name, item.parts, partial(_arrays, read, item))]
+def _store_item(read: Callable[[Any], Any], store: Store, item: Item) -> None:
+    store.make(item.name, item.parts, partial(_arrays, read, item))
 
 
 def _arrays(read: Callable[[Any], Any], item: Item) -> dict[str, Any]:
@@ -197,7 +184,7 @@ def draw_groups(
     Args:
         groups: All there are; those that come several times count once.
         fraction: Share of them to draw: at least one, never all, so none of a single one.
-        seed: Of the drawing.
+        seed: Seed of the draw.
 
     >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
     ['attic', 'kitchen']

@@ -22,7 +22,7 @@ Input = Literal["rgb", "depth", "elevation"]
 """
 
 INPUTS: tuple[Input, ...] = get_args(Input)
-"""All of them."""
+"""All inputs, in channel order."""
 
 _COLORS = ("red", "green", "blue")
 
@@ -37,14 +37,14 @@ MAX_DEPTH_M = 4.0
 
 @dataclass(frozen=True)
 class Normalization:
-    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (metres).
+    """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (meters).
 
     Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
     see `mesh_spheres`.
 
     Attributes:
         mean: 3, 4 or 6 numbers.
-        std: As many, greater than 0.
+        std: As many numbers, greater than 0.
 
     Raises:
         SettingError: Other numbers.
@@ -147,7 +147,7 @@ RGBD_NORMALIZATION = Normalization(
 
 
 def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """The channels of an image of these inputs by name, colours apart.
+    """The channels of an image of these inputs by name, colors apart.
 
     >>> channel_names(["rgb", "depth"])
     ('red', 'green', 'blue', 'depth')
@@ -180,7 +180,7 @@ def normalize(
     Args:
         rendered: RGB ``(..., h, w, 3)`` uint8; with depth ``(..., h, w)`` in steps of 1/512 m, 0
             where missing, at most `MAX_DEPTH_M`; with elevation ``(..., h, w)`` float32.
-        normalization: Of RGB and depth.
+        normalization: Normalization of RGB and depth.
         inputs: Inputs of the network, in the order of `INPUTS`.
 
     Returns:
@@ -212,8 +212,8 @@ def normalize_channels(
 
     Args:
         images: ``(..., C, h, w)`` float32.
-        units: Of every channel, its stored value for 1.
-        normalization: Of C channels.
+        units: Stored value for 1, of each channel.
+        normalization: Normalization of C channels.
 
     Returns:
         The images.

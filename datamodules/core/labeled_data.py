@@ -31,7 +31,7 @@ REMEDY = (
     "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
     "broken files out."
 )
-"""What to do about broken items."""
+"""Remedy for broken items."""
 
 
 @dataclass(kw_only=True, eq=False, repr=False)

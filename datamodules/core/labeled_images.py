@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from torch.utils.data import Dataset
 
 from datamodules.core.panoramas import ImageFiles, ImageReader, steps_to_meters
 from datamodules.core.reading import SplitReader
@@ -22,7 +23,7 @@ class LabeledImage(NamedTuple):
         name: Unique short name; ``/`` between groups.
         rgb: ``(H, W, 3)`` uint8.
         labels: ``(H, W)`` uint8 places in the class names of the data set, 0 where unknown.
-        distance_m: ``(H, W)`` float32 metres from the center of the camera, NaN where missing; None
+        distance_m: ``(H, W)`` float32 meters from the center of the camera, NaN where missing; None
             without depth among the inputs of the data set.
         pose: Pose; None if the data set has none. In the axes of a photo, x is its optical axis, y
             points to the right and z up in the image.
@@ -40,7 +41,7 @@ class LabeledImage(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LabeledImages(Sequence[LabeledImage]):
+class LabeledImages(Dataset[LabeledImage]):
     """The images of a split, read one at a time, as training and evaluation read them.
 
     Attributes:
@@ -54,19 +55,16 @@ class LabeledImages(Sequence[LabeledImage]):
     def __len__(self) -> int:
         return len(self.source)
 
-    @overload
-    def __getitem__(self, index: int) -> LabeledImage: ...
-    @overload
-    def __getitem__(self, index: slice) -> list[LabeledImage]: ...
-    def __getitem__(self, index: int | slice) -> LabeledImage | list[LabeledImage]:
-        if isinstance(index, slice):
-            return [self[place] for place in range(len(self))[index]]
-        place = range(len(self))[index]
-        files, image = self.source.items[place], self.source.read(place)
+    def __iter__(self) -> Iterator[LabeledImage]:
+        return map(self.__getitem__, range(len(self)))
+
+    def __getitem__(self, index: int) -> LabeledImage:
+        index = range(len(self))[index]
+        files, image = self.source.items[index], self.source.read(index)
         pose = self.reader.pose(files)
         for transform in self.source.transforms:
             if pose is not None and isinstance(transform, RotatedPanoramas):
-                rotation = transform.rotation(place)
+                rotation = transform.rotation(index)
                 pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
         distance_m = None if image.depth is None else steps_to_meters(image.depth)
         matrix = getattr(image, "camera_matrix", None)

@@ -167,7 +167,7 @@ def explained(error: Exception, num_workers: int) -> Exception:
 
     Args:
         error: The error.
-        num_workers: Of the loader.
+        num_workers: Worker processes of the loader.
 
     Returns:
         The error of a worker as raised there; a remedy if a worker was killed; or the

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.labeled_data import print_on_rank_zero
-from datamodules.images.gpano import area_of
+from datamodules.images.gpano import read_area
 from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size
@@ -28,7 +28,7 @@ class PairedPanorama(NamedTuple):
         name: Unique in the data set: the same panorama in another pair has the same name.
         rgb: ``(H, W, 3)`` uint8.
         file: The image it was read from.
-        distance_m: ``(H, W)`` float32 metres from the centre, NaN where missing; or None.
+        distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
     """
 
@@ -200,4 +200,4 @@ class ImagePairs(PanoramaPairs):
         path = self._paths[files]
         rgb = read_rgb(path)
         size = (rgb.shape[0], rgb.shape[1])
-        return PairedPanorama(self._names[files], area_of(path, size).place(rgb), path)
+        return PairedPanorama(self._names[files], read_area(path, size).place(rgb), path)

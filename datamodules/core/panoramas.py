@@ -3,7 +3,7 @@
 Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
 pixel grid: the outer edges of source and target agree, so target row i covers source rows
 ``i · H / h`` to ``(i + 1) · H / h``. RGB is averaged over that area; labels and depth are taken
-from the source pixel at its centre.
+from the source pixel at its center.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +24,7 @@ from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import PanoramaPose
+from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 Unknown = Literal["labels", "any_black", "all_black"]
-"""Pixels that count as unknown besides unlabelled ones; see `mask_black`."""
+"""Pixels that count as unknown besides unlabeled ones; see `mask_black`."""
 
 Turn = float | Literal["so3"] | None
 """Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or none."""
@@ -56,7 +55,7 @@ class ImageFiles(NamedTuple):
 
     Attributes:
         name: Unique short name; ``/`` between groups.
-        rgb: Colours.
+        rgb: Colors.
         labels: Classes.
         depth: Depth, where it is an input.
         camera: File with the camera matrix, for photos with one file each.
@@ -102,7 +101,7 @@ class ImageReader(ABC):
 
     @abstractmethod
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours, ``(H, W, 3)``."""
+        """Colors, ``(H, W, 3)``."""
 
     @abstractmethod
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
@@ -126,11 +125,11 @@ class ImageReader(ABC):
         raise NotImplementedError(files.name)
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """``(3, 3)`` K of a photo for integer pixel centres, without skew."""
+        """``(3, 3)`` K of a photo for integer pixel centers, without skew."""
         raise NotImplementedError(files.name)
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
-        """Pose in a world of metres, see `LabeledImage`; None if it is unknown."""
+        """Pose in a world of meters, see `LabeledImage`; None if it is unknown."""
         del files
         return None
 
@@ -139,7 +138,7 @@ class PngReader(ImageReader):
     """Decoder of the PNG files of a release.
 
     Attributes:
-        formats: Bits per channel and kinds of colours (`PngHeader.color`) by part.
+        formats: Bits per channel and kinds of colors (`PngHeader.color`) by part.
     """
 
     formats: Mapping[str, tuple[int, Sequence[str]]]
@@ -150,7 +149,7 @@ class PngReader(ImageReader):
         return header.height, header.width
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colours; alpha is dropped."""
+        """Colors; alpha is dropped."""
         return read_rgb(files.rgb)
 
 
@@ -159,7 +158,7 @@ class Panorama(NamedTuple):
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` uint16 distance from the centre in steps of 1/512 m, 0 where missing; or
+        depth: ``(H, W)`` uint16 distance from the center in steps of 1/512 m, 0 where missing; or
             None. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
         up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
@@ -186,36 +185,29 @@ class Panorama(NamedTuple):
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Downsample ``(H, W, 3)`` to ``shape`` by area averaging."""
-    if image.shape[:2] == shape:
-        return image
-    return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return resize(image, shape, "bilinear")
 
 
 def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
-    """Downsample ``(H, W[, C])`` to ``shape``: the pixel at the centre of each target pixel.
+    """Downsample ``(H, W[, C])`` to ``shape``: the pixel at the center of each target pixel.
 
     Where that is a corner of four pixels (even ratios) it is the lower right one.
     """
-    if image.shape[:2] == shape:
-        return image
-    rows, columns = (
-        (2 * np.arange(target) + 1) * source // (2 * target)
-        for source, target in zip(image.shape, shape, strict=False)
-    )
-    return image[rows][:, columns]
+    resized: Any = resize(image, shape, "nearest")
+    return resized
 
 
 def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
     """Downsample raw depth ``(H, W)``, 0 where missing, without mixing values.
 
-    As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the centre,
+    As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the center,
     of those in the area of the target pixel, is taken instead.
     """
     small = resize_nearest(depth, shape)
     holes = np.nonzero(small == 0)
     scale = [source / target for source, target in zip(depth.shape, shape, strict=True)]
     centers = [(i + 0.5) * s for i, s in zip(holes, scale, strict=True)]
-    # The first source pixel whose centre lies in the area of the target pixel.
+    # The first source pixel whose center lies in the area of the target pixel.
     first = [np.ceil(i * s - 0.5).astype(np.intp) for i, s in zip(holes, scale, strict=True)]
     nearest = np.full(len(holes[0]), np.inf)
     for step in np.ndindex(math.ceil(scale[0]), math.ceil(scale[1])):
@@ -254,13 +246,13 @@ def mask_black(
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in metres, float32, NaN where missing, of depth in steps of 1/512 m."""
+    """Depth in meters, float32, NaN where missing, of depth in steps of 1/512 m."""
     meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
     return np.where(steps == 0, np.float32(np.nan), meters)
 
 
 def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in metres.
+    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in meters.
 
     Depth below half a step is rounded up to one step: 0 means missing.
 
@@ -276,10 +268,10 @@ class Photo(NamedTuple):
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` uint16 distance from the centre of projection in steps of 1/512 m, 0 where
+        depth: ``(H, W)`` uint16 distance from the center of projection in steps of 1/512 m, 0 where
             missing: the same meaning as in panoramas; or None. See `distance_from_z_depth`.
         labels: ``(H, W)`` uint8, 0 where unknown.
-        camera_matrix: ``(3, 3)`` K for integer pixel centres, without skew.
+        camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
         up: Unknown.
 
     The arrays may be shared or read-only: not to be written to.
@@ -305,11 +297,11 @@ class Photo(NamedTuple):
 def distance_from_z_depth(
     z_depth: NDArray[np.uint16], camera_matrix: NDArray[np.float64]
 ) -> NDArray[np.uint16]:
-    """Distance from the centre of projection, as in panoramas, from z-depth.
+    """Distance from the center of projection, as in panoramas, from z-depth.
 
     Args:
         z_depth: ``(H, W)`` depth along the optical axis in any unit, 0 where missing.
-        camera_matrix: ``(3, 3)`` K for integer pixel centres.
+        camera_matrix: ``(3, 3)`` K for integer pixel centers.
 
     Returns:
         ``(H, W)`` in the same unit, rounded, at most 65535; 0 where missing.
@@ -373,14 +365,13 @@ class _Reading:
         return labels
 
     def parts(
-        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str], files: ImageFiles
-    ) -> list[Callable[[], object]]:
-        """Functions that decode each of its files separately.
+        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str]
+    ) -> dict[str, Callable[[ImageFiles], object]]:
+        """Return functions that decode the file of a part, by part.
 
         Args:
             label_counts: The pixels of each label are added under the name of the image.
             warnings: Warnings of labels are added.
-            files: Files of the image.
         """
 
         def count_labels(files: ImageFiles) -> None:
@@ -389,8 +380,9 @@ class _Reading:
             if warning := self.reader.label_warning(files):
                 warnings.append(warning)
 
-        read = {"labels": count_labels}
-        return [partial(read.get(part, getattr(self.reader, part)), files) for part in files.parts]
+        reader = self.reader
+        parts = {"rgb": reader.rgb, "depth": reader.depth, "camera": reader.camera}
+        return {"labels": count_labels, **parts}
 
 
 class PanoramaReading(_Reading):
@@ -406,7 +398,7 @@ class PanoramaReading(_Reading):
 
 
 class PhotoReading(_Reading):
-    """Reads photos; z-depth becomes distance from the centre of projection."""
+    """Reads photos; z-depth becomes distance from the center of projection."""
 
     kind = Photo
 
@@ -436,7 +428,7 @@ def check_headers(
         erp_height: Required rows of a panorama; None for photos.
 
     Returns:
-        Rows and columns; None where the colours cannot be used.
+        Rows and columns; None where the colors cannot be used.
     """
     size: tuple[int, int] | None = None
     for part in ("rgb", "labels", "depth"):

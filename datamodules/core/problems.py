@@ -92,7 +92,7 @@ class Problems:
 
     @property
     def fatal(self) -> bool:
-        """Whether one of them concerns the whole data set."""
+        """True if one of them concerns the whole data set."""
         return any(problem.item is None for problem in self._noted)
 
     @property

@@ -32,7 +32,7 @@ def in_processes(
 
     Args:
         work: A function of a module.
-        pieces: Its arguments.
+        pieces: Arguments of the function, for each piece of work.
         workers: Number of processes, by default one per CPU core; 0 and 1 work in this one.
         least: Pieces per process that justify starting it.
     """

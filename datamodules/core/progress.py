@@ -26,12 +26,12 @@ class PlainLines:
     def __init__(self) -> None:
         self._last = time.monotonic()
 
-    def tell(self, line: str, *, at_once: bool = False) -> None:
+    def print(self, line: str, *, at_once: bool = False) -> None:
         """Print a line, if it is time for one.
 
         Args:
             line: Without its end.
-            at_once: Whether it is not to wait.
+            at_once: True to print it in any case.
         """
         console = get_console()
         if console.is_terminal or not (at_once or time.monotonic() - self._last >= _EVERY_S):
@@ -51,17 +51,17 @@ class _Progress(Progress):
     def update(self, task_id: TaskID, **changes: Any) -> None:
         super().update(task_id, **changes)
         task = self.tasks[task_id]
-        told, total = f"{task.description}: {task.completed:g} of {task.total:g}", task.total or 0
+        text, total = f"{task.description}: {task.completed:g} of {task.total:g}", task.total or 0
         done = task.completed - task.fields["before"]
         if done <= 0:
-            self._lines.tell(told, at_once=True)
+            self._lines.print(text, at_once=True)
             return
         each_s = (time.monotonic() - self._begun) / done
         rate = _rate(each_s, task.fields["unit"])
         super().update(task_id, rate=rate)
         # rich's own estimate is of the last 30 seconds, in which nothing may have been finished.
         left = timedelta(seconds=round(each_s * (total - task.completed)))
-        self._lines.tell(f"{told}, {rate}, {left} left")
+        self._lines.print(f"{text}, {rate}, {left} left")
 
 
 def _rate(each_s: float, unit: str) -> str:
@@ -106,8 +106,8 @@ def show_progress(
     if before == total:
         return
     with progress_bar() as bar:
-        own: dict[str, Any] = {"unit": f" {unit}", "before": before, "rate": ""}
-        task = bar.add_task(description, total=total, completed=before, **own)
+        fields: dict[str, Any] = {"unit": f" {unit}", "before": before, "rate": ""}
+        task = bar.add_task(description, total=total, completed=before, **fields)
         bar.update(task)
         for _ in done:
             bar.update(task, advance=1)

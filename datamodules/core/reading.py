@@ -29,7 +29,7 @@ class SplitReader(Generic[_Item, _Image]):
         transforms: Changes to every image, in their order.
 
     Attributes:
-        items: Their files.
+        items: Files of each image.
         transforms: Changes to every image, in their order.
     """
 

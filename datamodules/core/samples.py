@@ -1,4 +1,4 @@
-"""Training and evaluation samples from labelled images."""
+"""Training and evaluation samples from labeled images."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         representation: Representation of the images.
         seed: Seed of the run, 0 or more.
         inputs: Inputs of the network, see `Input`.
-        color_jitter: Strength of the colour augmentation, 0 to 1, see `jitter_colors`.
+        color_jitter: Strength of the color augmentation, 0 to 1, see `jitter_colors`.
     """
 
     source: SplitReader[Any, Any]
@@ -130,7 +130,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
 
     Args:
         image: A `Panorama` or `Photo`; its `depth` is needed if that is an input.
-        views: Its views.
+        views: Views of the image.
         inputs: See `Input`.
 
     Returns:
@@ -153,8 +153,8 @@ def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float
     """Viewing rays in a world whose zenith is z, see `Views.rays`.
 
     Args:
-        views: Of a panorama.
-        up: Its zenith; None if that is z.
+        views: Views of a panorama.
+        up: Zenith of the panorama; None if it is z.
     """
     rays = views.rays()
     return rays if up is None else upright_rotation(up).T.astype(np.float32) @ rays
@@ -189,7 +189,7 @@ def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Ten
     """
     brightness, contrast, saturation = rng.uniform(1 - strength, 1 + strength, 3)
     hue = rng.uniform(-1, 1) * strength * _HUE_SHARE
-    # One high image: contrast is about the mean of all, or neighbours would part at their seams.
+    # One high image: contrast is about the mean of all, or neighbors would part at their seams.
     image = rgb.flatten(0, 1).movedim(-1, 0)
     image = functional.adjust_brightness(image, brightness)
     image = functional.adjust_contrast(image, contrast)

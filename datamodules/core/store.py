@@ -87,7 +87,7 @@ class Store:
         """Store of one choice of settings, in its own subfolder.
 
         Args:
-            folder: Of the stores of all choices; without it, there is no store.
+            folder: Folder of the stores of all choices; None for no store.
             name: Prefix of the subfolder's name.
             settings: Settings that affect the arrays besides the files.
             layout: The arrays that items may have.
@@ -107,8 +107,8 @@ class Store:
         """Write the file of one item atomically.
 
         Args:
-            name: Of the item, with ``/`` between folders.
-            files: Its source files, by part.
+            name: Name of the item, with ``/`` between folders.
+            files: Source files of the item, by part.
             read: Decodes them to named arrays.
 
         Raises:
@@ -136,7 +136,7 @@ class Store:
         checksum, and the largest values, the first time only.
 
         Args:
-            name: Of the item.
+            name: Name of the item.
             files: Required source files; it may have more.
             whole: True to check the content too.
 

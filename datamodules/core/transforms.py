@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from datamodules.images.gpano import up_of, whole_area
+from datamodules.images.gpano import read_up, whole_area
 from datamodules.images.masks import Masks
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import rotate_equirect
@@ -28,9 +28,9 @@ def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> P
 
     Args:
         masks: Where panoramas count.
-        panorama: Its colours and depth stay.
+        panorama: Panorama, whose colors and depth stay.
         index: Ignored.
-        files: Of the panorama.
+        files: Files of the panorama.
     """
     del index
     counts = masks.read(files.name, whole_area(files.rgb, panorama.labels.shape))
@@ -46,7 +46,7 @@ class PosedUp:
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
         """The panorama with `up`."""
         if index not in self._ups:
-            self._ups[index] = up_of(files.rgb)
+            self._ups[index] = read_up(files.rgb)
         return panorama._replace(up=self._ups[index])
 
 
@@ -58,7 +58,7 @@ class EstimatedUp:
 
     Args:
         max_tilt_deg: Maximum tilt, see `estimate_up`.
-        rgb: Reads the colours of a file.
+        rgb: Reads the colors of a file.
         rotated: Rotates the panoramas, if they are.
         judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
             its process.
@@ -109,7 +109,7 @@ class RotatedPanoramas:
         rotation: Tilt in degrees about a random horizontal axis, after a random rotation about the
             vertical; or `so3`, uniform over all rotations.
         seed: Seed of the rotations.
-        known: Whether the up direction is known, as from a camera with a gravity sensor.
+        known: True if the up direction is known, e.g. from a camera with a gravity sensor.
     """
 
     def __init__(self, rotation: float | Literal["so3"], seed: int, *, known: bool = False) -> None:

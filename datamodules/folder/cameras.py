@@ -133,7 +133,7 @@ class FolderCameras:
         return fov_deg
 
 
-def read_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
+def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
     """Read a ``cameras.json``; the cameras in it are read with their photos.
 
     It holds K by the name of an image, as ``kitchen/door``, or of a folder, for all images in it

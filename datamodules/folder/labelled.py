@@ -23,7 +23,7 @@ from datamodules.core.inputs import Input
 from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.folder.cameras import read_cameras
+from datamodules.folder.cameras import read_folder_cameras
 from datamodules.folder.classes import UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
@@ -40,8 +40,8 @@ class LabelledFolder(ImageDataModule):
 
     Args:
         test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
-            `validation_fraction` is that of the training scenes, likewise.
-        split_seed: Of the drawing of both. Independent of the run's seed, so that runs with
+            `validation_fraction` is a share of the training scenes.
+        split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
         depth_units_per_m: Units in a meter of depth files of whole numbers, 1000 for millimeters.
 
@@ -88,7 +88,7 @@ class LabelledFolder(ImageDataModule):
         image_paths(self.root / "images", tell=print_on_rank_zero)
 
     def check(self) -> tuple[Problems, int]:
-        """See `SplitDataModule`; files that training would pass over are named too."""
+        """See `LabeledData`; files that training would pass over are named too."""
         problems, count = super().check()
         with problems.noted():
             note_ignored(self.root, problems)
@@ -163,6 +163,6 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
         """See `LabelledFolder`."""
-        cameras = read_cameras(self.root / "cameras.json", self.fov)
+        cameras = read_folder_cameras(self.root / "cameras.json", self.fov)
         cameras.check_names(images, problems)
         return FolderReader(self._classes, self.depth_units_per_m, cameras)

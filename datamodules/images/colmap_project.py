@@ -7,6 +7,7 @@ camera for each folder (``--ImageReader.single_camera_per_folder``), so these ha
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,6 +44,7 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
     return flat
 
 
+@dataclass
 class ColmapProject:
     """A project that is being written.
 
@@ -54,18 +56,17 @@ class ColmapProject:
         interpolation: See `equirect_to_tangent`.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        grid: TangentGrid,
-        faces: Sequence[int],
-        suffix: str,
-        interpolation: Interpolation,
-    ) -> None:
-        self._folder, self._grid, self._suffix = folder, grid, suffix
-        self._interpolation: Interpolation = interpolation
-        self._faces = {f"{face_name(grid, face)}/": face for face in faces}
-        self._panoramas: dict[str, str] = {}
+    folder: Path
+    grid: TangentGrid
+    faces: Sequence[int]
+    suffix: str
+    interpolation: Interpolation
+    _panoramas: dict[str, str] = field(init=False, default_factory=dict)
+
+    @property
+    def _prefixes(self) -> dict[str, int]:
+        """Faces by the prefix of their images."""
+        return {f"{face_name(self.grid, face)}/": face for face in self.faces}
 
     def add(
         self,
@@ -87,19 +88,19 @@ class ColmapProject:
         Raises:
             SettingError: The files cannot hold its pixels.
         """
-        if self._interpolation == "bilinear":
-            image = shrink_to_level(image, self._grid.level)
+        if self.interpolation == "bilinear":
+            image = shrink_to_level(image, self.grid.level)
 
         def render(prefix: str, face: int) -> None:
-            path = f"{prefix}{name}{self._suffix}"
-            (pixels,) = equirect_to_tangent(image, self._grid, [face], self._interpolation)
-            write_pixels(self._folder / "images" / path, pixels)
-            (mask,) = equirect_to_tangent(counts, self._grid, [face], "nearest")
-            write_pixels(self._folder / "masks" / f"{path}.png", mask)
+            path = f"{prefix}{name}{self.suffix}"
+            (pixels,) = equirect_to_tangent(image, self.grid, [face], self.interpolation)
+            write_pixels(self.folder / "images" / path, pixels)
+            (mask,) = equirect_to_tangent(counts, self.grid, [face], "nearest")
+            write_pixels(self.folder / "masks" / f"{path}.png", mask)
 
-        write_each(render, self._faces, progress)
-        self._panoramas[name + self._suffix] = file
+        write_each(render, self._prefixes, progress)
+        self._panoramas[name + self.suffix] = file
 
     def write_rig(self) -> None:
         """Write the ``rig_config.json`` of the panoramas that were added."""
-        write_rig(self._folder / RIG_FILE, self._grid, self._faces, self._panoramas)
+        write_rig(self.folder / RIG_FILE, self.grid, self._prefixes, self._panoramas)

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -95,7 +96,7 @@ class PanoramaArea:
         return resize_nearest(rows, (height, 1))[:, 0], resize_nearest(columns, (1, width))[0]
 
 
-def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
+def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
     """Return the place of an image on the sphere by its GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
@@ -125,8 +126,9 @@ def area_of(path: Path, size: tuple[int, int]) -> PanoramaArea:
         _number(path, name, tags[name], 1e9) for name in _SIZES
     )
     inside = 0 < width <= full_width and height > 0 and top >= 0 and top + height <= full_height
+    agree = partial(math.isclose, rel_tol=_TOLERANCE)
     if not (
-        inside and _agree(full_width, 2 * full_height) and _agree(size[1] / width, size[0] / height)
+        inside and agree(full_width, 2 * full_height) and agree(size[1] / width, size[0] / height)
     ):
         raise DataError(
             path,
@@ -166,7 +168,7 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
         )
     width = east - west if east > west else east - west + 360
     pixels_deg = width / size[1], (north - south) / size[0]
-    if not _agree(*pixels_deg):
+    if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
         raise SettingError(
             "crop",
             found=f"{list(crop)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
@@ -200,7 +202,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
     return PanoramaArea((height, 2 * height), (0, height), (0, 2 * height), size)
 
 
-def up_of(path: Path) -> NDArray[np.float64] | None:
+def read_up(path: Path) -> NDArray[np.float64] | None:
     """Return the direction of up by the GPano tags of a panorama, see `up_from_pose`.
 
     Args:
@@ -257,7 +259,3 @@ def _area(
     height = min(height, full_height)
     top = min(round(down[0] * full_height), full_height - height)
     return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
-
-
-def _agree(one: float, other: float) -> bool:
-    return abs(one - other) <= _TOLERANCE * max(one, other)

@@ -92,7 +92,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
 
     def find(self, problems: Problems) -> DatasetIndex[ShapeFile]:
-        """See `SplitDataModule`."""
+        """See `LabeledData`."""
         del problems
         meshes = find_shapes(self.root)
         chosen = self._choose_for_validation(meshes)

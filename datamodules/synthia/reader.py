@@ -149,7 +149,7 @@ def list_frames(folder: Path) -> list[str]:
     return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
 
 
-def list_panoramas(folder: Path) -> list[str]:
+def list_panorama_frames(folder: Path) -> list[str]:
     """List frames with the color image of a panorama, in order."""
     return _names(folder / "pano" / "RGB")
 
@@ -176,7 +176,7 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     return list(frames[::step])
 
 
-def read_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
+def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
     """Read camera matrix of all views of a sequence.
 
     From ``CameraParams/intrinsics.txt``: the focal length, x and y of the center, and perhaps the
@@ -235,7 +235,7 @@ class SynthiaReader(PngReader):
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """Read the camera matrix of the sequence that the view is from."""
-        return read_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
+        return read_view_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
 
 
 def read_first_channel(path: Path) -> NDArray[Any]:

@@ -98,7 +98,7 @@ class Pose:
 
 
 @dataclass(frozen=True)
-class PanoramaView:
+class PanoramaRays:
     """A panorama of ``height × 2 height`` pixels; its depth is the distance."""
 
     pose: Pose
@@ -121,7 +121,7 @@ class PanoramaView:
 
 
 @dataclass(frozen=True)
-class PerspectiveView:
+class PerspectiveRays:
     """A square pinhole image; its depth is the z-depth.
 
     Attributes:
@@ -151,13 +151,13 @@ class PerspectiveView:
         return distance_m * (self.rays() @ self.pose.world_from_camera[:, 2].astype(np.float32))
 
 
-View: TypeAlias = PanoramaView | PerspectiveView
+PictureRays: TypeAlias = PanoramaRays | PerspectiveRays
 """The pixels of a picture: their rays, and depth from distances along them."""
 
 
-def draw_view(
+def draw_rays(
     rng: np.random.Generator, kind: ViewKind, location: NDArray[np.float64], size: int
-) -> PerspectiveView:
+) -> PerspectiveRays:
     """Draw a perspective view from a place.
 
     Args:
@@ -173,4 +173,4 @@ def draw_view(
         pitch = float(np.clip(rng.normal(0, math.radians(20)), -1.4, 1.4))
         roll = rng.normal(0, math.radians(3))
     fov = math.radians(rng.uniform(45, 75))
-    return PerspectiveView(Pose.looking(location, heading, pitch, roll), size, fov)
+    return PerspectiveRays(Pose.looking(location, heading, pitch, roll), size, fov)

@@ -13,12 +13,12 @@ import numpy as np
 from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.layout import Frame
 from datamodules.synthrooms.materials import Pattern
-from datamodules.synthrooms.room import Item, Light, Room
+from datamodules.synthrooms.room import Light, Room, RoomItem
 
 _UNLABELED = 0.12
 
 
-def _new(room: Room, frame: Frame) -> Item:
+def _new(room: Room, frame: Frame) -> RoomItem:
     return room.item(UNKNOWN_CLASS if room.chance(_UNLABELED) else "clutter", frame)
 
 
@@ -33,7 +33,7 @@ def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) 
         _build_desk_thing(room, _new(room, frame.at(x, y, high, yaw=turn)))
 
 
-def _build_desk_thing(room: Room, thing: Item) -> None:
+def _build_desk_thing(room: Room, thing: RoomItem) -> None:
     """Build a monitor, a pile of books, a vase, a box, or a desk lamp."""
     rng = room.rng
     material = room.palette.material()
@@ -74,7 +74,7 @@ def add_floor_clutter(room: Room) -> None:
     _build_floor_thing(room, _new(room, frame), kind, size)
 
 
-def _build_floor_thing(room: Room, thing: Item, kind: int, size: float) -> None:
+def _build_floor_thing(room: Room, thing: RoomItem, kind: int, size: float) -> None:
     """Build boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
     rng, material = room.rng, room.palette.material
     if kind == 0:

@@ -11,7 +11,7 @@ import numpy as np
 from datamodules.synthrooms.clutter import add_desk_things
 from datamodules.synthrooms.layout import Frame, NoPlaceError, Rectangle
 from datamodules.synthrooms.materials import Material, Pattern
-from datamodules.synthrooms.room import Item, Room
+from datamodules.synthrooms.room import Room, RoomItem
 
 
 def add_chair(room: Room) -> None:
@@ -58,7 +58,7 @@ def _build_chair(room: Room, frame: Frame) -> None:
 
 
 def _add_legs(
-    item: Item, material: Material, spread: tuple[float, float], height: float, thick: float
+    item: RoomItem, material: Material, spread: tuple[float, float], height: float, thick: float
 ) -> None:
     """Add four upright legs from the floor, ``±spread`` meters from the middle."""
     for x in (-spread[0], spread[0]):
@@ -66,7 +66,7 @@ def _add_legs(
             item.box(material, (x, y, height / 2), (thick, thick, height))
 
 
-def _add_base(chair: Item, material: Material, design: int, wide: float, seat: float) -> None:
+def _add_base(chair: RoomItem, material: Material, design: int, wide: float, seat: float) -> None:
     spread = wide / 2 - 0.03
     if design == 0:
         _add_legs(chair, material, (spread, spread), seat, 0.045)
@@ -112,7 +112,7 @@ def add_sofa(room: Room) -> None:
 
 
 def _add_arms(
-    room: Room, sofa: Item, cover: Material, design: int, size: tuple[float, float, float]
+    room: Room, sofa: RoomItem, cover: Material, design: int, size: tuple[float, float, float]
 ) -> float:
     """Add the arms of a sofa; returns the width of one."""
     wide, deep, seat = size
@@ -254,7 +254,7 @@ def add_bookcase(room: Room) -> None:
 
 
 def _add_cupboard(
-    room: Room, case: Item, body: Material, wide: float, deep: float, high: float, doors: int
+    room: Room, case: RoomItem, body: Material, wide: float, deep: float, high: float, doors: int
 ) -> None:
     front = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
     for k in range(doors):
@@ -265,7 +265,7 @@ def _add_cupboard(
 
 def _add_shelves(
     room: Room,
-    case: Item,
+    case: RoomItem,
     body: Material,
     size: tuple[float, float, float],
     bottom: float,
@@ -286,7 +286,7 @@ def _add_shelves(
 
 
 def _add_row(
-    room: Room, case: Item, start: float, wide: float, deep: float, z: float, room_above: float
+    room: Room, case: RoomItem, start: float, wide: float, deep: float, z: float, room_above: float
 ) -> None:
     rng = room.rng
     if room.chance(0.2):

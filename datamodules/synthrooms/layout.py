@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -112,10 +113,10 @@ class FloorPlan:
             a, b = x - notch[0], y - notch[1]
             self.notch = Rectangle(a, b, x, y)
             corners[2:3] = [(x, b), (a, b), (a, y)]
-        self.walls = [
-            _wall_between(start, end)
-            for start, end in zip(corners, [*corners[1:], corners[0]], strict=True)
-        ]
+        self.walls = []
+        for (x0, y0), (x1, y1) in pairwise([*corners, corners[0]]):
+            frame = Frame(x0, y0, yaw=math.atan2(y1 - y0, x1 - x0))
+            self.walls.append(Wall(frame, math.hypot(x1 - x0, y1 - y0)))
 
     @property
     def floors(self) -> list[Rectangle]:
@@ -201,8 +202,3 @@ class FloorPlan:
             if self.claim(area, 0.1, gap):
                 return frame
         raise NoPlaceError
-
-
-def _wall_between(start: tuple[float, float], end: tuple[float, float]) -> Wall:
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    return Wall(Frame(*start, yaw=math.atan2(dy, dx)), math.hypot(dx, dy))

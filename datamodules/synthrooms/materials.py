@@ -121,21 +121,20 @@ class Palette:
         rng = self._rng
         base = self.color() if color is None else color
         related = np.clip(base * rng.uniform(0.5, 1.3) + rng.normal(0, 0.05, 3), 0.02, 0.98)
+        if patterns:
+            pattern = patterns[rng.integers(len(patterns))]
+        else:
+            pattern = _COMMON[rng.choice(len(_COMMON), p=_COMMON_SHARES)]
         return Material(
             color=base,
             second=related if second is None else second,
-            pattern=self._pattern(patterns),
+            pattern=pattern,
             frequency=rng.uniform(*frequency),
             contrast=rng.uniform(0.03, 0.14),
             offset=rng.uniform(0, 50, 2),
             emission=emission,
             unscanned=unscanned,
         )
-
-    def _pattern(self, choices: Sequence[Pattern]) -> Pattern:
-        if choices:
-            return choices[int(self._rng.integers(len(choices)))]
-        return _COMMON[self._rng.choice(len(_COMMON), p=_COMMON_SHARES)]
 
 
 _TYPES = {"pattern": np.int64, "unscanned": np.bool_}

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import View
+from datamodules.synthrooms.camera import PictureRays
 from datamodules.synthrooms.layout import FloorPlan
-from datamodules.synthrooms.raycast import Hits, RayScene, even_directions
+from datamodules.synthrooms.raycast import RayScene, even_directions
 
 Floats = NDArray[np.float32]
 
@@ -127,9 +127,9 @@ def _draw_location(
     return best
 
 
-def render(
+def render_picture(
     scene: RayScene,
-    view: View,
+    view: PictureRays,
     camera: Camera,
     holes: Holes,
     supersample: int,
@@ -153,7 +153,8 @@ def render(
     distance, items = np.empty(shape, np.float32), np.empty(shape, np.int64)
     for rows in _bands(shape):
         hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
-        missing = _unscanned(scene, hits, holes)
+        missing = ~hits.found | (hits.cosine < _GRAZING) | holes.cover(hits.points)
+        missing |= scene.materials["unscanned"][hits.part]
         distance[rows] = np.where(missing, np.nan, hits.distance).reshape(-1, shape[1])
         found = np.where(missing, MISSING, scene.item_of_part[hits.part])
         items[rows] = found.reshape(-1, shape[1])
@@ -170,7 +171,7 @@ def render(
 
 
 def _colors(
-    scene: RayScene, view: View, camera: Camera, shape: tuple[int, int], supersample: int
+    scene: RayScene, view: PictureRays, camera: Camera, shape: tuple[int, int], supersample: int
 ) -> Floats:
     """Return display values ``(h, w, 3)``."""
     steps = (np.arange(supersample) + 0.5) / supersample - 0.5
@@ -182,18 +183,10 @@ def _colors(
         for rows in _bands(shape):
             hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
             light = scene.radiance(hits, (2 * dx, 2 * dy), spread) * camera.gain
-            color[rows] += _display(light).reshape(color[rows].shape)
+            # Tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2.
+            toned = light * (1 + light / np.float32(_WHITE)) / (1 + light)
+            color[rows] += np.sqrt(np.minimum(toned, 1)).reshape(color[rows].shape)
     return color / np.float32(len(spreads))
-
-
-def _display(light: Floats) -> Floats:
-    """Apply the tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2."""
-    return np.sqrt(np.minimum(light * (1 + light / np.float32(_WHITE)) / (1 + light), 1))
-
-
-def _unscanned(scene: RayScene, hits: Hits, holes: Holes) -> NDArray[np.bool_]:
-    missing = ~hits.found | (hits.cosine < _GRAZING) | holes.cover(hits.points)
-    return missing | scene.materials["unscanned"][hits.part]
 
 
 def _bands(shape: tuple[int, int]) -> Iterator[slice]:

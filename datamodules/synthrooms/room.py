@@ -26,7 +26,7 @@ _SHAPES = {
 _Triple = tuple[float, float, float]
 
 
-class Part(NamedTuple):
+class RoomPart(NamedTuple):
     """Triangles of one material of one item.
 
     Attributes:
@@ -57,7 +57,7 @@ class Light(NamedTuple):
 
 
 @dataclass
-class Item:
+class RoomItem:
     """One labelled object, composed of parts.
 
     Attributes:
@@ -66,7 +66,7 @@ class Item:
         frame: Place of the item; all parts are given in this frame.
     """
 
-    parts: list[Part]
+    parts: list[RoomPart]
     index: int
     frame: Frame
 
@@ -78,7 +78,8 @@ class Item:
         cos, sin = math.cos(place.yaw), math.sin(place.yaw)
         turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         unit = np.array(_SHAPES[shape].triangles, np.float64)
-        self.parts.append(Part(self.index, material, unit * size @ turn.T + np.array(place[:3])))
+        corners = unit * size @ turn.T + np.array(place[:3])
+        self.parts.append(RoomPart(self.index, material, corners))
 
     box = partialmethod(add, "box")
     cylinder = partialmethod(add, "cylinder")
@@ -103,14 +104,14 @@ class Room:
     plan: FloorPlan
     palette: Palette
     items: list[str] = field(default_factory=list)
-    parts: list[Part] = field(default_factory=list)
+    parts: list[RoomPart] = field(default_factory=list)
     lights: list[Light] = field(default_factory=list)
     reflectance: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
-    def item(self, class_name: str, frame: Frame) -> Item:
+    def item(self, class_name: str, frame: Frame) -> RoomItem:
         """Begin a new item of a class at a place."""
         self.items.append(class_name)
-        return Item(self.parts, len(self.items) - 1, frame)
+        return RoomItem(self.parts, len(self.items) - 1, frame)
 
     def chance(self, probability: float) -> bool:
         """True with a probability."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from datamodules.synthrooms.layout import Frame, Rectangle, Zone
 from datamodules.synthrooms.materials import Material, Pattern
-from datamodules.synthrooms.room import Item, Light, Room
+from datamodules.synthrooms.room import Light, Room, RoomItem
 
 _THICK = 0.1
 
@@ -49,7 +49,7 @@ def add_ceiling(room: Room) -> Material:
     return material
 
 
-def _add_slab(item: Item, area: Rectangle, material: Material, z: float) -> None:
+def _add_slab(item: RoomItem, area: Rectangle, material: Material, z: float) -> None:
     center = ((area.x0 + area.x1) / 2, (area.y0 + area.y1) / 2, z)
     item.box(material, center, (area.x1 - area.x0, area.y1 - area.y0, _THICK))
 
@@ -139,7 +139,7 @@ _SKY = ((0.5, 0.65), (0.05, 0.4), (0.8, 1.0))
 _LIT_SIDE = 0.16  # meters in front of the glass, past frame and sill
 
 
-def _add_frame(item: Item, material: Material, wide: float, bottom: float, top: float) -> None:
+def _add_frame(item: RoomItem, material: Material, wide: float, bottom: float, top: float) -> None:
     """Add two posts and a lintel around an opening."""
     for x in (-wide / 2, wide / 2):
         item.box(material, (x, 0.045, (bottom + top) / 2), (0.08, 0.09, top - bottom + 0.08))
@@ -212,7 +212,7 @@ def _glass(room: Room, bright: bool) -> Material:
     return room.palette.material(Pattern.PLAIN, Pattern.SPECKLE, frequency=(0.5, 2))
 
 
-def _add_blind(room: Room, window: Item, wide: float, bottom: float, top: float) -> None:
+def _add_blind(room: Room, window: RoomItem, wide: float, bottom: float, top: float) -> None:
     material = room.palette.material(Pattern.PLAIN)
     lowest = top - (top - bottom) * room.rng.uniform(0.2, 0.7)
     for z in np.arange(top - 0.04, lowest, -0.09):

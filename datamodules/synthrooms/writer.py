@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
-from datamodules.synthrooms.camera import PerspectiveView, Pose, View, euler_angles
+from datamodules.synthrooms.camera import PerspectiveRays, PictureRays, Pose, euler_angles
 from datamodules.synthrooms.render import MISSING, Picture
 
 PANORAMA = "equirectangular"
@@ -138,7 +138,7 @@ def _encode_png(image: NDArray[Any]) -> bytes:
 
 
 def pose_record(
-    room: RoomPlan, camera: str, frame: str, view: View, original: Pose
+    room: RoomPlan, camera: str, frame: str, view: PictureRays, original: Pose
 ) -> dict[str, Any]:
     """Return the pose file of a picture, with all keys of the real set.
 
@@ -155,8 +155,8 @@ def pose_record(
     """
     pose = view.pose
     image = view
-    if not isinstance(image, PerspectiveView):
-        image = PerspectiveView(pose, image.height, math.pi / 2)
+    if not isinstance(image, PerspectiveRays):
+        image = PerspectiveRays(pose, image.height, math.pi / 2)
     focal, center = image.size / (2 * math.tan(image.fov_rad / 2)), image.size / 2
     turn = pose.world_from_camera @ original.world_from_camera.T
     return {

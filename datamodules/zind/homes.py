@@ -165,7 +165,7 @@ class HomePanorama:
         return DataError(self.file, found=found, expected=expected, remedy=_COPY)
 
 
-def list_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
+def list_home_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
     """List frames with the color image of a panorama, in order.
 
     Args:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
@@ -13,10 +14,11 @@ from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paire
 from datamodules.core.panoramas import resize_area
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_rgb
-from datamodules.zind.homes import HomePanorama, list_panoramas
+from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError
 
 
+@dataclass(eq=False)
 class ZindPairs(PanoramaPairs):
     """Any two panoramas of a complete room whose cameras are inside.
 
@@ -29,15 +31,9 @@ class ZindPairs(PanoramaPairs):
         erp_height: Rows to downsample the panoramas to; by default unchanged.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        max_distance_m: float | None = None,
-        erp_height: int | None = None,
-    ) -> None:
-        self.root = Path(root)
-        self._max_distance_m = math.inf if max_distance_m is None else max_distance_m
-        self._height = erp_height
+    root: str | Path
+    max_distance_m: float | None = None
+    erp_height: int | None = None
 
     @cached_property
     def pairs(self) -> list[tuple[str, HomePanorama, HomePanorama]]:
@@ -46,20 +42,21 @@ class ZindPairs(PanoramaPairs):
         Raises:
             DataError: There are none, or a file is broken.
         """
-        problems = Problems()
-        listed = list_panoramas(self.root, problems)
-        problems.refuse(self.root)
+        problems, root = Problems(), Path(self.root)
+        most_m = math.inf if self.max_distance_m is None else self.max_distance_m
+        listed = list_home_panoramas(root, problems)
+        problems.refuse(root)
         usable = [p for p in listed if p.has_layout and p.is_inside and p.unit_m is not None]
         location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
         pairs = [
             (f"{one.room}/{one.path[-1]} – {other.path[-1]}", one, other)
             for one, other in combinations(usable, 2)
             if one.room == other.room
-            and math.dist(location_m[one.name], location_m[other.name]) <= self._max_distance_m
+            and math.dist(location_m[one.name], location_m[other.name]) <= most_m
         ]
         if not pairs:
             raise DataError(
-                self.root,
+                root,
                 found="no two panoramas of one room",
                 expected="layout_visible, is_inside and scale_meters_per_coordinate of some",
                 remedy="Set data.max_distance_m=null for any distance.",
@@ -74,7 +71,7 @@ class ZindPairs(PanoramaPairs):
         """See `PanoramaPairs`."""
         path = files.image()
         rgb = read_rgb(path)
-        shape = paired_shape(path, rgb, self._height)
+        shape = paired_shape(path, rgb, self.erp_height)
         pose, unit_m = files.pose()
         distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
         return PairedPanorama(files.name, resize_area(rgb, shape), path, distance_m, pose)

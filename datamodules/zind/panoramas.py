@@ -11,7 +11,7 @@ On disk, as released::
         panos/floor_01_partial_room_09_pano_5.jpg
       zind_partition.json         homes of train, val and test; copied from the repository if wanted
 
-A panorama is labelled by `layout_visible`, what its camera sees of the complete room. Left out are
+A panorama is labeled by `layout_visible`, what its camera sees of the complete room. Left out are
 panoramas without it: those taken outside of the room that was annotated in them, 5 in the sample.
 
 ====== ======= ====================================================================================
@@ -48,14 +48,14 @@ from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
 from datamodules.images.pixel_files import read_image_size, read_rgb
-from datamodules.zind.homes import HomePanorama, list_panoramas
+from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields, registered
 
 Doors = Literal["class", "ignore"]
-"""Whether doors are a class or unknown."""
+"""Labels of doors: a class, or unknown."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class ZindReader(ImageReader):
 
     Attributes:
         layouts: By the name of the panorama.
-        doors: Whether doors are a class.
+        doors: Labels of doors.
     """
 
     layouts: Mapping[str, Layout]
@@ -72,7 +72,7 @@ class ZindReader(ImageReader):
 
     @property
     def settings(self) -> dict[str, str]:
-        """What becomes of doors."""
+        """Labels of doors."""
         return {"doors": self.doors}
 
     def size(self, part: str, path: Path) -> tuple[int, int] | None:
@@ -103,7 +103,7 @@ class Zind(PanoramaDataModule):
         doors: `class`, or `ignore`: unknown.
         test_fraction: Share of the rooms for test, without a partition; 1 for all, to evaluate
             networks that were trained on something else.
-        split_seed: Of the drawing of rooms, for test and for validation. Independent of the run's
+        split_seed: Seed of the splits. Independent of the run's
             seed, so that runs with different seeds share their splits.
 
     Raises:
@@ -126,7 +126,7 @@ class Zind(PanoramaDataModule):
 
     def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
-        panoramas = [p for p in list_panoramas(self.root, problems) if p.has_layout]
+        panoramas = [p for p in list_home_panoramas(self.root, problems) if p.has_layout]
         split_of = self._divided(panoramas)
         layouts: dict[str, Layout] = {}
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}

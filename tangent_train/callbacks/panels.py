@@ -24,7 +24,7 @@ class PredictionPanels(Callback):
         count: Number of images, spread over the test split.
 
     Attributes:
-        images: The same, compressed, for the viewer of the report; after the test those of all
+        images: Compressed images for the viewer of the report; after the test those of all
             processes, in the order of the split.
 
     Raises:

@@ -65,8 +65,8 @@ class ProgressBar(RichProgressBar):
         each = (time.monotonic() - self._begun) / self._epochs
         parts += [f"{timedelta(seconds=round(each * (last - done)))} left"] * (last > done)
         if trainer.is_global_zero:
-            self._lines.tell(", ".join(parts), at_once=True)
+            self._lines.print(", ".join(parts), at_once=True)
 
     def _tell(self, what: str, index: int, total: float) -> None:
         if self.trainer.is_global_zero:
-            self._lines.tell(f"{what}: {index + 1} of {total} steps")
+            self._lines.print(f"{what}: {index + 1} of {total} steps")

@@ -248,7 +248,7 @@ class EvaluateSettings(RunSettings):
 class TransferSettings(EvaluateSettings):
     """See ``configs/transfer.yaml``."""
 
-    network: dict[str, Any]
+    network: dict[str, Any] = field()
     checkpoint: Path | None = field(metadata=_EXISTS)  # type: ignore[assignment]
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import EvaluateSettings
-from tangent_train.cli.run import Run, Settings, machine_faults
+from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import run_settings
 from tangent_train.registry import SettingsFile
 
 
 def evaluate(
-    settings: Settings,
+    settings: Mapping[str, Any],
     source: SettingsFile | None = None,
     trained: TrainedNetwork | None = None,
 ) -> None:

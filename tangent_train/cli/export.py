@@ -9,7 +9,7 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.command_settings import ExportSettings as Settings
+from tangent_train.cli.command_settings import ExportSettings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
@@ -28,7 +28,7 @@ def export(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or impossible, the file exists, or the network cannot be
             exported.
     """
-    settings = parse_settings(Settings, config)
+    settings = parse_settings(ExportSettings, config)
     output = settings.output
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):

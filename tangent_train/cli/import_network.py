@@ -14,7 +14,7 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.cli.command_settings import ImportSettings as Settings
+from tangent_train.cli.command_settings import ImportSettings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
@@ -48,7 +48,7 @@ def import_network(config: Mapping[str, Any]) -> None:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    settings = parse_settings(Settings, config)
+    settings = parse_settings(ImportSettings, config)
     output = settings.output
     with elsewhere():
         from tangent_train.inference import photo_networks
@@ -86,7 +86,7 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
     return given[0], given[-1]
 
 
-def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
+def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
     name, classes = settings.network, settings.classes
     if name in _LIBRARIES:
@@ -110,7 +110,7 @@ def _load(settings: Settings, normalization: Any) -> PhotoNetwork:
     return own_files.load_config(section, settings.weights, classes, normalization)
 
 
-def _understood(path: Path, trained: TrainedNetwork, settings: Settings) -> str:
+def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
     base_level, dim = trained.representation["base_level"], trained.representation["dim"]
     names = trained.class_names[1:]

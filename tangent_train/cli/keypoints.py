@@ -14,7 +14,7 @@ from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
 from datamodules.images.pixel_files import read_image_size
-from tangent_train.cli.command_settings import KeypointSettings as Settings
+from tangent_train.cli.command_settings import KeypointSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
@@ -38,7 +38,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or invalid.
         DataError: There are no pairs.
     """
-    given, comparer = parse_settings(Settings, config), parse_settings(Comparer, config)
+    given, comparer = parse_settings(KeypointSettings, config), parse_settings(Comparer, config)
     output = given.output
     colmap()  # a missing pycolmap is an error now rather than after minutes
     data, pairs = _pairs(config)

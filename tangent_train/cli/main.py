@@ -29,6 +29,14 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 
+_NOT_BUILT = {
+    "check": ("network", "optimizer", "task", "trainer"),
+    "evaluate": ("optimizer",),
+    "prepare": ("network", "optimizer", "task", "trainer"),
+}
+"""Sections of a run that a command does not build: added settings are checked all the same."""
+
+
 def _main(command: str) -> None:
     """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
     _prepare_process()
@@ -57,20 +65,23 @@ def _main(command: str) -> None:
 
         if stored is not None:
             arguments = stored.arguments
-        # Hydra takes no null for a group on the command line.
+        folder = config_folder()
         arguments = ["logger=none" if a == "logger=null" else a for a in arguments]
         if command == "import":
             # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
             arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]
+        for k, argument in enumerate(arguments):  # Hydra takes no null for a group here
+            group = re.fullmatch(r"(\w+)(@[\w.]+)?=null", argument)
+            if group is not None and (folder / group[1]).is_dir():
+                arguments[k] = f"~{argument.removesuffix('=null')}"
         sys.argv[1:] = literal_paths(command, arguments)
         try:
-            folder = config_folder()
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
             if {"--help", "-h"}.intersection(arguments):
-                with suppress(SystemExit), redirect_stdout(StringIO()) as told:
+                with suppress(SystemExit), redirect_stdout(StringIO()) as printed:
                     run()
-                sys.stdout.write(annotate(told.getvalue(), folder, command))
+                sys.stdout.write(annotate(printed.getvalue(), folder, command))
             else:
                 run()
         except (HydraException, OmegaConfBaseException) as error:
@@ -119,6 +130,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from tangent_train.cli.run_folder import folder_settings
     from tangent_train.cli.setting_names import check_names, declared_settings
     from tangent_train.cli.sweep import in_sweep, run_job
+    from tangent_train.registry import check_arguments
 
     composed: Any = OmegaConf.to_container(config)
     whole = OmegaConf.to_container(HydraConfig.instance().cfg)
@@ -139,6 +151,10 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)
         import_module("datamodules.core.split_module")  # for commands that import no library yet
+    for override in HydraConfig.get().overrides.task:
+        section = override.lstrip("+").partition(".")[0]
+        if override[0] == "+" and section in _NOT_BUILT.get(command, ()):
+            check_arguments(settings.get(section), section)
     if command == "transfer":  # its stages keep the references of the config
         return run(config)
     return run(settings) if stored is None else run(*stored.settings(settings))
@@ -198,7 +214,7 @@ def _errors_once() -> Iterator[None]:
 
 
 def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
-    """Exit as a shell says it; commands have said how to go on."""
+    """Exit with the status of a shell; the command has printed how to continue."""
     from tangent_train.cli.processes import SigtermError
 
     received = signal.SIGTERM if isinstance(interrupt, SigtermError) else signal.SIGINT

@@ -1,4 +1,4 @@
-"""``tangent-predict``: label maps of the user's own panoramas and photos."""
+"""``tangent-predict``: label maps of user panoramas and photos."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import read_pixels
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
-from tangent_train.cli.command_settings import PredictSettings as Settings
+from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
 from tangent_train.cli.predict_shards import PredictionShard
@@ -51,10 +51,10 @@ _DECISIVE = (
     "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
-"""Settings that results depend on: those of resumed predictions must be the same."""
+"""Settings that results depend on: resumed predictions must have the same."""
 
 _SAVED_EVERY_S = 10.0
-"""So much work is done again after a process was killed."""
+"""Seconds of work that may be lost when a process is killed."""
 
 
 def predict(config: Mapping[str, Any]) -> None:
@@ -67,7 +67,7 @@ def predict(config: Mapping[str, Any]) -> None:
         SettingError: A setting is missing or invalid.
         DataError: The checkpoint cannot be read, or there are no images.
     """
-    settings = parse_settings(Settings, config)
+    settings = parse_settings(PredictSettings, config)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.of(settings.shard)
     original, trained = _networks(settings)
@@ -93,7 +93,7 @@ def predict(config: Mapping[str, Any]) -> None:
 
 
 def _label(
-    settings: Settings,
+    settings: PredictSettings,
     decisive: Mapping[str, Any],
     inputs: Inputs,
     label: _Labeller,
@@ -147,7 +147,7 @@ def _label(
 
 
 def _finish(
-    settings: Settings,
+    settings: PredictSettings,
     inputs: Inputs,
     label: _Labeller,
     folder: PredictionFolder,
@@ -168,8 +168,8 @@ class _Labeller:
     """Reads images, predicts their labels and writes these.
 
     Args:
-        settings: Of the command.
-        original: The network with its own classes, which tells which way is up.
+        settings: Settings of the command.
+        original: The network before classes are mapped, which estimates up.
         trained: The network.
         folder: Output folder.
         shown: Names of the images of the report.
@@ -177,7 +177,7 @@ class _Labeller:
 
     def __init__(
         self,
-        settings: Settings,
+        settings: PredictSettings,
         original: TrainedNetwork,
         trained: TrainedNetwork,
         folder: PredictionFolder,
@@ -268,8 +268,8 @@ def _make_videos(
     return [{"file": str(j.path), "name": j.item, "error": j.error} for j in done if j.error]
 
 
-def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
-    """The network with its own classes, and with those of the class map."""
+def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork]:
+    """The network with its original classes, and with those of the class map."""
     if settings.class_map is None:
         return (load_trained(settings.checkpoint, settings.trust),) * 2
     class_map = load_class_map(settings.class_map)
@@ -279,7 +279,7 @@ def _networks(settings: Settings) -> tuple[TrainedNetwork, TrainedNetwork]:
     return trained, mapped.trained
 
 
-def _inputs(settings: Settings) -> Inputs:
+def _inputs(settings: PredictSettings) -> Inputs:
     """The images and videos."""
 
     def check_size(path: Path, size: tuple[int, int]) -> None:
@@ -297,7 +297,7 @@ def _inputs(settings: Settings) -> Inputs:
     return inputs
 
 
-def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
+def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     how = trained, settings.levels, settings.base_level, settings.blend
     views: PhotoViews | PanoramaViews
     if settings.projection == "equirectangular":
@@ -310,13 +310,13 @@ def _predictor(settings: Settings, trained: TrainedNetwork) -> Predictor:
     return Predictor(trained, views, *of_forward, settings.min_confidence)
 
 
-def _masks(settings: Settings) -> Masks:
+def _masks(settings: PredictSettings) -> Masks:
     if settings.mask is not None and settings.projection == "perspective":
         raise SettingError("mask", found=settings.mask, expected="null for photos")
     return Masks(settings.mask)
 
 
-def _depth_folder(settings: Settings, trained: TrainedNetwork) -> DepthFolder | None:
+def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:
     folder, wanted = settings.depth, "depth" in trained.inputs
     if wanted != (folder is not None) or (folder is not None and not folder.is_dir()):
         raise SettingError(

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 from tangent_train.cli.jobs import Shard
-from tangent_train.cli.run import Settings
 from tangent_train.console import print_text
 from tangent_train.registry import build_from_config
 
 
-def prepare(settings: Settings) -> None:
+def prepare(settings: Mapping[str, Any]) -> None:
     """Generate or check the data set.
 
     Args:

@@ -17,7 +17,7 @@ from tangent_train.checkpoints.trained import (
     completed_settings,
     describe_network,
 )
-from tangent_train.cli.run import Run, Settings
+from tangent_train.cli.run import Run
 from tangent_train.cli.settings import Trust, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
@@ -27,7 +27,9 @@ _RGB = 3
 _TYPED = re.compile(r"[+~]*network[.@=]")
 
 
-def with_pretrained_network(path: Path, settings: Settings) -> tuple[Settings, SettingsFile | None]:
+def with_pretrained_network(
+    path: Path, settings: Mapping[str, Any]
+) -> tuple[Mapping[str, Any], SettingsFile | None]:
     """Return the settings of a run with the network and the normalization of a file.
 
     The network is that of the file, unless the user typed one (``network=…``,

@@ -22,13 +22,13 @@ from datamodules.images.pixel_files import (
 from datamodules.images.tangent_folders import (
     face_name,
     panorama_area,
-    read_panorama,
+    read_placed,
     replaced_folder,
     shrink_to_level,
     write_tangent_folder,
 )
 from datamodules.images.tangent_results import TangentResults, result_files
-from tangent_train.cli.command_settings import RenderSettings as Settings
+from tangent_train.cli.command_settings import RenderSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, run_jobs
 from tangent_train.cli.settings import check_new, parse_settings
@@ -59,7 +59,7 @@ def render(config: Mapping[str, Any]) -> None:
         DataError: There is nothing to render.
         SettingError: A setting is invalid, or a file would be overwritten.
     """
-    settings = parse_settings(Settings, config)
+    settings = parse_settings(RenderSettings, config)
     modes = [name for name in ("input", "back", "poses") if getattr(settings, name) is not None]
     if len(modes) != 1:
         raise SettingError(
@@ -98,7 +98,7 @@ def _end(done: Sequence[Path], count: int) -> None:
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
-def _forward(settings: Settings) -> tuple[Iterable[Job], int, _Work]:
+def _forward(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
     """The panoramas, their number, and the function that renders one to its folder."""
     inputs, suffix = _panoramas(settings), _suffix(settings)
     names, output = inputs.names(), settings.output
@@ -108,7 +108,7 @@ def _forward(settings: Settings) -> tuple[Iterable[Job], int, _Work]:
     check_new(settings, *folders, settings.figure)
 
     def work(job: Job, progress: Callable[[float], object]) -> Path:
-        image, _ = read_panorama(job.path, settings.interpolation, settings.crop, job.value)
+        image, _ = read_placed(job.path, settings.interpolation, settings.crop, job.value)
         shape = image.shape[0], image.shape[1]
         grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
@@ -126,7 +126,7 @@ def _forward(settings: Settings) -> tuple[Iterable[Job], int, _Work]:
     return inputs.missing(()), len(names), work
 
 
-def _panoramas(settings: Settings) -> Inputs:
+def _panoramas(settings: RenderSettings) -> Inputs:
     """The panoramas of `input`, without tangent images that are among them."""
 
     def is_result(path: Path) -> bool:
@@ -139,7 +139,7 @@ def _panoramas(settings: Settings) -> Inputs:
     return Inputs.find(settings, is_result, check_size)
 
 
-def _suffix(settings: Settings) -> str:
+def _suffix(settings: RenderSettings) -> str:
     suffix = f".{settings.format}"
     if settings.interpolation == "nearest" and suffix in LOSSY_SUFFIXES:
         expected = "png, tif or npy with interpolation=nearest: others change pixels"
@@ -147,7 +147,7 @@ def _suffix(settings: Settings) -> str:
     return suffix
 
 
-def _grid(settings: Settings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
+def _grid(settings: RenderSettings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
     """The images of panoramas with so many rows, and the indices of those to write."""
     level = nearest_level(rows) if settings.level is None else settings.level
     rotation = None
@@ -160,7 +160,7 @@ def _grid(settings: Settings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
     return grid, tuple(int(face) for face in grid.face_indices(settings.faces))
 
 
-def _colmap(settings: Settings) -> None:
+def _colmap(settings: RenderSettings) -> None:
     """Render panoramas to one project for COLMAP."""
     inputs, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
     if suffix == ".npy":
@@ -175,7 +175,7 @@ def _colmap(settings: Settings) -> None:
 
         def work(job: Job, progress: Callable[[float], object]) -> Path:
             name, path = job.item, job.path
-            image, area = read_panorama(path, settings.interpolation, settings.crop, job.value)
+            image, area = read_placed(path, settings.interpolation, settings.crop, job.value)
             file = name if is_video(path) else name.removesuffix(path.suffix) + path.suffix
             project.add(names[name], file, image, masks.read(name, area), progress)
             return output
@@ -187,7 +187,7 @@ def _colmap(settings: Settings) -> None:
     _end(done, len(names))
 
 
-def _masks(settings: Settings) -> Masks:
+def _masks(settings: RenderSettings) -> Masks:
     if not settings.mask_classes:
         return Masks(settings.mask)
     if not isinstance(settings.mask, Path):
@@ -199,7 +199,7 @@ def _masks(settings: Settings) -> Masks:
     return class_masks(settings.mask, settings.mask_classes)
 
 
-def _rows(settings: Settings, inputs: Inputs) -> Iterator[int]:
+def _rows(settings: RenderSettings, inputs: Inputs) -> Iterator[int]:
     """Rows of the whole panoramas; 0 of files that cannot be read."""
     for name, path in inputs.files.items():
         rows, video = 0, inputs.videos.get(name)
@@ -210,7 +210,7 @@ def _rows(settings: Settings, inputs: Inputs) -> Iterator[int]:
         yield rows
 
 
-def _poses(settings: Settings, model: Path) -> None:
+def _poses(settings: RenderSettings, model: Path) -> None:
     """Write the poses of panoramas in a model of COLMAP."""
     output = settings.output or Path()
     check_new(settings, output)
@@ -222,7 +222,7 @@ def _poses(settings: Settings, model: Path) -> None:
     )
 
 
-def _back(settings: Settings) -> tuple[list[Job], int, _Work]:
+def _back(settings: RenderSettings) -> tuple[list[Job], int, _Work]:
     """The folders of the results of panoramas, their number, and the function that renders one."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():

@@ -47,9 +47,6 @@ from tangent_train.tasks.schedules import Schedule
 # lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
-Settings = Mapping[str, Any]
-"""All settings of a run, resolved: plain values in nested sections."""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -66,7 +63,7 @@ class Run:
     """
 
     folder: Path
-    settings: Settings
+    settings: Mapping[str, Any]
     source: SettingsFile | None
     data: Any
     task: Any
@@ -75,7 +72,7 @@ class Run:
 
     @staticmethod
     def create(
-        settings: Settings,
+        settings: Mapping[str, Any],
         source: SettingsFile | None,
         trained: TrainedNetwork | None = None,
         *,
@@ -172,8 +169,8 @@ class Run:
 
     @rank_zero_only
     def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
-        own = checkpoint.is_relative_to(self.folder)  # so that a run tells the same wherever it is
-        name = str(checkpoint.relative_to(self.folder) if own else checkpoint)
+        is_inside = checkpoint.is_relative_to(self.folder)  # the same wherever the folder is
+        name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
         write_results(record, self.folder, notes)
@@ -192,7 +189,7 @@ class Run:
 
 
 def build(
-    settings: Settings, source: SettingsFile | None = None, *, trains: bool = True
+    settings: Mapping[str, Any], source: SettingsFile | None = None, *, trains: bool = True
 ) -> tuple[Any, Any]:
     """Build the data module and the task of a run, and try them on empty inputs.
 
@@ -233,7 +230,7 @@ def build(
     return data, task
 
 
-def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
+def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -> Any:
     """Build the data module of a run, with the labels that its task needs; see `build`."""
     representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
@@ -254,7 +251,7 @@ def build_data(settings: Settings, source: SettingsFile | None = None) -> Any:
 
 
 def build_trained(
-    settings: Settings, trained: TrainedNetwork, source: SettingsFile | None = None
+    settings: Mapping[str, Any], trained: TrainedNetwork, source: SettingsFile | None = None
 ) -> tuple[Any, Any, list[str]]:
     """Build the data module and the task that evaluate a network from a file.
 
@@ -312,7 +309,12 @@ def inputs_and_classes(of: Any) -> dict[str, Any]:
 
 
 def _build_task(
-    settings: Settings, data: Any, network: nn.Module, source: SettingsFile | None, *, trains: bool
+    settings: Mapping[str, Any],
+    data: Any,
+    network: nn.Module,
+    source: SettingsFile | None,
+    *,
+    trains: bool,
 ) -> Any:
     parts: dict[str, Any] = {"optimizer": _no_optimizer}
     if trains:
@@ -337,7 +339,7 @@ def _no_optimizer(*_: Any, **__: Any) -> Any:
     raise RuntimeError("a task that is only evaluated has no optimizer")
 
 
-def _choices(settings: Settings, source: SettingsFile | None) -> dict[str, str]:
+def _choices(settings: Mapping[str, Any], source: SettingsFile | None) -> dict[str, str]:
     """The chosen options of config groups, without those in whose place a file gave a section."""
     chosen, stored = HydraConfig.get().runtime.choices, settings.get("choices") or ()
     return {

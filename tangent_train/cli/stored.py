@@ -71,11 +71,11 @@ class StoredRun:
         overrides = [a for a in self.user_overrides if a not in options]
         return [*options, *self.added, *overrides, *self.place]
 
-    def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
+    def settings(self, composed: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
         """All settings of the continued run.
 
         Args:
-            said: The composed config, resolved.
+            composed: The composed config, resolved.
 
         Returns:
             The settings, and where they come from.
@@ -84,51 +84,51 @@ class StoredRun:
             DataError: The file lacks settings.
             SettingError: A setting of this machine has to be typed.
         """
-        own = names_of(self.user_overrides)
-        own |= {"representation.level"} if "level" in own else set()
-        own |= {"data.seed"} if "seed" in own else set()
+        typed = names_of(self.user_overrides)
+        typed |= {"representation.level"} if "level" in typed else set()
+        typed |= {"data.seed"} if "seed" in typed else set()
         of_run = check_fields(self.path, self.config, _RUN, _EXPECTED)
         of_run |= check_fields(self.path, self.config, _SECTIONS, _EXPECTED)
-        settings = dict(said)
-        settings |= {name: value for name, value in of_run.items() if name not in own}
+        settings = dict(composed)
+        settings |= {name: value for name, value in of_run.items() if name not in typed}
         local: set[str] = set()
-        for name in _SECTIONS.keys() - own:
+        for name in _SECTIONS.keys() - typed:
             if settings[name] is not None:
-                settings[name], names = self._section(name, said.get(name) or {}, own)
+                settings[name], names = self._section(name, composed.get(name) or {}, typed)
                 local |= names
-        for name in own:
-            _lay(settings, said, name.split("."))
-        if "data" in own:
-            settings["data"] |= self._of_the_network(settings["data"], own)
-        trust = parse_settings(Trust, said).trust
-        return settings, SettingsFile(self.path, trust, own | local)
+        for name in typed:
+            _copy_setting(settings, composed, name.split("."))
+        if "data" in typed:
+            settings["data"] |= self._of_the_network(settings["data"], typed)
+        trust = parse_settings(Trust, composed).trust
+        return settings, SettingsFile(self.path, trust, typed | local)
 
     def _section(
-        self, name: str, here: Mapping[str, Any], own: set[str]
+        self, name: str, here: Mapping[str, Any], typed: set[str]
     ) -> tuple[dict[str, Any], set[str]]:
         """A section of the file with machine-specific settings of the user, and their names."""
-        theirs = self.config[name]
-        names = {*theirs, *here}
-        local = {n for n in names if not from_file(f"{name}.{n}", theirs.get(n))}
-        section = {n: v for n, v in theirs.items() if n not in local}
-        same = here.get("_target_") == theirs.get("_target_")
+        stored = self.config[name]
+        names = {*stored, *here}
+        local = {n for n in names if not from_file(f"{name}.{n}", stored.get(n))}
+        section = {n: v for n, v in stored.items() if n not in local}
+        same = here.get("_target_") == stored.get("_target_")
         of_user = {n: v for n, v in here.items() if n in local and same}
         section |= of_user
         for n in sorted(local & {"root", "mask"} if name == "data" else ()):
-            if f"data.{n}" not in own and section.get(n) != theirs.get(n):
+            if f"data.{n}" not in typed and section.get(n) != stored.get(n):
                 raise SettingError(
                     f"data.{n}",
                     found="none, as checkpoints do not say where files are",
                     expected="that of the run on this machine",
-                    remedy=f"The run had data.{n}={theirs.get(n)!r}: add that if it is right here.",
+                    remedy=f"The run had data.{n}={stored.get(n)!r}: add that if it is right here.",
                 )
         return section, {f"{name}.{n}" for n in of_user}
 
-    def _of_the_network(self, data: Mapping[str, Any], own: set[str]) -> dict[str, Any]:
+    def _of_the_network(self, data: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
         """Settings tied to the network, not to the data: its test fold and its inputs."""
         kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
         before = check_fields(self.path, self.config["data"], kinds, _EXPECTED, "data")
-        known = {name for name in (*data, "normalization") if f"data.{name}" not in own}
+        known = {name for name in (*data, "normalization") if f"data.{name}" not in typed}
         return {n: value for n, value in before.items() if value is not None and n in known}
 
 
@@ -151,11 +151,11 @@ class StoredNetwork:
         """The command line for Hydra."""
         return [*self.user_overrides, f"checkpoint={self.path}"]
 
-    def settings(self, said: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile, Any]:
+    def settings(self, composed: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile, Any]:
         """All settings of the evaluation.
 
         Args:
-            said: The composed config, resolved.
+            composed: The composed config, resolved.
 
         Returns:
             The settings, where they come from, and the `TrainedNetwork`.
@@ -167,33 +167,33 @@ class StoredNetwork:
         from tangent_train.inference.engine import views_per_forward
         from tangent_train.inference.representations import panorama_settings
 
-        own = names_of(self.user_overrides)
-        trust = parse_settings(Trust, said).trust
+        typed = names_of(self.user_overrides)
+        trust = parse_settings(Trust, composed).trust
         trained = load_trained(self.path, trust)
-        settings = dict(said)
-        level = said["level"] if "level" in own else None
+        settings = dict(composed)
+        level = composed["level"] if "level" in typed else None
         settings["level"] = trained.level if level is None else level
-        if "representation" not in own:
+        if "representation" not in typed:
             stored = dict(trained.representation)
             settings["representation"] = (
                 stored if level is None else panorama_settings(trained, level)
             )
-            for name in own:
+            for name in typed:
                 if name.startswith("representation."):
-                    _lay(settings, said, name.split("."))
-        elif not own & {"level", "representation.level"}:
-            settings["representation"] = dict(said["representation"]) | {"level": trained.level}
+                    _copy_setting(settings, composed, name.split("."))
+        elif not typed & {"level", "representation.level"}:
+            settings["representation"] = dict(composed["representation"]) | {"level": trained.level}
         in_file = {"_target_": "models.OnnxNetwork", "path": str(self.path)}
         settings["network"] = in_file if trained.settings is None else trained.settings
         mean, std = list(trained.normalization.mean), list(trained.normalization.std)
         tied = {"inputs": list(trained.inputs), "normalization": {"mean": mean, "std": std}}
-        if "inputs" in said["data"]:  # images, not shapes
-            known = {name: v for name, v in tied.items() if f"data.{name}" not in own}
-            settings["data"] = dict(said["data"]) | known
-        if "task.images_per_forward" not in own:  # photo networks have many classes, large images
+        if "inputs" in composed["data"]:  # images, not shapes
+            known = {name: v for name, v in tied.items() if f"data.{name}" not in typed}
+            settings["data"] = dict(composed["data"]) | known
+        if "task.images_per_forward" not in typed:  # photo networks have many classes, large images
             at_once = views_per_forward(trained.image_size)
-            settings["task"] = dict(said["task"]) | {"images_per_forward": at_once}
-        of_user = (said.keys() - {"network", "representation"}) | own
+            settings["task"] = dict(composed["task"]) | {"images_per_forward": at_once}
+        of_user = (composed.keys() - {"network", "representation"}) | typed
         return settings, SettingsFile(self.path, trust, of_user), trained
 
 
@@ -254,11 +254,11 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
     if command != "train":  # a file does not choose who sees the evaluation
         choices = {g: name for g, name in choices.items() if g not in _NEVER_STORED}
-    own = {a.partition("=")[0] for a in left}.intersection(GROUPS)
-    if own & _SECTIONS.keys():  # an experiment's settings of a section are of another option of it
+    typed = {a.partition("=")[0] for a in left}.intersection(GROUPS)
+    if typed & _SECTIONS.keys():  # an experiment's settings of a section are for another option
         choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
     added = [f"level={known['level']}", f"seed={known['seed']}"]
-    added += [f"{group}={name}" for group, name in choices.items() if group not in own]
+    added += [f"{group}={name}" for group, name in choices.items() if group not in typed]
     return StoredRun(path, config, left, added, place)
 
 
@@ -286,17 +286,17 @@ def _remembered(path: Path, names: Collection[str]) -> list[str]:
     return [f"++{name}={quoted(text)}" for name, text in paths if name not in names]
 
 
-def _check_evaluation(path: Path, own: set[str], *, of_run: bool) -> None:
+def _check_evaluation(path: Path, typed: set[str], *, of_run: bool) -> None:
     """Refuse to evaluate a network without data, or with settings of another network."""
-    if not of_run and not own & {"data", "experiment"}:
+    if not of_run and not typed & {"data", "experiment"}:
         raise SettingError(
             "data",
             found=f"none, and {path} has no settings of a run",
             expected="the data set to evaluate it on: data=stanford2d3ds data.root=…",
             remedy="class_map= gives the network the classes of the data.",
         )
-    others = sorted(name for name in own if name.partition(".")[0] == "network")
-    if others and (not of_run or "class_map" in own):
+    others = sorted(name for name in typed if name.partition(".")[0] == "network")
+    if others and (not of_run or "class_map" in typed):
         raise SettingError(others[0], found="a value", expected=f"none: the network is in {path}")
 
 
@@ -306,15 +306,15 @@ def is_own_option(group: str, option: str) -> bool:
     return group in GROUPS and folder / f"{option}.yaml" in folder.rglob("*.yaml")
 
 
-def _lay(settings: dict[str, Any], said: Any, place: Sequence[str]) -> None:
-    """Set a value at a place in settings."""
+def _copy_setting(settings: dict[str, Any], composed: Any, place: Sequence[str]) -> None:
+    """Copy one of the composed settings; remove it where there is none."""
     *sections, name = place
     for section in sections:
-        said = said.get(section) if isinstance(said, dict) else None
+        composed = composed.get(section) if isinstance(composed, dict) else None
         inner = settings.get(section)
         settings[section] = dict(inner) if isinstance(inner, dict) else {}
         settings = settings[section]
-    if isinstance(said, dict) and name in said:
-        settings[name] = said[name]
+    if isinstance(composed, dict) and name in composed:
+        settings[name] = composed[name]
     else:
         settings.pop(name, None)

@@ -9,9 +9,10 @@ import shutil
 import signal
 import sys
 import warnings
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import lightning
 from hydra.core.hydra_config import HydraConfig
@@ -25,7 +26,7 @@ from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.command_settings import TrainSettings
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.remembered import remember_paths, remembered_paths
-from tangent_train.cli.run import Run, Settings, machine_faults
+from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
@@ -35,7 +36,7 @@ from tangent_train.registry import SettingsFile
 from tangent_train.setting_rules import differing_settings, flat_settings, from_file
 
 
-def train(settings: Settings, source: SettingsFile | None = None) -> float | None:
+def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> float | None:
     """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
 
     Args:
@@ -126,7 +127,7 @@ def _training_faults(resumed: Path | None, last: LastCheckpoint) -> Iterator[Non
             raise SettingError("trainer", found=error, expected="valid settings") from error
 
 
-def _check_resumed(settings: Settings, checkpoint: Path) -> None:
+def _check_resumed(settings: Mapping[str, Any], checkpoint: Path) -> None:
     """Refuse to resume a run as another one, or for fewer epochs than it has."""
     content = read_checkpoint(checkpoint, ("config", "epoch", "state_dict"))
     for name, now, then in differing_settings(settings, content["config"], "resume"):

@@ -60,8 +60,8 @@ def transfer(config: DictConfig) -> None:
 
 def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
     """The transfer of a network whose file knows no run: it is evaluated as it is."""
-    said = list(HydraConfig.get().overrides.task)
-    for text in said:
+    overrides = list(HydraConfig.get().overrides.task)
+    for text in overrides:
         name = text.lstrip("+~").partition("=")[0]
         if re.split("[.@]", name)[0] in _OF_TRAINING:
             raise SettingError(
@@ -71,7 +71,7 @@ def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
                 remedy="tangent-train init_from= fine-tunes it.",
             )
     plain: Any = OmegaConf.to_container(config)
-    settings, _, trained = StoredNetwork(Path(config.checkpoint), said).settings(plain)
+    settings, _, trained = StoredNetwork(Path(config.checkpoint), overrides).settings(plain)
     if "${" in str(trained.representation):
         raise DataError(
             Path(config.checkpoint),

@@ -153,8 +153,8 @@ class _Planner:
 
     def _slower(self, settings: dict[str, Any]) -> dict[str, Any]:
         """The optimizer of fine-tuning; other settings are those of P's training."""
-        own, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
-        optimizer = own if "_target_" in own else before | own
+        tuned, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
+        optimizer = tuned if "_target_" in tuned else before | tuned
         if optimizer.get("lr") is None:
             if before.get("lr") is None:
                 raise SettingError(
@@ -175,10 +175,10 @@ class _Planner:
         declared = declared_settings(command).keys() - {"checkpoint"}
         if settings["class_map"] is None:
             declared -= {"class_map", "unmapped"}
-        own = {key: value for key, value in settings.items() if key in declared}
-        own |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
+        config = {key: value for key, value in settings.items() if key in declared}
+        config |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
         if name[0] == "P":
-            own |= {key: settings["photos"][key] for key in ("data", "representation")}
+            config |= {key: settings["photos"][key] for key in ("data", "representation")}
         trained = self._folder / "P" / "checkpoints" / "best.ckpt"
         scratch = name == "P" and not self._given
         return Stage(
@@ -187,7 +187,7 @@ class _Planner:
             seed=self._seed,
             folder=self._folder / name,
             command=command,
-            config=own,
+            config=config,
             weights=None if scratch else Path(self._given or trained),
         )
 

@@ -13,19 +13,15 @@ from tangent_train.geometry.pinhole_grid import PinholeGrid
 
 _X, _Y, _Z = np.eye(3)
 
-_AXES = np.stack(
-    [
-        np.stack(axes, axis=-1)
-        for axes in (  # right, down, forward
-            (_Y, -_Z, _X),
-            (-_X, -_Z, _Y),
-            (-_Y, -_Z, -_X),
-            (_X, -_Z, -_Y),
-            (_Y, _X, _Z),
-            (_Y, -_X, -_Z),
-        )
-    ]
-)
+_FACES = [  # right, down, forward
+    (_Y, -_Z, _X),
+    (-_X, -_Z, _Y),
+    (-_Y, -_Z, -_X),
+    (_X, -_Z, -_Y),
+    (_Y, _X, _Z),
+    (_Y, -_X, -_Z),
+]
+_AXES = np.array(_FACES).swapaxes(1, 2)
 
 _NEIGHBORS = np.nonzero(_AXES[..., 2] @ _AXES[..., 2].T == 0)[1].reshape(6, 4).astype(np.int32)
 _NEIGHBORS.setflags(write=False)

@@ -94,6 +94,7 @@ def fill(
     sets: Iterable[tuple[Views, ViewImages, Tensor | None]],
     per_forward: int,
     progress: Callable[[int], object] = lambda count: None,
+    scored: Callable[[Tensor, Views], object] = lambda scores, views: None,
 ) -> ScoreMosaic:
     """Add the scores of sets of views to a mosaic.
 
@@ -103,10 +104,12 @@ def fill(
         sets: Views that cover the whole image, their images, and the rays that the network takes.
         per_forward: Views per call of the network.
         progress: Called with the number of views done since its last call.
+        scored: Called with the scores of some views.
     """
     for views, images, rays in sets:
         for part, scores in view_scores(network, images, len(views), per_forward, rays):
             mosaic.add(scores, views[part])
+            scored(scores, views[part])
             progress(part.stop - part.start)
     return mosaic
 
@@ -152,7 +155,12 @@ def input_planes(
         level, lines = (torch.from_numpy(a).to(device) for a in (up[:2] @ columns, rows))
         elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
         others.append((elevation[None].float(), "bilinear"))
-    return resize(rgb, shape, "bilinear"), others
+    return resize(rgb, shape, "bilinear").round_(), others
+
+
+def renders_arrays(device: torch.device | str) -> bool:
+    """True on the CPU, where OpenCV renders faster than torch."""
+    return torch.device(device).type == "cpu"
 
 
 class RenderedViews:
@@ -181,9 +189,9 @@ class RenderedViews:
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
         self._trained = trained
-        on_cpu = torch.device(device).type == "cpu"
-        self._image = image.resized(shape) if on_cpu else image
-        self._planes = None if on_cpu else input_planes(image, shape, trained.inputs, device)
+        arrays = renders_arrays(device)
+        self._image = image.resized(shape) if arrays else image
+        self._planes = None if arrays else input_planes(image, shape, trained.inputs, device)
 
     def __call__(self, views: Views) -> Tensor:
         """Views ``(n, C, h, w)``, normalized."""

@@ -1,4 +1,4 @@
-"""The user's own images as network input, from files and from memory."""
+"""User images as network input, from files and from memory."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from datamodules.core.panoramas import meters_to_steps, resize_depth, resize_nearest
-from datamodules.images.gpano import PanoramaArea, up_of, whole_area
+from datamodules.images.gpano import PanoramaArea, read_up, whole_area
 from datamodules.images.image_files import NamedFiles, find_depth
 from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from datamodules.images.tangent_folders import panorama_area
@@ -139,12 +139,12 @@ def read_panorama(
     else:
         area = whole_area(_IN_MEMORY, size, _NOT_WHOLE)
     steps = None if depth is None else depth(size)
-    up = None if upright is None or path is None else up_of(path)
+    up = None if upright is None or path is None else read_up(path)
     return InputImage(area.place(rgb), None if steps is None else area.place(steps), up), area
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
-    """A panorama with its zenith: its own, or else as estimated.
+    """A panorama with its zenith: as given, or else as estimated.
 
     Args:
         image: A panorama.

@@ -155,7 +155,7 @@ class Network:
         Args:
             image: A panorama, or a photo.
             depth: ``(H, W)`` floats in metres, for networks that see depth, 0 or NaN where missing:
-                the distance from the centre, in photos along the optical axis.
+                the distance from the center, in photos along the optical axis.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             crop: West, east, south and north of a part of a panorama in degrees, see
                 `area_of_crop`; None for that of its file's GPano tags, else the whole sphere,

@@ -27,7 +27,7 @@ class ClassificationScores(NamedTuple):
 
 
 def classification_scores(confusion: ArrayLike) -> ClassificationScores:
-    """Scores of a whole data set.
+    """Compute the scores of a whole data set.
 
     Args:
         confusion: ``(K, K)`` counts, rows truth, columns prediction.

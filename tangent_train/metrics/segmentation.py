@@ -16,7 +16,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
 
 AbsentClass = Literal["skip", "zero"]
-"""Whether a class without labelled pixels is left out of a mean or counts as 0."""
+"""Treatment of a class without labelled pixels: left out of a mean, or counted as 0."""
 
 UNKNOWN = 0
 """Class index of unlabelled pixels, everywhere."""
@@ -49,11 +49,21 @@ class SegmentationScores(NamedTuple):
     accuracy: NDArray[np.float64]
     share: NDArray[np.float64]
 
+    @property
+    def means(self) -> dict[str, float]:
+        """Scores over all classes by name."""
+        return {"miou": self.miou, "macc": self.macc}
+
+    @property
+    def of_classes(self) -> dict[str, NDArray[np.float64]]:
+        """Scores of the classes by name."""
+        return {"iou": self.iou, "accuracy": self.accuracy}
+
 
 def segmentation_scores(
     confusion: ArrayLike, absent_class: AbsentClass = "skip"
 ) -> SegmentationScores:
-    """Scores of a whole data set.
+    """Compute the scores of a whole data set.
 
     Args:
         confusion: ``(K+1, K+1)`` counts or weights, rows truth, columns prediction, class 0 unknown
@@ -90,7 +100,7 @@ def _class_scores(
 
 
 def _mean_of_classes(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean over the last axis of what is not NaN; NaN where nothing is."""
+    """Mean of the numbers that are not NaN over the last axis; NaN without one."""
     count = np.sum(~np.isnan(scores), axis=-1)
     total = np.nansum(scores, axis=-1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -102,7 +112,7 @@ def bootstrap_intervals(
     draws: int = 1000,
     seed: int = 0,
 ) -> dict[str, Interval]:
-    """95 % percentile bootstrap intervals of mIoU and mAcc, with images as the unit.
+    """Compute 95 % percentile bootstrap intervals of mIoU and mAcc, with images as the unit.
 
     Every draw takes as many images as there are, with replacement, and scores them as one data set
     (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The order of the
@@ -112,7 +122,7 @@ def bootstrap_intervals(
         of_images: Half of `SegmentationCounts.of_images`: pixels or solid angles.
         absent_class: Treatment of classes absent from the ground truth of a draw.
         draws: Number of draws.
-        seed: Of the draws.
+        seed: Seed of the draws.
 
     Returns:
         Intervals of ``miou`` and ``macc``; none of a single image, or where nothing is labelled.

@@ -20,7 +20,7 @@ from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import over_rows
 
 if TYPE_CHECKING:
-    from tangent_train.rendering.representations.views import Placement
+    from tangent_train.rendering.representations.views import Views
 
 _NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
@@ -37,7 +37,7 @@ _SPANS = 2**23
 
 def add_to_canvas(
     scores: NDArray[np.float32],
-    images: Placement,
+    images: Views,
     shape: tuple[int, int],
     rows: slice,
     owner: NDArray[np.integer],
@@ -65,11 +65,11 @@ def add_to_canvas(
 
 def label_canvas(
     scores: NDArray[np.float32],
-    images: Placement,
+    images: Views,
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:
-    """Write the best classes of all pixels that some images own or, feathered, see.
+    """Write the best classes of all pixels that some images own, or see where they are feathered.
 
     Args:
         scores: ``(n, K, h, w)`` of the images; of all images, for feathering.
@@ -105,7 +105,7 @@ def zero_sums(
     Args:
         shape: ``(H, W)``.
         channels: K.
-        spare: Sums that nobody uses any more; clearing them is faster than new memory.
+        spare: Sums that are no longer used; clearing them is faster than new memory.
 
     Returns:
         ``(H, W, Kp)``, see `kernels`.

@@ -53,7 +53,7 @@ def tangent_to_equirect(
             all images that see it, weights falling to 0 at the images' borders: no seams; see
             `blend_of` for images that do not overlap.
         interpolation: ``bilinear``, or ``nearest`` for labels, masks and depth of any dtype: the
-            owner's pixel whose centre is nearest, kept exactly. Only with the blend ``nearest``.
+            owner's pixel whose center is nearest, kept exactly. Only with the blend ``nearest``.
 
     Returns:
         A tensor ``(..., C, H, W)`` or an array ``(H, W[, C])``, of the dtype of the images.
@@ -61,7 +61,7 @@ def tangent_to_equirect(
     Raises:
         SettingError: The images, the shape, the blend or the interpolation cannot be used.
     """
-    blend = blend_of(blend, grid)
+    blend = blend_of(blend, overlapping=grid.overlapping)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
     check_images("tangent images", images, grid, interpolation)
@@ -104,7 +104,7 @@ def tangent_to_labels(
         SettingError: The logits, the shape or the blend cannot be used.
     """
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
-    blend = blend_of(blend, grid)
+    blend = blend_of(blend, overlapping=grid.overlapping)
     shape = check_shape(shape)
     check_images("scores", scores, grid)
     small = torch.uint8 if scores.shape[-3] <= 256 else torch.uint16

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 import torch
@@ -23,15 +23,6 @@ _MOST_COLORS = 4
 _COLOR_DIMENSIONS = 3
 
 
-class HasOverlap(Protocol):
-    """Images that may overlap."""
-
-    @property
-    def overlapping(self) -> bool:
-        """True if every direction is inside an image, not only on its outer edge."""
-        ...
-
-
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
     """Raise SettingError unless the interpolation is known and goes with the blend."""
     check_choice("interpolation", interpolation, ("bilinear", "nearest"))
@@ -44,7 +35,7 @@ def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
         )
 
 
-def blend_of(blend: Blend, images: HasOverlap) -> Blend:
+def blend_of(blend: Blend, *, overlapping: bool) -> Blend:
     """The blend of images: images that do not overlap have nothing to feather.
 
     Feather weights are 0 on the edges where such images meet: the faces of a cube map without a
@@ -52,13 +43,13 @@ def blend_of(blend: Blend, images: HasOverlap) -> Blend:
 
     Args:
         blend: The wanted blend.
-        images: The images.
+        overlapping: True if every pixel is inside an image, not only on its outer edge.
 
     Raises:
         SettingError: There is no such blend.
     """
     check_choice("blend", blend, ("nearest", "feather"))
-    return blend if images.overlapping else "nearest"
+    return blend if overlapping else "nearest"
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

@@ -14,12 +14,13 @@ import torch
 from torch.nn.functional import grid_sample
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from tangent_train.rendering.representations.views import Placement
+    from tangent_train.rendering.kernels import CanvasGeometry
+    from tangent_train.rendering.representations.views import Views
 
 _SCORES_AT_ONCE = 2**25
 """Scores that are sampled in one call, 128 MiB."""
@@ -70,7 +71,7 @@ class DeviceSums:
         self.sums = torch.zeros((channels, *shape), dtype=torch.float32, device=device)
         self._labels = torch.zeros(shape, dtype=torch.int32, device=device)
 
-    def add(self, scores: Tensor, images: Placement, owner: Tensor | None) -> None:
+    def add(self, scores: Tensor, images: Views, owner: Tensor | None) -> None:
         """Add the scores of some images.
 
         Args:
@@ -83,10 +84,10 @@ class DeviceSums:
         spans = geometry.spans if owner is None else images.owned_spans(self._shape)
         if owner is None:
             scores = _softmax(scores)
-        rays = _Rays(geometry.matrices, geometry.columns, geometry.rows, scores)
+        offsets_in = _offsets_in(geometry, scores)
         for m, number in enumerate(images.chosen.tolist()):
             for rows, columns in _boxes(spans[m], self._shape[1], scores.shape[1]):
-                offsets = rays.offsets(m, rows, columns)
+                offsets = offsets_in(m, rows, columns)
                 sampled = grid_sample(
                     scores[m : m + 1],
                     offsets.movedim(0, -1)[None].float(),
@@ -121,47 +122,30 @@ class DeviceSums:
         return self._labels.to(torch.uint8 if self._num_classes < 256 else torch.uint16)
 
 
-class _Rays:
-    """Positions of the pixels of a canvas in images.
+def _offsets_in(canvas: CanvasGeometry, scores: Tensor) -> Callable[[int, slice, slice], Tensor]:
+    """Positions of pixels of a canvas in images ``(n, K, h, w)``.
 
-    Args:
-        matrices: ``(n, 3, 3)`` see `CanvasGeometry`.
-        columns: ``(2, W)`` factors of the rays.
-        rows: ``(H, 2)`` factors of the rays.
-        scores: ``(n, K, h, w)`` of the images, on the device.
+    Returns:
+        A function of an image, rows and columns that gives ``(2, rows, columns)`` offsets from the
+        center of the image in half image sides; 2 where it looks away.
     """
+    device, (height, width) = scores.device, scores.shape[-2:]
+    dtype = torch.float32 if device.type == "mps" else torch.float64
+    scaled = np.diag([2 / width, 2 / height, 1]) @ canvas.matrices
+    scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * canvas.matrices[:, 2:]
+    m, c, r = (
+        torch.from_numpy(array).to(device, dtype, non_blocking=True)
+        for array in (scaled, canvas.columns, canvas.rows)
+    )
+    with torch.autocast(device.type, enabled=False):
+        of_columns, of_rows = m[:, :, None, :2] @ c, (m[:, :, 2:] * r[:, 1])[..., None]
 
-    def __init__(
-        self,
-        matrices: NDArray[np.float64],
-        columns: NDArray[np.float64],
-        rows: NDArray[np.float64],
-        scores: Tensor,
-    ) -> None:
-        device = scores.device
-        dtype = torch.float32 if device.type == "mps" else torch.float64
-        height, width = scores.shape[-2:]
-        # To offsets from the center in half image sides.
-        scaled = np.diag([2 / width, 2 / height, 1]) @ matrices
-        scaled[:, :2] += np.array([[1 / width - 1], [1 / height - 1]]) * matrices[:, 2:]
-        m, c, r = (
-            torch.from_numpy(a).to(device, dtype, non_blocking=True)
-            for a in (scaled, columns, rows)
-        )
-        with torch.autocast(device.type, enabled=False):
-            self._of_columns = m[:, :, :2] @ c  # (n, 3, W)
-        self._of_rows = m[:, :, 2:] * r[:, 1]  # (n, 3, H)
-        self._factor = r[:, :1]
+    def offsets(image: int, rows: slice, columns: slice) -> Tensor:
+        factors = r[rows, :1], of_columns[image, ..., columns]
+        x, y, z = torch.addcmul(of_rows[image, :, rows], *factors)
+        return (torch.stack([x, y]) / z).masked_fill_(z <= 0, 2)
 
-    def offsets(self, m: int, rows: slice, columns: slice) -> Tensor:
-        """``(2, rows, columns)`` offsets in image m; 2 where it looks away."""
-        x, y, z = torch.addcmul(
-            self._of_rows[m, :, rows, None],
-            self._factor[rows],
-            self._of_columns[m, :, None, columns],
-        )
-        offsets = torch.stack([x, y]) / z
-        return offsets.masked_fill_(z <= 0, 2)
+    return offsets
 
 
 def _boxes(spans: NDArray[np.int32], width: int, num_classes: int) -> Iterator[tuple[slice, slice]]:

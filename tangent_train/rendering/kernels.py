@@ -162,10 +162,10 @@ def _enough(buffers: Array, size: int) -> Array:
 
 
 @njit_fast
-def _count(geometry: CanvasGeometry) -> int:
+def _count(canvas: CanvasGeometry) -> int:
     """One more than the greatest number of an image."""
-    greatest = geometry.images.max()
-    return max(greatest, geometry.owner.max()) + 1 if len(geometry.owner) else greatest + 1
+    greatest = canvas.images.max()
+    return max(greatest, canvas.owner.max()) + 1 if len(canvas.owner) else greatest + 1
 
 
 @njit_fast
@@ -193,16 +193,16 @@ def _owned_runs(tile: Tile, owner: Array, runs: Array, owns: Array) -> int:
 
 
 @njit_fast
-def _seen_runs(tile: Tile, m: int, geometry: CanvasGeometry, runs: Array) -> int:
+def _seen_runs(tile: Tile, m: int, canvas: CanvasGeometry, runs: Array) -> int:
     """See `_owned_runs`, of pixels of which image m may see something."""
     top, bottom, left, right = tile
-    width, count = geometry.columns.shape[1], 0
+    width, count = canvas.columns.shape[1], 0
     for i in range(top, bottom):
-        begin, span = geometry.spans[m, i, 0], geometry.spans[m, i, 1]
+        begin, span = canvas.spans[m, i, 0], canvas.spans[m, i, 1]
         for back in range(0, width + 1, width):
             start, stop = max(left, begin - back), min(right, begin + span - back)
             if start < stop:
-                runs[count, 0], runs[count, 1] = geometry.images[m], i
+                runs[count, 0], runs[count, 1] = canvas.images[m], i
                 runs[count, 2], runs[count, 3] = start, stop
                 count += 1
     return count
@@ -212,7 +212,7 @@ def _seen_runs(tile: Tile, m: int, geometry: CanvasGeometry, runs: Array) -> int
 def _list_pixels(
     m: int,
     side: tuple[int, int],
-    geometry: CanvasGeometry,
+    canvas: CanvasGeometry,
     found: int,
     step: tuple[int, int],
     buffers: _TileBuffers,
@@ -220,9 +220,9 @@ def _list_pixels(
     """List the pixels of runs that image m contributes to; returns how many.
 
     Args:
-        m: Index of the image in `geometry`.
+        m: Index of the image in `canvas`.
         side: Rows and columns of the image.
-        geometry: Geometry of images and canvas.
+        canvas: Geometry of images and canvas.
         found: Number of runs, of any images.
         step: From a row to the next one where results go, and there the place of pixel (0, 0).
         buffers: Holds the runs; pixels, columns, rows and weights are written.
@@ -231,15 +231,15 @@ def _list_pixels(
     count = 0
     for n in range(found):
         image, i, start, stop = buffers.runs[n]
-        if image != geometry.images[m]:
+        if image != canvas.images[m]:
             continue
         first, count = count, count + stop - start
-        row = geometry.rows[i]
-        _project(geometry.matrices[m], row, geometry.columns, start, stop, u[first:], v[first:])
+        row = canvas.rows[i]
+        _project(canvas.matrices[m], row, canvas.columns, start, stop, u[first:], v[first:])
         pixels, weights = pixel[first:count], weight[first:count]
         for p in range(len(pixels)):
             pixels[p], weights[p] = i * step[0] + step[1] + start + p, 1
-        if len(geometry.owner) == 0 and _feather(side, u[first:], v[first:], weights) > 0:
+        if len(canvas.owner) == 0 and _feather(side, u[first:], v[first:], weights) > 0:
             last, count = count, first
             for p in range(first, last):
                 if weight[p] > 0:
@@ -421,12 +421,12 @@ def _add_probabilities(
 
 
 @njit_fast
-def _tiles(start: int, stop: int, geometry: CanvasGeometry, pixels: int) -> list[Tile]:
+def _tiles(start: int, stop: int, canvas: CanvasGeometry, pixels: int) -> list[Tile]:
     """Tiles of `pixels` or fewer, about square on the sphere, that cover rows ``start:stop``."""
-    tiles, bottom, width = [], start, geometry.columns.shape[1]
+    tiles, bottom, width = [], start, canvas.columns.shape[1]
     while bottom < stop:
         top, remaining = bottom, stop - bottom
-        parts = round(remaining / math.sqrt(pixels * abs(geometry.rows[top, 0])))
+        parts = round(remaining / math.sqrt(pixels * abs(canvas.rows[top, 0])))
         rows = -(-remaining // max(1, parts))
         bottom, across = top + rows, pixels // rows
         for first in range(0, width, across):
@@ -457,7 +457,7 @@ def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -
 
 @njit_fast
 def _add_to_tile(
-    tile: Tile, scores: Array, geometry: CanvasGeometry, softmax: bool, step: tuple[int, int],
+    tile: Tile, scores: Array, canvas: CanvasGeometry, softmax: bool, step: tuple[int, int],
     owns: Array, buffers: _TileBuffers, taps: _Taps, patch: Array, sums: Array,
 ) -> Array:  # fmt: skip
     """Add weighted scores of images to the sums of a tile.
@@ -465,7 +465,7 @@ def _add_to_tile(
     Args:
         tile: The tile.
         scores: ``(n, K, h, w)``.
-        geometry: Geometry of the images and the canvas.
+        canvas: Geometry of the images and the canvas.
         softmax: Whether to add probabilities.
         step: See `_list_pixels`.
         owns: Buffer for all images, true at first.
@@ -478,15 +478,15 @@ def _add_to_tile(
         The buffer for a part of an image, or a larger one.
     """
     side, classes, found = (scores.shape[2], scores.shape[3]), sums.shape[2], 0
-    owned = len(geometry.owner) > 0
+    owned = len(canvas.owner) > 0
     if owned:
-        found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
+        found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
     for m in range(len(scores)):
-        if not owns[geometry.images[m]]:
+        if not owns[canvas.images[m]]:
             continue
         if not owned:
-            found = _seen_runs(tile, m, geometry, buffers.runs)
-        n = _list_pixels(m, side, geometry, found, step, buffers)
+            found = _seen_runs(tile, m, canvas, buffers.runs)
+        n = _list_pixels(m, side, canvas, found, step, buffers)
         if n == 0:
             continue
         top, left, high, wide = _split(n, side, buffers)
@@ -504,7 +504,7 @@ def add_images(
     start: int,
     stop: int,
     scores: Array,
-    geometry: CanvasGeometry,
+    canvas: CanvasGeometry,
     softmax: bool,
     total: Array,
     labels: Array,
@@ -517,22 +517,22 @@ def add_images(
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        geometry: Geometry of these images and the canvas.
+        canvas: Geometry of these images and the canvas.
         softmax: Whether to add probabilities: those of owners are of the interpolated scores,
             feathered ones are interpolated.
         total: ``(H, W, Kp)`` sums, changed. Empty where only labels are wanted, for which all
             images of a pixel have to come at once.
         labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
     """
-    num_classes, width = scores.shape[1], geometry.columns.shape[1]
-    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(geometry.owner) > 0
-    owns, covered = np.ones(_count(geometry), np.bool_), np.zeros(_count(geometry), np.bool_)
-    for image in geometry.images:
+    num_classes, width = scores.shape[1], canvas.columns.shape[1]
+    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(canvas.owner) > 0
+    owns, covered = np.ones(_count(canvas), np.bool_), np.zeros(_count(canvas), np.bool_)
+    for image in canvas.images:
         covered[image] = True
     pixels = max(64, _TILE_SCORES // classes)
     buffers, taps, patch = _tile_buffers(pixels), _tap_buffers(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
-    for tile in _tiles(start, stop, geometry, pixels):
+    for tile in _tiles(start, stop, canvas, pixels):
         top, bottom, left, right = tile
         sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
@@ -542,12 +542,12 @@ def add_images(
             sums[:] = 0
             step = wide, -top * wide - left
         before = softmax and not afterwards
-        patch = _add_to_tile(tile, scores, geometry, before, step, owns, buffers, taps, patch, sums)
+        patch = _add_to_tile(tile, scores, canvas, before, step, owns, buffers, taps, patch, sums)
         if len(total) == 0:
             for i in range(top, bottom):
                 _write_classes(sums[i - top], num_classes, 0.0, labels[i, left:right])
         elif afterwards:
-            _add_probabilities(tile, covered, geometry.owner, num_classes, sums, total)
+            _add_probabilities(tile, covered, canvas.owner, num_classes, sums, total)
 
 
 @njit_fast
@@ -640,7 +640,7 @@ def _write_alike(
 
 @njit_fast
 def label_images(
-    start: int, stop: int, scores: Array, geometry: CanvasGeometry, labels: Array
+    start: int, stop: int, scores: Array, canvas: CanvasGeometry, labels: Array
 ) -> None:
     """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
 
@@ -651,23 +651,23 @@ def label_images(
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
-        geometry: Geometry of these images and the canvas, with owners.
+        canvas: Geometry of these images and the canvas, with owners.
         labels: ``(H, W)``, written.
     """
     side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
     buffers, taps, owns = (
         _tile_buffers(pixels),
         _tap_buffers(pixels),
-        np.empty(_count(geometry), np.bool_),
+        np.empty(_count(canvas), np.bool_),
     )
     highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
-    for tile in _tiles(start, stop, geometry, pixels):
-        found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
+    for tile in _tiles(start, stop, canvas, pixels):
+        found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
         for m in range(len(scores)):
-            if not owns[geometry.images[m]]:
+            if not owns[canvas.images[m]]:
                 continue
-            n = _list_pixels(m, side, geometry, found, (width, 0), buffers)
+            n = _list_pixels(m, side, canvas, found, (width, 0), buffers)
             top, left, high, wide = _split(n, side, buffers)
             best = _enough(best, high * wide)
             part = best[: high * wide].reshape((high, wide))
@@ -690,7 +690,7 @@ def best_classes(
 
 @njit_exact
 def seen_table(
-    start: int, stop: int, side: tuple[int, int], geometry: CanvasGeometry,
+    start: int, stop: int, side: tuple[int, int], canvas: CanvasGeometry,
     count: Array, face: Array, u: Array, v: Array, weight: Array,
 ) -> None:  # fmt: skip
     """All images that contribute to a pixel, for the rows ``start:stop``.
@@ -699,26 +699,26 @@ def seen_table(
         start: First row.
         stop: One past the last row.
         side: Rows and columns of the images.
-        geometry: Geometry of images and canvas.
+        canvas: Geometry of images and canvas.
         count: ``(H, W)`` how many images there are, 0 before, written.
         face: ``(R, H, W)`` images, written; with R = 0 they are only counted.
         u: ``(R, H, W)`` columns in the images, written.
         v: ``(R, H, W)`` rows in the images, written.
         weight: ``(R, H, W)`` weights, written.
     """
-    width = geometry.columns.shape[1]
-    owned, owns = len(geometry.owner) > 0, np.ones(_count(geometry), np.bool_)
+    width = canvas.columns.shape[1]
+    owned, owns = len(canvas.owner) > 0, np.ones(_count(canvas), np.bool_)
     buffers, found = _tile_buffers(width), 0
     for i in range(start, stop):
         tile = i, i + 1, 0, width
         if owned:
-            found = _owned_runs(tile, geometry.owner, buffers.runs, owns)
-        for m in range(len(geometry.matrices)):
-            if not owns[geometry.images[m]]:
+            found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
+        for m in range(len(canvas.matrices)):
+            if not owns[canvas.images[m]]:
                 continue
             if not owned:
-                found = _seen_runs(tile, m, geometry, buffers.runs)
-            for p in range(_list_pixels(m, side, geometry, found, (0, 0), buffers)):
+                found = _seen_runs(tile, m, canvas, buffers.runs)
+            for p in range(_list_pixels(m, side, canvas, found, (0, 0), buffers)):
                 j = buffers.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1

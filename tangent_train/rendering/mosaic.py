@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from tangent_train.rendering.representations.views import Placement, Views
+    from tangent_train.rendering.representations.views import Views
 
 _LEAST_TOTAL = 1e-37
 
@@ -125,9 +125,9 @@ class ScoreMosaic:
             total = torch.from_numpy(self.sums[rows][..., : self._num_classes])
         return total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)
 
-    def _owners(self, images: Placement) -> Any:
+    def _owners(self, images: Views) -> Any:
         """Owner of each pixel, kept until images of another set are added."""
-        if blend_of(self.blend, images) == "feather":
+        if blend_of(self.blend, overlapping=images.overlapping) == "feather":
             return NO_OWNERS
         if self._owned[0] is not images.all_images:
             owner: Any = images.owners(self.shape)

@@ -85,7 +85,7 @@ def _filtered(
     shape: tuple[int, int],
     kind: Literal["area", "linear", "triangle"],
 ) -> Tensor:
-    """A part of ``(C, H, W)`` resized; of whole numbers in floats, whole numbers."""
+    """A part of ``(C, H, W)`` resized."""
     down, across = (
         torch.from_numpy(_weights(image.shape[axis - 2], near, far, count, kind)).to(image.device)
         for axis, (near, far, count) in enumerate(
@@ -93,7 +93,7 @@ def _filtered(
         )
     )
     with torch.autocast(image.device.type, enabled=False):
-        return (down @ (image @ across.T)).round()
+        return down @ (image @ across.T)
 
 
 def _weights(

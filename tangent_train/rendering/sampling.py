@@ -290,7 +290,7 @@ def bilinear_equirect_taps(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Taps
 
 
 def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The pixel centre nearest to positions in an ERP; half-way between two, the even one.
+    """The pixel center nearest to positions in an ERP; half-way between two, the even one.
 
     Args:
         u: ``(P,)`` columns, any real number.
@@ -308,7 +308,7 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
 def image_taps(
     face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor, image_size: int
 ) -> Taps:
-    """Bilinear taps in tangent images; positions beyond the outermost pixel centres are clamped.
+    """Bilinear taps in tangent images; positions beyond the outermost pixel centers are clamped.
 
     Args:
         face: ``(R, P)`` images, any integer dtype.
@@ -332,7 +332,7 @@ def image_taps(
 
 
 def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:
-    """The pixel centre nearest to positions in tangent images; half-way between two, the even one.
+    """The pixel center nearest to positions in tangent images; half-way between two, the even one.
 
     Args:
         face: ``(P,)`` images, any integer dtype.

@@ -59,20 +59,21 @@ class TableCache:
                 return held
         table = build()
         with self._lock:
-            if _nbytes(table) <= self.limit and key not in self._tables:
+            size = _nbytes(table)
+            if size <= self.limit and key not in self._tables:
+                self._drop(self.limit - size)
                 self._tables[key] = table
-                self.nbytes += _nbytes(table)
-                self._drop()
+                self.nbytes += size
         return table
 
     def set_limit(self, limit: int) -> None:
         """Change the limit, dropping what no longer fits."""
         with self._lock:
             self.limit = limit
-            self._drop()
+            self._drop(limit)
 
-    def _drop(self) -> None:
-        while self.nbytes > self.limit:
+    def _drop(self, limit: int) -> None:
+        while self.nbytes > limit:
             self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
 
     def _new_lock(self) -> None:
@@ -159,7 +160,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
-    """Cosine of half the angle between the nearest two centres: nearer to one is the nearest."""
+    """Cosine of half the angle between the nearest two centers: nearer to one is the nearest."""
     centers, around = grid.centers_xyz, grid.neighbors
     cosines = np.einsum("nkc,nc->nk", centers[around], centers)
     others = around != np.arange(grid.num_images)[:, None]
@@ -171,16 +172,16 @@ def find_owners(
     start: int, stop: int, centers: Array, neighbors: Array, inner: float,
     columns: Array, rows: Array, face: Array,
 ) -> None:  # fmt: skip
-    """Find the image with the nearest centre, for the ERP rows ``start:stop``.
+    """Find the image with the nearest center, for the ERP rows ``start:stop``.
 
-    Steps to ever nearer centres, starting from the owner of the previous pixel.
+    Steps to ever nearer centers, starting from the owner of the previous pixel.
 
     Args:
         start: First row.
         stop: One past the last row.
-        centers: ``(N, 3)`` directions of the images' centres.
+        centers: ``(N, 3)`` directions of the images' centers.
         neighbors: ``(N, k)`` images around every image.
-        inner: Cosine of half the angle between the nearest two centres: a centre nearer than that
+        inner: Cosine of half the angle between the nearest two centers: a center nearer than that
             is the nearest.
         columns: From `sphere_rays`.
         rows: From `sphere_rays`.
@@ -299,7 +300,7 @@ def _inside(normals: Array, x: float, y: float, z: float) -> bool:
 def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
     """Find the columns of ERP rows ``start:stop`` that may see something of images.
 
-    An image is seen between four planes through the centre of the sphere. What a row sees of it
+    An image is seen between four planes through the center of the sphere. What a row sees of it
     begins and ends where the row crosses one of them between the others.
 
     Args:

@@ -11,7 +11,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from tangent_train.results.record import Heading
 from tangent_train.results.rows import Row, Statistic
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
@@ -28,46 +27,40 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     the images of a single run; hatched bars are published.
 
     Args:
-        title: Of the chart.
+        title: Title of the chart.
         rows: Rows of the same scores and classes.
 
     Returns:
         A PNG file.
     """
     record = rows[0].records[0]
-    headings, names = record.headings, record.class_names
     panels: list[_Panel] = []
-    for unit in dict.fromkeys(heading.unit for heading in headings.values()):
-        shown = [name for name, heading in headings.items() if heading.unit == unit]
+    for unit in dict.fromkeys(heading.unit for heading in record.headings.values()):
+        shown = {n: h.text for n, h in record.headings.items() if h.unit == unit}
         means = [[row.score(name) for name in shown] for row in rows]
-        ticks = [headings[name].text for name in shown]
-        panels.append(_Panel("" if panels else title, ticks, means, unit))
-    if names:
-        score = record.main_of_class
-        heading = headings[record.class_means[score]]
+        panels.append(_Panel("" if panels else title, list(shown.values()), means, unit))
+    if score := record.main_of_class:
+        heading, names = record.headings[record.class_means[score]], record.class_names
         classes = [[row.score(score, name) for name in names] for row in rows]
-        title = f"{heading.class_text} of each class"
-        panels.append(_Panel(title, names, classes, heading.unit))
+        panels.append(_Panel(f"{heading.class_text} of each class", names, classes, heading.unit))
     return _png(rows, *panels)
 
 
-def grid_png(
-    title: str, grid: Mapping[str, Mapping[str, Row]], heading: Heading, score: str
-) -> bytes:
+def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str, unit: str) -> bytes:
     """Bars of one score of every view, in groups of one condition.
 
     Args:
-        title: Of the chart.
+        title: Title of the chart.
         grid: Rows by view, every one with all conditions.
-        heading: Heading of the score.
         score: Name of the score over all images.
+        unit: Unit of the score.
 
     Returns:
         A PNG file.
     """
     scores = [[row.score(score) for row in found.values()] for found in grid.values()]
     conditions = list(next(iter(grid.values())))
-    panel = _Panel(f"{title}: {heading.text}", conditions, scores, heading.unit)
+    panel = _Panel(title, conditions, scores, unit)
     return _png([Row(view, ()) for view in grid], panel)
 
 
@@ -78,10 +71,6 @@ class _Panel(NamedTuple):
     ticks: Sequence[str]
     scores: Sequence[Sequence[Statistic]]
     unit: str
-
-    def shown(self, values: Sequence[float | None]) -> list[float]:
-        """Numbers in the unit; NaN, which draws nothing, for None."""
-        return _in_unit(values, self.unit)
 
 
 def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
@@ -115,9 +104,9 @@ def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
         again = number >= len(_COLORS)  # a second row of a colour
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
-            panel.shown([score.mean for score in found]),
+            _in_unit([score.mean for score in found], panel.unit),
             0.92 * width,
-            yerr=np.transpose([panel.shown(_error_bar(score)) for score in found]),
+            yerr=np.transpose([_in_unit(_error_bar(score), panel.unit) for score in found]),
             color=_COLORS[number % len(_COLORS)],
             hatch="//" if row.published else "xx" if again else "",
             label=_short(row.label),
@@ -156,6 +145,7 @@ def _error_bar(score: Statistic) -> list[float | None]:
 
 
 def _in_unit(values: Sequence[float | None], unit: str) -> list[float]:
+    """Numbers to draw; NaN, which draws nothing, for None."""
     scale = 100 if unit == "%" else 1
     return [np.nan if value is None else scale * value for value in values]
 

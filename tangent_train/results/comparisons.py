@@ -36,11 +36,11 @@ _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
 
 
 def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
-    """The report over finished runs: mean and spread of each group, beside the paper's figures.
+    """Report finished runs: mean and spread of each group, beside the paper's figures.
 
     Args:
-        records: Of the runs.
-        notes: Further ones.
+        records: Records of the runs.
+        notes: Notes to add.
     """
     rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
     together = sorted(
@@ -63,7 +63,7 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
 def transfer_report(
     stages: Mapping[str, Sequence[Record]], cells: Mapping[str, Cell] | None = None
 ) -> Report:
-    """The report of a transfer from photos to panoramas, beside the paper's.
+    """Report a transfer from photos to panoramas, beside the paper's.
 
     Args:
         stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
@@ -95,7 +95,7 @@ def _photos_of(stage: str) -> str:
 
 
 def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) -> Report:
-    """The report over one network at several levels of the panoramas.
+    """Report one network at several levels of the panoramas.
 
     The paper's third transfer experiment: photos are normalized to the angular resolution of one
     level; scores fall the further that of the panoramas is from it.
@@ -122,9 +122,6 @@ def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) 
 
 def _facts(records: Sequence[Record]) -> dict[str, str]:
     record = records[0]
-    rotations = [
-        record.settings.get(n) for n in ("representation.random_rotation", "data.test_rotation")
-    ]
     facts = {
         "data": record.data,
         "s": str(record.settings.get("level") or "–"),
@@ -132,8 +129,10 @@ def _facts(records: Sequence[Record]) -> dict[str, str]:
         "b": _base_level(record),
     }
     if "data.test_rotation" in record.settings and "data.inputs" not in record.settings:  # shapes
+        names = ("representation.random_rotation", "data.test_rotation")
+        rotations = map(record.settings.get, names)
         facts["rotated in training / test"] = " / ".join(
-            _ROTATIONS.get(name, str(name)) for name in rotations
+            _ROTATIONS.get(r, str(r)) for r in rotations
         )
     if record.class_map is not None:
         facts["class map"] = record.class_map
@@ -161,11 +160,11 @@ def _base_level(record: Record) -> str:
 
 
 def published(records: Sequence[Record], *, transfer: bool = False) -> list[Row]:
-    """Published scores for the data and resolutions of some evaluations.
+    """Return published scores for the data and resolutions of some evaluations.
 
     Args:
         records: Evaluations; those on other data, other classes or rotated data match nothing.
-        transfer: Whether to take the figures of the network transfer.
+        transfer: True for the figures of the network transfer.
 
     Returns:
         Rows in the order of the file.
@@ -175,6 +174,7 @@ def published(records: Sequence[Record], *, transfer: bool = False) -> list[Row]
     text = files("tangent_train.results").joinpath("paper.csv").read_text(encoding="utf-8")
     for line in csv.DictReader(text.splitlines()):
         known = (line["data"], line["classes"], line["level"]) in own
+        known = known and line["score"] in records[0].headings
         if known and bool(line["stage"]) is transfer:
             lines[tuple(line[name] for name in _KEY)].append(line)
     return [_row(records[0], dict(zip(_KEY, k, strict=True)), found) for k, found in lines.items()]
@@ -200,18 +200,15 @@ def _row(like: Record, key: dict[str, str], lines: list[dict[str, str]]) -> Row:
 
 def _record(like: Record, fold: str, lines: Sequence[dict[str, str]]) -> Record:
     by_score = {line["score"]: line for line in lines}
-    means = {n: _share(by_score[n]["mean"]) if n in by_score else None for n in like.means}
+    means = {name: _share(by_score.get(name, {}).get("mean")) for name in like.means}
+    pairs = like.class_means.items()
     classes = [
-        {"class": name}
-        | {
-            of_class: _share(by_score[mean].get(name, "")) if mean in by_score else None
-            for of_class, mean in like.class_means.items()
-        }
-        for name in like.class_names
+        {"class": c, **{name: _share(by_score.get(mean, {}).get(c)) for name, mean in pairs}}
+        for c in like.class_names
     ]
     settings = {"data.fold": int(fold) if fold else None}
     return Record("", 0, like.headings, means, classes, settings=settings)
 
 
-def _share(percent: str) -> float | None:
+def _share(percent: str | None) -> float | None:
     return round(float(percent) / 100, 6) if percent else None

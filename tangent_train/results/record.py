@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
 from tangent_train.errors import DataError
@@ -19,6 +19,8 @@ from tangent_train.registry import Text, check_fields
 from tangent_train.setting_rules import flat_settings
 
 RESULTS_FILE = "results.json"
+
+_Value = TypeVar("_Value")
 
 Band = tuple[float, ...]
 """South and north of a latitude band, in degrees."""
@@ -51,6 +53,11 @@ class Heading(NamedTuple):
     def class_column(self) -> str:
         """Heading of a column with the score of one class."""
         return f"{self.class_text} {self.unit}".strip()
+
+
+def by_solid_angle(scores: Mapping[str, _Value]) -> dict[str, _Value]:
+    """Name scores as those by solid angle."""
+    return {name + SOLID_ANGLE: value for name, value in scores.items()}
 
 
 def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
@@ -108,7 +115,7 @@ class Record:
         confusion: Integer counts, rows truth, columns prediction; empty without classes.
         intervals: 95 % bootstrap intervals over the images, of those means that have one.
         checkpoint: File of the network; that of a run itself is relative to its folder.
-        class_map: What gave the network the classes of the data; None for its own classes.
+        class_map: File or name of the map to the classes of the data; None for its own classes.
         settings: The resolved config of the run, as ``section.setting``.
         folder: Folder of the run.
     """
@@ -208,7 +215,7 @@ def load_record(folder: Path) -> Record:
     """Read the results and settings of a finished run.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
 
     Raises:
         DataError: A file is missing, or is not what ``tangent-train`` writes.

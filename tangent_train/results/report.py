@@ -12,7 +12,7 @@ from typing import Any
 from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.results.chart import grid_png, report_png
-from tangent_train.results.record import SOLID_ANGLE, Band, Heading
+from tangent_train.results.record import SOLID_ANGLE, Band, Record
 from tangent_train.results.rows import Row
 from tangent_train.results.tables import Table, score_text
 
@@ -31,7 +31,7 @@ class Report:
     """Rows of the same scores over the same classes.
 
     Attributes:
-        title: Of the report.
+        title: Title of the report.
         rows: Evaluations, and published figures.
         notes: Sentences about the rows.
         compared: Explains the column "change"; empty without one.
@@ -62,34 +62,27 @@ class Report:
         }
 
     @property
-    def classes(self) -> tuple[str, ...]:
-        """Names of the classes."""
-        return self.rows[0].records[0].class_names
-
-    @property
-    def headings(self) -> Mapping[str, Heading]:
-        """Headings of the scores."""
-        return self.rows[0].records[0].headings
-
-    @property
-    def main(self) -> str:
-        """Name of the main score."""
-        return self.rows[0].records[0].main
+    def first(self) -> Record:
+        """The first record; all have the same scores and classes."""
+        return self.rows[0].records[0]
 
     @property
     def cell_score(self) -> str:
         """Name of the score in the cells: the main one, by solid angle if there is one."""
-        by_angle = self.main + SOLID_ANGLE
-        return by_angle if by_angle in self.headings else self.main
+        by_angle = self.first.main + SOLID_ANGLE
+        return by_angle if by_angle in self.first.headings else self.first.main
 
     def tables(self) -> list[Table]:
         """Views in conditions, all classes, every class, and latitude bands."""
         banded = [row for row in self.rows if row.bands]
         tables = [*self._views(), self._overall(), *self._per_class()]
         if banded:
-            bands, heading = banded[0].bands, self.headings[self.main]
-            means = ((row, (row.score(self.main, band).mean for band in bands)) for row in banded)
-            rows = [(row.label, *(score_text(m, heading.unit) for m in of)) for row, of in means]
+            bands, name = banded[0].bands, self.first.main
+            heading = self.first.headings[name]
+            rows = [
+                (row.label, *(score_text(row.score(name, b).mean, heading.unit) for b in bands))
+                for row in banded
+            ]
             header = ("", *(f"{south:g}° … {north:g}°" for south, north in bands))
             tables.append(Table(f"{heading.column} by latitude", header, rows))
         return tables
@@ -103,15 +96,15 @@ class Report:
             (view, *(self._cell(row, name, 0) for row in found.values()))
             for view, found in grid.items()
         ]
-        title = f"{self.title}: {self.headings[name].column}"
+        title = f"{self.title}: {self.first.headings[name].column}"
         yield Table(title, ("", *conditions), rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
 
     @property
     def _legend(self) -> str:
-        return "Percent. " * all(h.unit == "%" for h in self.headings.values()) + _LEGEND
+        return "Percent. " * all(h.unit == "%" for h in self.first.headings.values()) + _LEGEND
 
     def _overall(self) -> Table:
-        scores = self.headings
+        scores = self.first.headings
         names = dict.fromkeys(name for row in self.rows for name in row.facts)
         facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
         alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]
@@ -131,24 +124,25 @@ class Report:
         return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
 
     def _per_class(self) -> Iterator[Table]:
-        for name, mean in self.rows[0].records[0].class_means.items():
+        classes = self.first.class_names
+        for name, mean in self.first.class_means.items():
             rows = [
-                (row.label, *(self._cell(row, name, len(row.folds), c) for c in self.classes))
+                (row.label, *(self._cell(row, name, len(row.folds), c) for c in classes))
                 for row in self.rows
                 if not name.endswith(SOLID_ANGLE)
-                and any(row.score(name, c).mean is not None for c in self.classes)
+                and any(row.score(name, c).mean is not None for c in classes)
             ]
             if rows:
-                title = self.headings[mean].class_column
-                yield Table(f"{title[:1].upper()}{title[1:]}", ("", *self.classes), rows)
+                title = self.first.headings[mean].class_column
+                yield Table(f"{title[:1].upper()}{title[1:]}", ("", *classes), rows)
 
     def _cell(self, row: Row, name: str, folds: int, part: str | None = None) -> str:
         """A score with its spreads; "of 2" where it is over fewer folds than the row."""
         found = row.score(name, part)
         if found.mean is None:
             return "–"
-        mean = name if part is None else self.rows[0].records[0].class_means[name]
-        text = partial(score_text, unit=self.headings[mean].unit)
+        mean = name if part is None else self.first.class_means[name]
+        text = partial(score_text, unit=self.first.headings[mean].unit)
         over_folds = "" if found.over_folds is None else f" ± {text(found.over_folds)}"
         over_seeds = "" if found.over_seeds is None else f" (± {text(found.over_seeds)})"
         lacking = f" of {found.folds}" if found.folds < folds else ""
@@ -173,29 +167,36 @@ class Report:
 
         Args:
             folder: Output folder.
-            name: Of the files.
+            name: Name of the files.
         """
         write_text(folder / f"{name}.md", self._markdown())
         figures = list(self.figures())
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
         write_text(folder / f"{name}.csv", csv_text(columns, figures))
         if self.grid:
-            png = grid_png(self.title, self.grid, self.headings[self.cell_score], self.cell_score)
+            heading = self.first.headings[self.cell_score]
+            title = f"{self.title}: {heading.text}"
+            png = grid_png(title, self.grid, self.cell_score, heading.unit)
         else:
             png = report_png(self.title, self.rows)
         write_bytes(folder / f"{name}.png", png)
 
     def figures(self) -> Iterator[dict[str, Any]]:
         """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""
-        like = self.rows[0].records[0]
+        first = self.first
         for row in self.rows:
             scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
             for fold, part in [*scopes, ("mean", row)]:
                 facts = {"row": row.label, **row.facts, "fold": fold}
                 entries: list[tuple[str, str | Band | None, str]]
-                entries = [("mean", None, name) for name in like.headings]
-                entries += [(c, c, name) for c in self.classes for name in like.class_means]
-                entries += [("mean", band, name) for band in row.bands for name in row.band_scores]
+                entries = [("mean", None, name) for name in first.headings]
+                entries += [(c, c, name) for c in first.class_names for name in first.class_means]
+                entries += [
+                    ("mean", band, name)
+                    for band in row.bands
+                    for name in first.headings
+                    if name in row.records[0].latitude_bands[0]
+                ]
                 for class_name, where, name in entries:
                     south, north = where if isinstance(where, tuple) else (None, None)
                     yield {

@@ -31,7 +31,7 @@ class Statistic(NamedTuple):
         folds: Number of folds with the score: a class may be absent from a fold.
         low: Lower end of the 95 % bootstrap interval over the images of a single run; None with
             several runs.
-        high: Its upper end.
+        high: Upper end of that interval.
     """
 
     mean: float | None
@@ -56,7 +56,7 @@ class Row:
         records: The evaluations.
         facts: Further columns of the tables, by heading.
         partner: The row that its scores are compared with.
-        published: Whether it is from a paper.
+        published: True if it is from a paper.
     """
 
     label: str
@@ -76,13 +76,6 @@ class Row:
         """Its latitude bands."""
         return tuple(dict.fromkeys(band for record in self.records for band in record.bands))
 
-    @property
-    def band_scores(self) -> tuple[str, ...]:
-        """Names of the scores of its latitude bands, in the order of the tables."""
-        record = self.records[0]
-        bands = record.latitude_bands
-        return tuple(name for name in record.headings if bands and name in bands[0])
-
     def of_fold(self, fold: int | None) -> Row:
         """Its part of a fold, with its partner's."""
         records = tuple(record for record in self.records if record.fold == fold)
@@ -93,8 +86,8 @@ class Row:
         """Mean over folds of the mean over seeds, with both spreads; of one run, its interval.
 
         Args:
-            name: As in `Record.score`.
-            part: As in `Record.score`.
+            name: Name of the score.
+            part: Name of a class, or a band.
         """
         found = average((fold, value) for (fold, _), value in self._values(name, part))
         if part is not None or len(self.records) != 1:
@@ -103,15 +96,15 @@ class Row:
         return found._replace(low=low, high=high)
 
     def kept(self, name: str, part: str | Band | None = None) -> Statistic:
-        """The ratio of its score to its partner's, over the folds and seeds that both have.
+        """Return the ratio of its score to its partner's, over the folds and seeds that both have.
 
         The mean is the ratio of the two means, the spreads are those of the single ratios. Pixels
         of photos cover nearly the same solid angle: what panoramas score by solid angle is compared
         with what photos score by pixels.
 
         Args:
-            name: As in `Record.score`.
-            part: As in `Record.score`.
+            name: Name of the score.
+            part: Name of a class, or a band.
 
         Returns:
             None for the mean where there is no partner, or where its score is undefined or 0.
@@ -185,7 +178,7 @@ def group_runs(records: Sequence[Record]) -> list[Row]:
     """Group evaluations that differ only in fold and seed.
 
     Args:
-        records: Of finished runs, with their settings.
+        records: Records of finished runs, with their settings.
 
     Returns:
         Rows in the order of their first runs, labelled with the names of the runs, and with the
@@ -232,7 +225,7 @@ def _labels(firsts: Sequence[Record]) -> list[str]:
 
 
 def _differs(setting: str, other: Mapping[str, Any], own: Mapping[str, Any]) -> bool:
-    """Whether a setting differs, and not only because its section is of another class."""
+    """Return True if a setting differs, and not only because its section is of another class."""
     classes = [
         name
         for name in own

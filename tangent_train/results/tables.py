@@ -25,14 +25,14 @@ class Table:
     """Cells of text under a header.
 
     Attributes:
-        title: Above the table.
+        title: Text above the table.
         header: One name per column.
         rows: As many cells each.
-        note: Below the table.
+        note: Text below the table.
         text_columns: Columns that are aligned to the left; the others hold numbers.
         shades: For every row a number from 0 to 1 for each cell after the first: a heat map in
             HTML.
-        lines: Whether the terminal shows lines between the rows.
+        lines: True if the terminal shows lines between the rows.
     """
 
     title: str
@@ -116,20 +116,16 @@ def markdown_line(cells: Sequence[str]) -> str:
     return "| " + " | ".join(text.replace("|", r"\|") for text in cells) + " |"
 
 
-def percent(share: float | None, interval: tuple[float, float] | None = None) -> str:
-    """A share of 1 in percent, without the sign; a dash where it is undefined.
-
-    >>> percent(0.4562), percent(None), percent(0.4562, (0.42, 0.5))
-    ('45.6', '–', '45.6 [42.0, 50.0]')
-    """
-    return score_text(share, "%", interval)
+def percent(share: float | None) -> str:
+    """Return a share of 1 in percent, without the sign; a dash where it is undefined."""
+    return score_text(share, "%")
 
 
 def score_text(value: float | None, unit: str, interval: tuple[float, float] | None = None) -> str:
     """Return a score without its unit; a dash where it is undefined.
 
-    >>> score_text(0.4562, "%"), score_text(0.45623, "m", (0.42, 0.5)), score_text(None, "m")
-    ('45.6', '0.456 [0.42, 0.5]', '–')
+    >>> score_text(0.4562, "%", (0.42, 0.5)), score_text(0.45623, "m"), score_text(None, "m")
+    ('45.6 [42.0, 50.0]', '0.456', '–')
     """
     if value is None:
         return "–"

@@ -124,6 +124,9 @@ class Task(lightning.LightningModule, ABC):
         self._frozen = tuple(freeze(self.network, frozen))
         self.metric: Any = self.build_metric()
         self._counted = SumMetric()
+        # The validation loss and its norm: without the check for NaN, at which the host waits for a
+        # GPU. (A `MeanMetric` without it ignores weights.)
+        self._losses: Any = nn.ModuleList(SumMetric(nan_strategy="disable") for _ in range(2))
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
         self._trained_length: Mapping[str, int] | None = None
@@ -355,6 +358,21 @@ class Task(lightning.LightningModule, ABC):
     def optimizer_zero_grad(self, *_: Any) -> None:
         """Nothing: `training_step` clears the gradients before its first part."""
 
+    @property
+    def is_tested(self) -> bool:
+        """True in a test, which has no loss."""
+        return self._trainer is not None and self._trainer.testing
+
+    def add_validation_loss(self, loss: Tensor, labels: Tensor) -> None:
+        """Add to ``val/loss``, which is normalized as the training loss is.
+
+        Args:
+            loss: A sum of losses.
+            labels: Their labels, see `loss_norm`.
+        """
+        for total, value in zip(self._losses, (loss, self.loss_norm(labels)), strict=True):
+            total.update(value)
+
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Evaluate a batch of the validation or test split."""
         predictions = self.evaluate(batch)
@@ -367,6 +385,12 @@ class Task(lightning.LightningModule, ABC):
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
         self._counted.reset()
+        # A process without images takes part; a task without a loss has none to log.
+        if not self.is_tested and (self._losses[0].update_called or self.trainer.world_size > 1):
+            loss, norm = (total.compute() for total in self._losses)
+            self.log("val/loss", loss / norm, sync_dist=True)
+            for total in self._losses:
+                total.reset()
         # Every process has the same numbers: the mean over processes changes nothing.
         for name, score in self.logged_scores(self.result).items():
             key = f"{stage}/{name}"

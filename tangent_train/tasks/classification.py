@@ -62,7 +62,9 @@ class ClassificationTask(Task):
 
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
         """Cross-entropy, summed over the shapes."""
-        scores = self(*inputs)
+        return self._loss_of(self(*inputs), labels)
+
+    def _loss_of(self, scores: Tensor, labels: Tensor) -> Tensor:
         exact = torch.promote_types(scores.dtype, torch.float32)
         return functional.cross_entropy(
             scores.to(exact), labels, reduction="sum", label_smoothing=self.label_smoothing
@@ -74,7 +76,10 @@ class ClassificationTask(Task):
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of shapes to `metric`; returns the predictions ``(B,)``."""
-        prediction = self(batch.images).argmax(dim=1)
+        scores = self(batch.images)
+        if not self.is_tested:
+            self.add_validation_loss(self._loss_of(scores, batch.label), batch.label)
+        prediction = scores.argmax(dim=1)
         self.metric.update(prediction, batch.label)
         return prediction
 

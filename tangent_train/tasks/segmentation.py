@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, get_args
@@ -21,7 +22,9 @@ from tangent_train.metrics.segmentation import (
     AbsentClass,
     SegmentationCounts,
     SegmentationMetric,
+    SegmentationScores,
     bootstrap_intervals,
+    count_image,
     segmentation_scores,
 )
 from tangent_train.registry import registered
@@ -31,7 +34,7 @@ from tangent_train.rendering.representations.views import Representation
 from tangent_train.results.evaluation import class_entries, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
-from tangent_train.results.record import SOLID_ANGLE, Heading, Record, with_solid_angle
+from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.results.tables import percent
 from tangent_train.tasks.base import RGB, Part, Task
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
@@ -133,7 +136,7 @@ class SegmentationTask(Task):
         """Scores of every pixel.
 
         Args:
-            images: Of one or several spheres.
+            images: Images of one or several spheres.
             rays: Viewing rays, see `Views.rays`, for networks that take them.
 
         Raises:
@@ -200,6 +203,7 @@ class SegmentationTask(Task):
         images: Float[Tensor, "images channels height width"],
         shape: tuple[int, ...],
         rotation: NDArray[np.float64] | None = None,
+        target: Tensor | None = None,
     ) -> Integer[Tensor, ...]:
         """Class index of every pixel of one panorama, or of the crops of a photo.
 
@@ -208,20 +212,31 @@ class SegmentationTask(Task):
             shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
                 crops.
             rotation: Rotation of the representation.
+            target: The ground truth, to add the loss of the views to the validation loss.
 
         Returns:
             Class indices 1 … K of that shape; 0 where an imported network sees nothing.
         """
         if len(shape) > 2:  # each crop by itself
-            parts = view_scores(self, images.__getitem__, len(images), self.images_per_forward)
-            best = torch.cat([scores.argmax(dim=1) for _, scores in parts])
+            best = images.new_empty(shape, dtype=torch.int64)
+            for part, scores in view_scores(
+                self, images.__getitem__, len(images), self.images_per_forward
+            ):
+                best[part] = scores.argmax(dim=1)
+                if target is not None:
+                    self._add_loss_of(scores, target[part])
         else:
-            best = self._mosaic(images, (shape[0], shape[1]), rotation).labels().long()
+            mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target)
+            best = mosaic.labels().long()
             best = best.to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
     def _mosaic(
-        self, images: Tensor, shape: tuple[int, int], rotation: NDArray[np.float64] | None
+        self,
+        images: Tensor,
+        shape: tuple[int, int],
+        rotation: NDArray[np.float64] | None,
+        target: Tensor | None,
     ) -> ScoreMosaic:
         upright: Any = self.representation
         seen = upright if rotation is None else upright.with_rotation(rotation)
@@ -231,7 +246,23 @@ class SegmentationTask(Task):
         rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
         count, several = self._num_scores, len(sets) > 1
         mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
-        return fill(mosaic, self, zip(sets, of_sets, rays, strict=True), self.images_per_forward)
+        given = zip(sets, of_sets, rays, strict=True)
+        if target is None:
+            return fill(mosaic, self, given, self.images_per_forward)
+
+        def add_loss(scores: Tensor, views: Any) -> None:
+            if target.is_cpu:
+                labels = torch.from_numpy(views.render(target.numpy(), "nearest"))
+            else:
+                labels = views.render(target[None], "nearest")[:, 0]
+            self._add_loss_of(scores, labels)
+
+        return fill(mosaic, self, given, self.images_per_forward, scored=add_loss)
+
+    def _add_loss_of(self, scores: Tensor, labels: Tensor) -> None:
+        """Add the cross-entropy of some views to the validation loss; not of auxiliary scores."""
+        loss = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
+        self.add_validation_loss(loss, labels)
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; returns the predictions."""
@@ -239,7 +270,12 @@ class SegmentationTask(Task):
         for images, target, rotation in zip(
             batch.images, batch.target, batch.rotation, strict=True
         ):
-            labels = self.predict_labels(images, tuple(target.shape), rotation.cpu().numpy())
+            labels = self.predict_labels(
+                images,
+                tuple(target.shape),
+                rotation.cpu().numpy(),
+                None if self.is_tested else target,
+            )
             predictions.append(labels)
             self.metric.update(labels, target)
         return torch.stack(predictions)
@@ -250,46 +286,48 @@ class SegmentationTask(Task):
 
     def logged_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Means over classes, of panoramas also weighted by solid angle."""
-        pixels = segmentation_scores(result.pixels, self.absent_class)
-        scores = {"miou": pixels.miou, "macc": pixels.macc}
-        if result.solid_angle.any():
-            angles = segmentation_scores(result.solid_angle, self.absent_class)
-            scores |= {f"miou{SOLID_ANGLE}": angles.miou, f"macc{SOLID_ANGLE}": angles.macc}
-        return scores
+        pixels, angles = self._scores(result)
+        return pixels.means | (by_solid_angle(angles.means) if result.solid_angle.any() else {})
 
     def class_scores(self, result: SegmentationCounts) -> dict[str, float]:
         """Intersection over union of each class."""
-        scores = segmentation_scores(result.pixels, self.absent_class).iou.tolist()
+        scores = self._scores(result)[0].iou.tolist()
         return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
 
     def record(self, result: SegmentationCounts, noun: str) -> Record:
         """The record, with scores of classes and latitude bands, and intervals over the images."""
-        on_sphere, absent = bool(result.solid_angle.any()), self.absent_class
-        pixels = segmentation_scores(result.pixels, absent)
-        angles = segmentation_scores(result.solid_angle, absent if on_sphere else "skip")
-        of_class = {"iou": pixels.iou, "accuracy": pixels.accuracy}
-        of_class |= {f"iou{SOLID_ANGLE}": angles.iou, f"accuracy{SOLID_ANGLE}": angles.accuracy}
-        bands = [segmentation_scores(band, absent) for band in result.bands if on_sphere]
-        by_pixels, by_angle = result.of_images.swapaxes(0, 1)
-        intervals = bootstrap_intervals(by_pixels, absent)
-        if on_sphere:
-            by_name = bootstrap_intervals(by_angle, absent).items()
-            intervals |= {name + SOLID_ANGLE: ends for name, ends in by_name}
+        pixels, angles = self._scores(result)
+        bands = zip(itertools.pairwise(BAND_EDGES_DEG), result.bands, strict=True)
+        intervals = [
+            bootstrap_intervals(images, absent)
+            for images, absent in zip(
+                result.of_images.swapaxes(0, 1), self._absent_classes(result), strict=True
+            )
+        ]
+        of_class = pixels.of_classes | by_solid_angle(angles.of_classes)
         return replace(
             super().record(result, noun),
             classes=class_entries(
-                {**of_class, "share": pixels.share}, result.pixels, self.class_names
+                of_class | {"share": pixels.share}, result.pixels, self.class_names
             ),
             latitude_bands=[
                 {"latitude_deg": [south, north]}
-                | plain_scores({"miou": band.miou, "macc": band.macc})
-                for north, south, band in zip(
-                    BAND_EDGES_DEG, BAND_EDGES_DEG[1:], bands, strict=False
-                )
+                | plain_scores(segmentation_scores(band, self.absent_class).means)
+                for (north, south), band in bands
+                if result.solid_angle.any()
             ],
             confusion=result.pixels.tolist(),
-            intervals=intervals,
+            intervals=intervals[0] | by_solid_angle(intervals[1]),
         )
+
+    def _absent_classes(self, result: SegmentationCounts) -> tuple[AbsentClass, AbsentClass]:
+        """Treatment of absent classes by pixels and by solid angle; photos have no solid angles."""
+        return self.absent_class, self.absent_class if result.solid_angle.any() else "skip"
+
+    def _scores(self, result: SegmentationCounts) -> Sequence[SegmentationScores]:
+        """Scores by pixels and by solid angle."""
+        matrices = result.pixels, result.solid_angle
+        return tuple(map(segmentation_scores, matrices, self._absent_classes(result)))
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
@@ -304,8 +342,7 @@ class SegmentationTask(Task):
         """The image with its true and predicted labels."""
         rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
         classes = len(self.class_names)
-        pairs = truth.astype(np.int64).ravel() * classes + labels.ravel()
-        counts = np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
+        counts = count_image(prediction.cpu(), target.cpu(), classes).pixels
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
         return encode_image(
             name,

@@ -253,6 +253,25 @@ def test_figures_of_every_class_are_those_of_numpy(
     assert mean == pytest.approx(scalars["val/miou"][-1][1], rel=1e-6)
 
 
+def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
+    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+) -> None:
+    folder, task, data = trained
+    total, norm, source = 0.0, 0.0, data.source("val")
+    normalization: Any = data.normalization
+    for index in range(len(source)):
+        panorama, (views,) = source.read(index), TANGENT.view_sets()
+        inputs = render_inputs(panorama, views, data.inputs)
+        with torch.no_grad():
+            scores = task.network(normalize(inputs, normalization, data.inputs)).double()
+        labels = views.render(panorama.labels, "nearest").astype(np.int64)
+        weights = np.insert(task.class_weights.double().numpy(), 0, 0)[labels]
+        chosen = scores.log_softmax(1).gather(1, torch.tensor(labels).clamp(min=1)[:, None] - 1)
+        total -= float((chosen[:, 0].numpy() * weights).sum())
+        norm += float(weights.sum())
+    assert _of_csv(folder)["val/loss"][-1][1] == pytest.approx(total / norm, rel=1e-5)
+
+
 def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     task: Any = shape_task()
     _fit(tmp_path, Shapes(), task, "logger=csv", "validation_images=0")
@@ -261,3 +280,8 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     assert [step for step, _ in of_classes[0]] == VALIDATIONS
     mean = np.mean([values[-1][1] for values in of_classes])
     assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)
+    images = torch.stack([shape.images for shape in Shapes().shapes])
+    labels = torch.stack([shape.label for shape in Shapes().shapes])
+    with torch.no_grad():
+        loss = torch.nn.functional.cross_entropy(task.network(images), labels)
+    assert scalars["val/loss"][-1][1] == pytest.approx(float(loss), rel=1e-5)

@@ -360,7 +360,7 @@ def test_settings_that_cannot_work(
             {},
             r"003\.png: found uint8 .*; expected squares, .* 32×",
         ),
-        ({}, {"kind": "labels"}, "expected labels.*Say what they are with kind=.*one channel"),
+        ({}, {"kind": "labels"}, "expected labels.*Choose kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),
         ({}, {"output": "folder"}, r"expected a name ending in \.png"),
     ],

@@ -133,3 +133,33 @@ def test_an_experiment_of_ones_own(rooms: str, tmp_path: Path, run: Run) -> None
     assert not {"my_rate", "folder"} & kept.keys()
     assert results(tmp_path / "mine")["images"] == 2
     run("train", "resume=mine")
+
+
+@pytest.mark.parametrize(
+    ("command", "override"),
+    [
+        ("prepare", "+network.width=[8]"),
+        ("check", "+trainer.max_epoch=3"),
+        ("evaluate", "+optimizer.foo=1"),
+        ("train", "+optimizer.foo=1"),
+        ("prepare", "+data.rotation=so3"),
+    ],
+)
+def test_arguments_that_a_class_does_not_take(
+    command: str, override: str, run_folder: Path, rooms: str, run: Run
+) -> None:
+    """Also of sections that the command does not build."""
+    checkpoint = f"checkpoint={run_folder}/checkpoints/last.ckpt"
+    settings = (checkpoint,) if command == "evaluate" else tiny_runs.SETTINGS
+    section, _, name = override.strip("+").partition("=")[0].partition(".")
+    with pytest.raises(SystemExit, match=rf"^tangent-{command}: {section}: found {name} for "):
+        run(command, *settings, rooms, override)
+
+
+@pytest.mark.parametrize("group", ["callbacks", "data@photos.data", "recipe", "scheduler"])
+def test_groups_without_an_option(group: str, run: Run) -> None:
+    command = "transfer" if "@" in group else "train"
+    with pytest.raises(SystemExit, match=rf"^tangent-{command}: level: found nix"):
+        run(command, f"{group}=null", "level=nix")
+    with pytest.raises(SystemExit, match=rf"^tangent-{command}: network: found none; expected a s"):
+        run(command, "network=null")

@@ -81,6 +81,25 @@ def test_grids_are_values() -> None:
     assert CubeGrid(32) != (32, None)
 
 
+@pytest.mark.parametrize(
+    "original", [CubeGrid(8, ROTATION), TangentGrid(1, 5), TangentGrid(0, 4, 20, ROTATION)]
+)
+@pytest.mark.parametrize("dim", [2, 7, 33])
+def test_a_resized_grid_has_other_pixels(original: CubeGrid | TangentGrid, dim: int) -> None:
+    grid = original.resized(dim)
+    assert grid.dim == dim
+    assert grid.dim * grid.pitch == pytest.approx(original.dim * original.pitch, rel=1e-15)
+    assert grid.num_images == original.num_images
+    assert grid.overlapping is original.overlapping
+    np.testing.assert_array_equal(grid.rotation, original.rotation)
+    np.testing.assert_array_equal(grid.neighbors, original.neighbors)
+    np.testing.assert_array_equal(grid.world_from_camera, original.world_from_camera)
+    assert grid.with_rotation(ROTATION.T) == original.with_rotation(ROTATION.T).resized(dim)
+    # The outer edges agree: the middle of d pixels is (d − 1)/2.
+    edges = original.project(grid.directions([3])[0, 0, 0], 3)
+    np.testing.assert_allclose((edges + 0.5) * dim / original.dim, 0.5, atol=1e-9)
+
+
 def test_grids_cannot_change() -> None:
     rotation = ROTATION.copy()
     grid = TangentGrid(0, 4, rotation=rotation)

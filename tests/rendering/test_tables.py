@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -189,3 +190,25 @@ def test_rows_are_covered_once_and_errors_surface(
 
     with pytest.raises(ValueError, match="0"):
         over_rows(fail, 1000, 1000)
+
+
+def test_threads_do_not_exceed_the_limit_of_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Dropping is slow here: without a lock, tables are added while others count."""
+    count = tables._nbytes
+
+    def slowly(table: tuple[Any, ...]) -> int:
+        time.sleep(1e-4)
+        return count(table)
+
+    monkeypatch.setattr(tables, "_nbytes", slowly)
+    cache = tables.TableCache(10 * 8)
+    table = (np.zeros(1),)
+
+    def use(first: int) -> None:
+        for key in range(first, first + 60):
+            cache.get(key % 40, lambda: table)
+            assert cache.nbytes <= 80
+
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(use, range(0, 80, 10)))
+    assert cache.nbytes == 8 * len(cache._tables) <= 80

@@ -11,7 +11,7 @@ import cv2
 import pytest
 from PIL import Image, ImageFile
 
-from datamodules.images.gpano import area_of
+from datamodules.images.gpano import read_area
 from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from tangent_train.errors import DataError
 from tests.slow.fuzz.mutation import sealed_png
@@ -78,4 +78,4 @@ def test_long_xmp_with_a_document_type_is_refused_before_entities_are_expanded(
     inside = b'<x xmlns:GPano="%s"><GPano:FullPanoWidthPixels>%s' % (name, b"&b;\n" * 2_000_000)
     Image.new("RGB", (2, 1)).save(tmp_path / "a.webp", xmp=laughs + inside)
     with pytest.raises(DataError, match=r"a\.webp: found XMP data .* \(a document type\)"):
-        area_of(tmp_path / "a.webp", (1, 2))
+        read_area(tmp_path / "a.webp", (1, 2))

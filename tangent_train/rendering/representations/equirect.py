@@ -19,8 +19,6 @@ from tangent_train.rendering.forward import Interpolation, Pixels, rotate_equire
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import (
-    NO_RAYS,
-    Placement,
     RotationAugmentation,
     Views,
 )
@@ -49,6 +47,7 @@ class EquirectViews(Views):
         return 1
 
     def __getitem__(self, part: slice) -> Self:
+        """The view."""
         return self
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
@@ -69,11 +68,7 @@ class EquirectViews(Views):
         view: Any = np.ascontiguousarray(shown[None])
         return view
 
-    def rays(self) -> NDArray[np.float32]:
-        """No rays: it is not a pinhole image."""
-        return NO_RAYS
-
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Placement]:
+    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """The scores of the unrotated panorama, continued by a pixel around the sphere."""
         scores = scores.roll(self.first, -1)
         if self.rotation is not None:

@@ -23,7 +23,7 @@ from tangent_train.geometry import shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.representations.views import NO_RAYS, Placement, Views
+from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.resampling import crop
 from tangent_train.rendering.sampling import plane_rays
 
@@ -44,7 +44,7 @@ class PhotoCrops(Views):
         mirrored: True if they are mirrored left to right.
         numbers: ``(n,)`` crops that are rendered; None for all.
         canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
-        overlapping: See `Placement`.
+        overlapping: See `Views`.
     """
 
     boxes: NDArray[np.float64]
@@ -54,20 +54,17 @@ class PhotoCrops(Views):
     canvas_boxes: NDArray[np.float64] | None = None
     overlapping: bool = True
 
-    def __len__(self) -> int:
-        return len(self.chosen)
-
     def __getitem__(self, part: slice) -> Self:
         return replace(self, numbers=self.chosen[part])
 
     @property
-    def chosen(self) -> NDArray[np.int64]:
-        """See `Placement`."""
+    def chosen(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """See `Views`."""
         return np.arange(len(self.boxes)) if self.numbers is None else self.numbers
 
     @property
-    def all_images(self) -> object:
-        """See `Placement`."""
+    def all_images(self) -> object:  # type: ignore[override]
+        """See `Views`."""
         return self.boxes
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
@@ -78,15 +75,6 @@ class PhotoCrops(Views):
             return crops.flip(-1) if self.mirrored else crops
         crops = np.stack(parts)
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
-
-    def rays(self) -> NDArray[np.float32]:
-        """No rays: they are not images of a sphere."""
-        return NO_RAYS
-
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Placement]:
-        """See `Views`."""
-        del shape
-        return scores, self
 
     def owned(self) -> NDArray[np.bool_]:
         """Pixels of each crop that lie nearer to its center than to any other's, ``(n, h, w)``.
@@ -102,7 +90,7 @@ class PhotoCrops(Views):
         return down[:, :, None] & across[:, None, :]
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """See `Placement`."""
+        """See `Views`."""
         owner = np.zeros(shape, np.int32)
         for number, (left, top, right, bottom) in enumerate(self._owned_pixels(shape)):
             owner[top:bottom, left:right] = number
@@ -111,7 +99,7 @@ class PhotoCrops(Views):
     def geometry(
         self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
     ) -> CanvasGeometry:
-        """See `Placement`."""
+        """See `Views`."""
         boxes = self._on_canvas[self.chosen]
         across, down = (self.size[1 - i] / (boxes[:, 2 + i] - boxes[:, i]) for i in (0, 1))
         # Of the ray (j, 1, i): pixel j of the photo is at j + ½ from its corner.
@@ -125,7 +113,7 @@ class PhotoCrops(Views):
         return CanvasGeometry(self.chosen, matrices, spans, columns, lines[rows], owner)
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """See `Placement`."""
+        """See `Views`."""
         return _spans(self._owned_pixels(shape)[self.chosen], shape)
 
     def _owned_pixels(self, shape: tuple[int, int]) -> NDArray[np.intp]:
@@ -177,7 +165,7 @@ class PhotoSampler:
     """Draws crops of photos of one camera.
 
     Attributes:
-        camera_matrix: ``(3, 3)`` K, integer pixel centres.
+        camera_matrix: ``(3, 3)`` K, integer pixel centers.
         size: ``(height, width)`` of the photo.
         representation: The common camera, and the selection of crops.
     """
@@ -273,7 +261,7 @@ class PerspectiveRepresentation:
         """The sampler of the crops of a photo.
 
         Args:
-            camera_matrix: ``(3, 3)`` K of the photo, integer pixel centres, without skew.
+            camera_matrix: ``(3, 3)`` K of the photo, integer pixel centers, without skew.
             size: ``(height, width)`` of the photo.
         """
         return PhotoSampler(camera_matrix, size, self)

@@ -9,6 +9,7 @@ average over. Views render themselves from an image, and say where they lie on i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, Protocol, Self, runtime_checkable
 
@@ -29,27 +30,54 @@ NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
 """The rays of views that are not pinhole images of a sphere."""
 
 
-class Placement(Protocol):
-    """Some of N images on a canvas: a panorama, or a photo."""
+class Views:
+    """Views of one panorama or photo: some of N images that each show a part of it.
 
-    @property
-    def chosen(self) -> NDArray[np.int64]:
-        """``(n,)`` numbers of the images, 0 … N − 1."""
-        ...
+    Attributes:
+        overlapping: True if every pixel is inside an image, not only on its outer edge.
+        chosen: ``(n,)`` numbers of these views, 0 … N − 1.
+        all_images: The same object for all parts of one set of images.
+    """
 
-    @property
-    def all_images(self) -> object:
-        """The same object for all parts of one set of images."""
-        ...
+    overlapping: bool
+    chosen: NDArray[np.int64]
+    all_images: object
 
-    @property
-    def overlapping(self) -> bool:
-        """True if every pixel of the canvas is inside an image, not only on its outer edge."""
-        ...
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, part: slice) -> Self:
+        """Some of the views."""
+        raise NotImplementedError
+
+    def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
+        """Render the views, dtype kept.
+
+        Args:
+            image: An array ``(H, W[, C])``, or a tensor ``(C, H, W)``.
+            interpolation: ``bilinear`` or ``nearest``.
+
+        Returns:
+            An array ``(n, h, w[, C])``, or a tensor ``(n, C, h, w)``.
+        """
+        raise NotImplementedError
+
+    def rays(self) -> NDArray[np.float32]:
+        """``(n, 3, 3)`` viewing rays of the images; `NO_RAYS` if they are not pinhole images.
+
+        Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
+        to 1 at the opposite one, to a direction (of any length) on the sphere.
+        """
+        return NO_RAYS
+
+    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
+        """Scores ``(n, K, h, w)`` as images on the canvas ``(H, W)``, and these images."""
+        del shape
+        return scores, self
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
         """``(H, W)`` number of the image whose center is nearest to each pixel of the canvas."""
-        ...
+        raise NotImplementedError
 
     def geometry(
         self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
@@ -61,41 +89,11 @@ class Placement(Protocol):
             rows: Rows of the canvas, without a step.
             owner: Owners of these rows; empty for feathering.
         """
-        ...
+        raise NotImplementedError
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """``(n, H, 2)`` spans of pixels of the canvas that contain those that an image owns."""
-        ...
-
-
-class Views(Protocol):
-    """Views of one panorama or photo."""
-
-    def __len__(self) -> int:
-        """Number of views."""
-        ...
-
-    def __getitem__(self, part: slice) -> Self:
-        """Some of the views."""
-        ...
-
-    def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
-        """Render an array ``(H, W[, C])`` to ``(n, h, w[, C])``, a tensor ``(C, H, W)`` to
-        ``(n, C, h, w)``; the dtype is kept.
-        """  # noqa: D205
-        ...
-
-    def rays(self) -> NDArray[np.float32]:
-        """``(n, 3, 3)`` viewing rays of the images; `NO_RAYS` if they are not pinhole images.
-
-        Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
-        to 1 at the opposite one, to a direction (of any length) on the sphere.
-        """
-        ...
-
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Placement]:
-        """Scores ``(n, K, h, w)`` of the views as images on the canvas ``(H, W)``."""
-        ...
+        raise NotImplementedError
 
 
 class Sampler(Protocol):
@@ -105,8 +103,8 @@ class Sampler(Protocol):
         """Views of one training sample: a random subset, augmented."""
         ...
 
-    def view_sets(self) -> list[Any]:
-        """Sets of `Views` that each cover the whole; the scores of several sets are averaged."""
+    def view_sets(self) -> Sequence[Views]:
+        """Sets of views that each cover the whole; the scores of several sets are averaged."""
         ...
 
 
@@ -132,7 +130,7 @@ class Representation(Sampler, Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class PinholeViews:
+class PinholeViews(Views):
     """Pinhole images.
 
     Attributes:
@@ -145,25 +143,22 @@ class PinholeViews:
     faces: NDArray[np.int64] | None = None
     mirrored: bool = False
 
-    def __len__(self) -> int:
-        return self.grid.num_images if self.faces is None else len(self.faces)
-
     def __getitem__(self, part: slice) -> Self:
         return replace(self, faces=self.chosen[part])
 
     @property
-    def chosen(self) -> NDArray[np.int64]:
-        """See `Placement`."""
+    def chosen(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """See `Views`."""
         return self.grid.face_indices(self.faces)
 
     @property
-    def all_images(self) -> object:
-        """See `Placement`."""
+    def all_images(self) -> object:  # type: ignore[override]
+        """See `Views`."""
         return self.grid
 
     @property
-    def overlapping(self) -> bool:
-        """See `Placement`."""
+    def overlapping(self) -> bool:  # type: ignore[override]
+        """See `Views`."""
         return self.grid.overlapping
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
@@ -184,23 +179,18 @@ class PinholeViews:
         axes = grid.world_from_camera[self.chosen]
         return (axes * (-edge if self.mirrored else edge, edge, 1)).astype(np.float32)
 
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Placement]:
-        """See `Views`."""
-        del shape
-        return scores, self
-
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
-        """See `Placement`."""
+        """See `Views`."""
         return owners(self.grid, shape)
 
     def geometry(
         self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
     ) -> CanvasGeometry:
-        """See `Placement`."""
+        """See `Views`."""
         return canvas_geometry(self.grid, self.chosen, shape, rows, owner)
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """See `Placement`."""
+        """See `Views`."""
         grid = self.grid
         beyond = grid.widened(-((grid.dim - grid.owned_dim) // 2))
         return find_spans(beyond, self.chosen, shape, slice(0, shape[0]))

@@ -40,7 +40,7 @@ _FRAMES = 8
 class LineSegments(NamedTuple):
     """Straight edges as arcs of great circles, the longest first.
 
-    A straight edge of the scene and the centre of the camera span a plane. The vanishing points of
+    A straight edge of the scene and the center of the camera span a plane. The vanishing points of
     the edge, and all that is parallel to it, lie in that plane.
 
     Attributes:

@@ -71,11 +71,11 @@ def test_image_depth_labels_and_up_rotate_together(
 def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def up_of(path: Path) -> NDArray[np.float64] | None:
+    def read_up(path: Path) -> NDArray[np.float64] | None:
         asked.append(str(path))
         return UP if str(path) == "1" else None
 
-    monkeypatch.setattr("datamodules.core.transforms.up_of", up_of)
+    monkeypatch.setattr("datamodules.core.transforms.read_up", read_up)
     posed = PosedUp()
     for _ in range(2):
         assert posed(_heights(), 0, FILES[0]).up is None

@@ -93,7 +93,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     for split in ("train", "val"):
         assert known.source(split).read(0).up is None
     tagged = np.array([0.6, 0, 0.8])
-    monkeypatch.setattr("datamodules.core.transforms.up_of", lambda path: tagged)
+    monkeypatch.setattr("datamodules.core.transforms.read_up", lambda path: tagged)
     known = make_module(test_rotation=30, upright="pose")
     np.testing.assert_array_equal(known.source("train").read(0).up, tagged)
     turned = known.source("test").read(0).up

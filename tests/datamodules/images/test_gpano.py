@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from datamodules.images.gpano import PanoramaArea, area_of, area_of_crop, up_of, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_crop, read_area, read_up, whole_area
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
@@ -42,7 +42,7 @@ _AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
 @pytest.mark.parametrize("projection", ["equirectangular", "Equirectangular", "EQUIRECTANGULAR"])
 def test_tags_of_all_formats(tmp_path: Path, suffix: str, projection: str) -> None:
     path = _save(tmp_path / f"image{suffix}", GPANO_TAGS | {"ProjectionType": projection})
-    assert area_of(path, (40, 60)) == _AREA
+    assert read_area(path, (40, 60)) == _AREA
 
 
 # XMP: ways to write the same, and places to write it to.
@@ -112,7 +112,7 @@ def _adobe(packet: bytes) -> bytes:
 def test_forms_of_xmp(tmp_path: Path, form: str, prefix: str) -> None:
     packet = xmp_packet(_FORMS[form].replace("GPano", prefix), prefix)
     (tmp_path / "image.jpg").write_bytes(_jpeg(_adobe(packet)))
-    np.testing.assert_array_equal(up_of(tmp_path / "image.jpg"), _UP)
+    np.testing.assert_array_equal(read_up(tmp_path / "image.jpg"), _UP)
 
 
 def test_places_of_xmp(tmp_path: Path) -> None:
@@ -151,10 +151,10 @@ def test_places_of_xmp(tmp_path: Path) -> None:
         tmp_path / "utf16.jpg", xmp=packet.decode().encode("utf-16"), quality=90
     )
     for path in sorted(tmp_path.iterdir()):
-        np.testing.assert_array_equal(up_of(path), _UP, err_msg=path.name)
+        np.testing.assert_array_equal(read_up(path), _UP, err_msg=path.name)
     foreign = _jpeg(_adobe(xmp_packet("<rdf:Description/>")), *extended)
     (tmp_path / "foreign.jpg").write_bytes(foreign)
-    assert up_of(tmp_path / "foreign.jpg") is None
+    assert read_up(tmp_path / "foreign.jpg") is None
 
 
 @pytest.mark.parametrize(
@@ -174,18 +174,18 @@ def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
     path = tmp_path / "image.jpg"
     path.write_bytes(_jpeg(_adobe(packet)))
     with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
-        up_of(path)
+        read_up(path)
     old, new = (name.encode("utf-16-le") for name in ("photos", "videos"))
     other = packet.replace(b"photos", b"videos").replace(old, new)
     path.write_bytes(_jpeg(_adobe(other)))
-    assert up_of(path) is None
+    assert read_up(path) is None
 
 
 def test_a_raw_profile_that_is_not_hexadecimal(tmp_path: Path) -> None:
     chunk = png_chunk(b"tEXt", b"Raw profile type xmp\0\nxmp\n       3\n3c?\n")
     (tmp_path / "a.png").write_bytes(png_bytes(np.zeros((4, 8, 3), np.uint8), before=chunk))
     with pytest.raises(DataError, match=r"a\.png: found XMP data that cannot be read"):
-        up_of(tmp_path / "a.png")
+        read_up(tmp_path / "a.png")
 
 
 def test_images_that_say_nothing(tmp_path: Path) -> None:
@@ -194,16 +194,16 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
     other = _save(tmp_path / "other.jpg", GPANO_TAGS)
     other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
     for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
-        assert area_of(path, (30, 60)) == whole_area(path, (30, 60)), path.name
+        assert read_area(path, (30, 60)) == whole_area(path, (30, 60)), path.name
         with pytest.raises(DataError, match="a whole panorama"):
-            area_of(path, (40, 60))
-        assert up_of(path) is None
+            read_area(path, (40, 60))
+        assert read_up(path) is None
 
 
 @pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
 def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
     path = _save(tmp_path / "image.jpg", GPANO_TAGS, size)
-    area = area_of(path, size)
+    area = read_area(path, size)
     assert area is not None
     assert area.image_shape == size
     west, north = _angles_deg(area, (area.columns[0], area.rows[0]))
@@ -245,7 +245,7 @@ def test_tags_that_cannot_be_are_refused(
 ) -> None:
     path = _save(tmp_path / "image.jpg", GPANO_TAGS | changes)
     with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
-        area_of(path, size)
+        read_area(path, size)
 
 
 # Placing and cutting
@@ -345,7 +345,7 @@ def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
 def test_pose(tmp_path: Path, pitch: str, roll: str) -> None:
     """Programs that do not know it write zero pitch and roll."""
     tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
-    up = up_of(_save(tmp_path / "image.jpg", tags))
+    up = read_up(_save(tmp_path / "image.jpg", tags))
     expected = None if float(pitch) == 0 else up_from_pose(float(pitch), float(roll))
     np.testing.assert_array_equal(up, expected)
 
@@ -363,4 +363,4 @@ def test_impossible_poses(tmp_path: Path) -> None:
         path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
         message = rf"image\.jpg: found GPano:Pose{axis}Degrees .*expected a number from"
         with pytest.raises(DataError, match=message):
-            up_of(path)
+            read_up(path)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from PIL import ExifTags, Image, ImageCms, TiffImagePlugin, features
+from PIL import Image, ImageCms, TiffImagePlugin, features
 
 from datamodules.images.pixel_files import (
     check_writable,
@@ -116,17 +116,6 @@ def test_grey_palette_and_transparency(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_rgb(tmp_path / f"{name}.png"), pixels, err_msg=name)
 
 
-@pytest.mark.parametrize("orientation", range(1, 9))
-def test_jpeg_gives_the_upright_pixels_of_another_decoder(tmp_path: Path, orientation: int) -> None:
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    Image.fromarray(_noise((24, 41, 3))).save(tmp_path / "image.jpg", exif=exif)
-    expected = cv2.imread(str(tmp_path / "image.jpg"))
-    assert expected is not None
-    np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg"), expected[..., ::-1])
-    assert read_image_size(tmp_path / "image.jpg") == expected.shape[:2]
-
-
 def _raw_profile(kind: bytes, exif: bytes) -> bytes:
     digits = (b"Exif\0\0" + exif).hex().encode()
     text = b"\n%s\n%8d\n%s" % (kind.lower(), len(exif) + 6, digits)
@@ -162,7 +151,7 @@ def test_png_is_turned_wherever_its_exif_data_are(
 _AVIF = pytest.mark.skipif(not features.check("avif"), reason="Pillow without AVIF")
 
 
-@pytest.mark.parametrize("suffix", [".webp", pytest.param(".avif", marks=_AVIF)])
+@pytest.mark.parametrize("suffix", [".jpg", ".webp", pytest.param(".avif", marks=_AVIF)])
 def test_other_formats_are_turned(tmp_path: Path, suffix: str) -> None:
     stored = np.kron(_noise((3, 5, 3)), np.ones((8, 8, 1))).astype(np.uint8)
     best: dict[str, Any] = {"lossless": True} if suffix == ".webp" else {"quality": 100}

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.synthia.reader import choose_frames, read_camera, read_ids
+from datamodules.synthia.reader import choose_frames, read_ids, read_view_camera
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import write_png
 
@@ -28,7 +28,7 @@ def _write_camera(folder: Path, text: str) -> Path:
 def test_cameras(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         _write_camera(tmp_path, text)
-    camera = read_camera(tmp_path, (760, 1280))
+    camera = read_view_camera(tmp_path, (760, 1280))
     # Counted from pixel corners the centre is the middle of the image; so it is here.
     expected = [[532.740352, 0, 639.5], [0, 532.740352, 379.5], [0, 0, 1]]
     np.testing.assert_array_equal(camera, expected)
@@ -41,7 +41,7 @@ def test_cameras(tmp_path: Path, text: str | None) -> None:
 def test_strange_cameras(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
     with pytest.raises(DataError, match=r"intrinsics\.txt: found .* views of 1280 × 760"):
-        read_camera(tmp_path, (760, 1280))
+        read_view_camera(tmp_path, (760, 1280))
 
 
 # --- labels --------------------------------------------------------------------------------------

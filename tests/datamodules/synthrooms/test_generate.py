@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
-from datamodules.synthrooms.camera import PanoramaView, PerspectiveView, Pose, euler_rotation
+from datamodules.synthrooms.camera import PanoramaRays, PerspectiveRays, Pose, euler_rotation
 from datamodules.synthrooms.generate import RoomSettings, plan_rooms
 from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render
+from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render_picture
 from datamodules.synthrooms.room import Room
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from datamodules.synthrooms.writer import (
@@ -80,8 +80,8 @@ def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> 
         scene = RayScene(room)
         holes = draw_holes(room.rng, scene)
         camera = draw_camera(room.rng, scene, room.plan, [])
-        view = PanoramaView(Pose.looking(camera.location, camera.heading), 32)
-        items = render(scene, view, camera, holes, 1, room.rng).items
+        view = PanoramaRays(Pose.looking(camera.location, camera.heading), 32)
+        items = render_picture(scene, view, camera, holes, 1, room.rng).items
         seen = Counter(room.items[k] for k in items[items != MISSING])
         pixels += seen
         present.update(seen.keys())
@@ -140,7 +140,7 @@ def test_pictures_survive_the_files() -> None:
 def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
     original = Pose.looking(np.array([1.0, 2.0, 1.5]), 0.7)
     turned = Pose.looking(original.location, -1.2, 0.3, 0.1)
-    view = PanoramaView(original, 64) if panorama else PerspectiveView(turned, 100, 1.0)
+    view = PanoramaRays(original, 64) if panorama else PerspectiveRays(turned, 100, 1.0)
     frame = "equirectangular" if panorama else "4"
     record = pose_record(ROOMS[1], CAMERA, frame, view, original)
     assert record["camera_uuid"] == record["point_uuid"] == CAMERA

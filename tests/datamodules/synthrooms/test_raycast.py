@@ -8,16 +8,16 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.synthrooms.camera import (
-    PanoramaView,
-    PerspectiveView,
+    PanoramaRays,
+    PerspectiveRays,
     Pose,
-    draw_view,
+    draw_rays,
     euler_angles,
     euler_rotation,
 )
 from datamodules.synthrooms.layout import FloorPlan
 from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render
+from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render_picture
 from datamodules.synthrooms.room import Light, Room
 from datamodules.synthrooms.scene import shell
 from tangent_train.geometry import FLIP_Y, equirect_directions, random_rotation, rotation_about
@@ -46,14 +46,14 @@ def _is_slab(triangles: NDArray[Any]) -> bool:
 
 
 def take(
-    view: PanoramaView, holes: Holes = NO_HOLES, caps: tuple[float, float] = (0.0, 0.0)
+    view: PanoramaRays, holes: Holes = NO_HOLES, caps: tuple[float, float] = (0.0, 0.0)
 ) -> Picture:
     camera = Camera(HERE, 0.0, caps, np.full(3, 3.0, np.float32), 0.0)
-    return render(RayScene(empty_room()), view, camera, holes, 2, np.random.default_rng(0))
+    return render_picture(RayScene(empty_room()), view, camera, holes, 2, np.random.default_rng(0))
 
 
 def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
-    view = PanoramaView(Pose.looking(HERE, heading=0.7), 64)
+    view = PanoramaRays(Pose.looking(HERE, heading=0.7), 64)
     rays = view.rays().astype(np.float64)
     with np.errstate(divide="ignore"):
         expected = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays).min(axis=-1)
@@ -64,7 +64,7 @@ def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
 
 
 def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None:
-    view = PanoramaView(Pose.looking(HERE, 0.0), 64)
+    view = PanoramaRays(Pose.looking(HERE, 0.0), 64)
     whole = take(view)
     wall = HERE + np.array([3.5, 0, 0])
     holed = take(view, Holes(wall[None], np.array([0.5])))
@@ -79,7 +79,7 @@ def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None
 
 @pytest.mark.parametrize(("caps", "rows"), [((0.4, 0.0), [0]), ((0.0, 0.4), [-1]), ((0, 0), [])])
 def test_caps_are_black_and_missing(caps: tuple[float, float], rows: list[int]) -> None:
-    picture = take(PanoramaView(Pose.looking(HERE, 0), 32), caps=caps)
+    picture = take(PanoramaRays(Pose.looking(HERE, 0), 32), caps=caps)
     black = (picture.rgb == 0).all(axis=(1, 2))
     missing = (picture.items == MISSING).all(axis=1) & np.isnan(picture.depth_m).all(axis=1)
     for row in (0, -1):
@@ -101,13 +101,13 @@ def test_euler_angles_give_their_rotation_back(seed: int) -> None:
 
 
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
-    view = PanoramaView(Pose.looking(PLACE, heading=0.7), 16)
+    view = PanoramaRays(Pose.looking(PLACE, heading=0.7), 16)
     expected = equirect_directions((16, 32)) @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T
     np.testing.assert_allclose(view.rays(), expected, atol=1e-6)
 
 
 def test_perspective_rays_project_to_their_pixels() -> None:
-    view = PerspectiveView(Pose.looking(PLACE, 0.4, 0.2, 0.1), 9, math.radians(60))
+    view = PerspectiveRays(Pose.looking(PLACE, 0.4, 0.2, 0.1), 9, math.radians(60))
     rays = view.rays()
     projected = rays @ view.pose.world_from_camera @ view.camera_matrix.T
     pixels = projected[..., :2] / projected[..., 2:]
@@ -123,7 +123,7 @@ def test_views_look_around_as_asked() -> None:
     rng = np.random.default_rng(0)
     up = {
         kind: np.array(
-            [draw_view(rng, kind, PLACE, 8).pose.world_from_camera[2, 2] for _ in range(2000)]
+            [draw_rays(rng, kind, PLACE, 8).pose.world_from_camera[2, 2] for _ in range(2000)]
         )
         for kind in ("uniform", "stanford")
     }

@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
-from datamodules.synthrooms.camera import PanoramaView, Pose
+from datamodules.synthrooms.camera import PanoramaRays, Pose
 from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render
+from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
 from datamodules.synthrooms.scene import furnish
 from tests.cli.rendering import render_with
 from tests.geometry.directions import angle_deg
@@ -34,7 +34,7 @@ def _panoramas(folder: Path) -> dict[str, Pose]:
         place = first.location + (rng.uniform(-0.35, 0.35, 3) if k else 0)
         pose = Pose.looking(place, rng.uniform(-3, 3), *rng.uniform(-0.2, 0.2, 2))
         camera = Camera(place, 0.0, (0.0, 0.0), first.gain, 0.004)
-        picture = render(scene, PanoramaView(pose, 512), camera, holes, 1, rng)
+        picture = render_picture(scene, PanoramaRays(pose, 512), camera, holes, 1, rng)
         write_pixels(folder / f"{k}" / "room.png", picture.rgb)
         poses[f"{k}/room.png"] = pose
     return poses

@@ -18,14 +18,14 @@ from PIL import Image
 
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.folder.cameras import read_cameras as read_photo_cameras
+from datamodules.folder.cameras import read_folder_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
-from datamodules.images.gpano import area_of, up_of
+from datamodules.images.gpano import read_area, read_up
 from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.files import CLASSES
 from datamodules.stanford2d3ds.reader import LabelTable, read_camera_matrix, read_panorama_pose
-from datamodules.zind.homes import list_panoramas
+from datamodules.zind.homes import list_home_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
 from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
@@ -152,7 +152,7 @@ def _read_home(path: Path) -> None:
     file.parent.mkdir(exist_ok=True)
     path.replace(file)
     problems = Problems()
-    panoramas = list_panoramas(path.parent, problems)
+    panoramas = list_home_panoramas(path.parent, problems)
     problems.refuse(path.parent)
     for panorama in panoramas:
         assert panorama.image().parent == file.parent / "panos"
@@ -173,9 +173,9 @@ def _gpano_seeds() -> list[bytes]:
 
 
 def _read_gpano(path: Path) -> None:
-    up = up_of(path)
+    up = read_up(path)
     assert up is None or abs(np.linalg.norm(up) - 1) < 1e-9
-    area = area_of(path, (40, 60))
+    area = read_area(path, (40, 60))
     rows, columns = area.places()
     assert (len(rows), len(columns)) == area.image_shape
     assert 0 <= rows.min() <= rows.max() < area.full_shape[0] <= 16384
