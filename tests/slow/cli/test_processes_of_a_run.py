@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import re
 import subprocess
@@ -28,12 +29,21 @@ def _names_in_report(run: Path) -> list[str]:
     return re.findall(r"area_\w+/\w+", (run / "report.html").read_text())
 
 
+def _scalars(run: Path) -> dict[str, list[float]]:
+    """Logged values by name, but for the epoch."""
+    (path,) = run.glob("csv/*/metrics.csv")
+    rows = list(csv.DictReader(path.read_text().splitlines()))
+    names = rows[0].keys() - {"epoch"}
+    return {name: [float(row[name]) for row in rows if row[name]] for name in names}
+
+
 def test_two_processes_make_the_steps_and_figures_of_one(
     rooms: str, tmp_path: Path, run: Run, plain: tuple[str, ...]
 ) -> None:
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = [*plain, *settings, rooms]
     common += ["trainer.max_steps=3", "data.validation_fraction=0.4", "panels=2"]
+    common += ["logger=many", "trainer.log_every_n_steps=1"]
     # Not of Adam, whose steps do not depend on the size of the gradient.
     common += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1"]
     one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
@@ -42,7 +52,15 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     two = [*common, "trainer=ddp", *devices, "trainer.max_steps=3"]
     two += ["data.panoramas_per_step=1", "task.images_per_chunk=2"]
     _train(tmp_path, *two, "hydra.run.dir=two")
-    assert {path.name for path in tmp_path.iterdir()} == {"one", "two", "own"}, "one folder each"
+    assert {"mlflow.db", "mlruns", "one", "own", "two"} >= {p.name for p in tmp_path.iterdir()}
+    logged = [_scalars(tmp_path / name) for name in ("one", "two")]
+    assert logged[1].keys() == logged[0].keys()
+    assert len(logged[0]["train/loss"]) == 3, "both processes log once"
+    for name, values in logged[0].items():
+        assert logged[1][name] == pytest.approx(values, abs=1e-5), name
+    assert len(list((tmp_path / "two" / "tensorboard").glob("events*"))) == len(
+        list((tmp_path / "one" / "tensorboard").glob("events*"))
+    )
     first, second = (
         torch.load(tmp_path / n / "checkpoints" / "last.ckpt", weights_only=True)
         for n in ("one", "two")
