@@ -42,7 +42,7 @@ def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
 
     Args:
         module: Its full name.
-        name: In the module.
+        name: Name in the module.
 
     Returns:
         None where files may not name it.

@@ -78,7 +78,7 @@ def registered(made: _Registered) -> _Registered:
 
 @dataclass(frozen=True)
 class SettingsFile:
-    """The file that settings come from, and what the user says about it.
+    """The file that settings come from, with settings and names that the user typed.
 
     Attributes:
         path: The file, for messages.
@@ -97,7 +97,7 @@ class SettingsFile:
         return not any(f"{place}.".startswith(f"{name}.") for name in self.user_settings)
 
     def refused(self, place: str, value: Any, expected: str) -> DataError:
-        """The error for an invalid value of the file."""
+        """Return the error for an invalid value of the file."""
         remedy = f"On the command line {place}=… may be anything."
         return DataError(self.path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
@@ -123,7 +123,7 @@ def build_from_config(
             take its arguments; other errors of a user's own class are raised as they are.
         DataError: The file gives forbidden or invalid settings.
     """
-    maker, kinds = _maker(settings, place, file)
+    maker, kinds = _resolve(settings, place, file)
     weights = [name for name, kind in kinds.items() if kind is Weights and file is not None]
     section = dict.fromkeys(weights) | dict(settings)
     source = file if file is not None and file.gave(place) else None
@@ -180,7 +180,7 @@ def check_arguments(section: Any, place: str) -> None:
         SettingError: A class cannot be imported, or gets an unknown argument or text for a number.
     """
     for inner, at in _sections(section, place):
-        maker, kinds = _maker(inner, at, None)
+        maker, kinds = _resolve(inner, at, None)
         arguments = [name for name in inner if name not in _HYDRA]
         for name in arguments:
             _check_whole(inner[name], f"{at}.{name}", kinds.get(name))
@@ -275,8 +275,8 @@ def _check_taken(
 
 
 def resolve_target(settings: Any, place: str, file: SettingsFile | None = None) -> Any:
-    """The class or function that a section names; see `build_from_config`."""
-    return _maker(settings, place, file)[0]
+    """Return the class or function that a section names; see `build_from_config`."""
+    return _resolve(settings, place, file)[0]
 
 
 def import_named(target: Any, place: str) -> Any:
@@ -300,7 +300,7 @@ def import_named(target: Any, place: str) -> Any:
 
 
 def unregistered(settings: Any) -> tuple[str, ...]:
-    """What a section of a config names that a file may not name, and sections in it likewise.
+    """Return the names in a section, and in sections inside it, that a file may not use.
 
     Args:
         settings: The section, whose names are known to be right.
@@ -316,20 +316,20 @@ def unregistered(settings: Any) -> tuple[str, ...]:
 def check_fields(
     path: Path, content: Any, kinds: Mapping[str, Any], expected: str, where: str = ""
 ) -> dict[str, Any]:
-    """The fields of a mapping in a file, each of its kind.
+    """Return the fields of a mapping in a file, each of its kind.
 
     Args:
         path: The file, for the message.
         content: The mapping.
-        kinds: Of every field; one that may be missing is a union with None.
+        kinds: Kind of every field; of a field that may be missing, a union with None.
         expected: Expected file.
-        where: In it, for the message.
+        where: Place in the file, for the message.
 
     Returns:
         These fields; None where they are missing.
 
     Raises:
-        DataError: It is no mapping, or a field is missing or of another kind.
+        DataError: It is not a mapping, or a field is missing or of another kind.
     """
     inside = f"in {where}" if where else "inside"
     if not isinstance(content, Mapping):
@@ -375,8 +375,8 @@ def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
     raise DataError(path, found=f"{place}={value!r}", expected=expected)
 
 
-def _maker(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
-    """The class or function that a section names, with the kinds of its arguments in a file."""
+def _resolve(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any, Mapping[str, Any]]:
+    """Return the class or function of a section, with the kinds of its arguments in a file."""
     target = settings.get("_target_") if isinstance(settings, Mapping) else None
     if not isinstance(target, str):
         expected = "a section with a _target_"
@@ -495,7 +495,7 @@ def is_class_name(value: Any) -> bool:
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Whether a value is of a kind: a type of plain values, or `Text`."""
+    """Return True for a value of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in arguments)

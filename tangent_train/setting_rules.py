@@ -59,10 +59,10 @@ _OR_PATHS = ("data.mask",)
 
 
 def may_differ(name: str, purpose: Purpose) -> bool:
-    """Whether a setting may differ between two runs.
+    """Return True if a setting may differ between two runs.
 
     Args:
-        name: As ``section.setting``.
+        name: Name of the setting, ``section.setting``.
         purpose: Relation of the two.
     """
     while name and name not in _MAY_DIFFER:
@@ -71,10 +71,10 @@ def may_differ(name: str, purpose: Purpose) -> bool:
 
 
 def from_file(name: str, value: Any = None) -> bool:
-    """Whether the settings in a file may give a setting.
+    """Return True if the settings in a file may give a setting.
 
     Args:
-        name: As ``section.setting``.
+        name: Name of the setting, ``section.setting``.
         value: Its value: a mask may be a latitude, or a path of this machine.
     """
     return not (

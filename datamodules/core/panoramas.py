@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,6 +24,7 @@ from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size, check_png
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import PanoramaPose
+from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -185,9 +185,7 @@ class Panorama(NamedTuple):
 
 def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.uint8]:
     """Downsample ``(H, W, 3)`` to ``shape`` by area averaging."""
-    if image.shape[:2] == shape:
-        return image
-    return cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_AREA)
+    return resize(image, shape, "bilinear")
 
 
 def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
@@ -195,13 +193,8 @@ def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_P
 
     Where that is a corner of four pixels (even ratios) it is the lower right one.
     """
-    if image.shape[:2] == shape:
-        return image
-    rows, columns = (
-        (2 * np.arange(target) + 1) * source // (2 * target)
-        for source, target in zip(image.shape, shape, strict=False)
-    )
-    return image[rows][:, columns]
+    resized: Any = resize(image, shape, "nearest")
+    return resized
 
 
 def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:

@@ -15,15 +15,7 @@ from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps,
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
-from datamodules.images.image_files import (
-    IMAGE_SUFFIXES,
-    NamedFiles,
-    composed,
-    find_depth,
-    image_paths,
-    spelled,
-    walk_files,
-)
+from datamodules.images import image_files
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from datamodules.images.png import PngHeader, read_png_header
@@ -100,23 +92,23 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
             expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
-    labels = NamedFiles(root / "labels")
-    depths = NamedFiles(root / "depth") if with_depth else None
-    for rgb in image_paths(root / "images"):
+    labels = image_files.NamedFiles(root / "labels")
+    depths = image_files.NamedFiles(root / "depth") if with_depth else None
+    for rgb in image_files.image_paths(root / "images"):
         name = _name(root / "images", rgb)
         label, depth = labels.folder / f"{name}.png", None
         with problems.noted(name):
             if name in found:
                 raise DataError(
                     rgb,
-                    found=f"{spelled(found[name].rgb.name)} beside it",
+                    found=f"{image_files.spelled(found[name].rgb.name)} beside it",
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )
             label = labels.path(f"{name}.png")
             if depths is not None:
                 without = "Or train without depth: data.inputs=[rgb]."
-                depth = find_depth(depths, name, without)
+                depth = image_files.find_depth(depths, name, without)
         found.setdefault(name, ImageFiles(name, rgb, label, depth))
     return [found[name] for name in sorted(found)]
 
@@ -128,22 +120,24 @@ def note_ignored(root: Path, problems: Problems) -> None:
         root: Folder with ``images/`` and ``labels/``, there or not.
         problems: They are added.
     """
-    files = list(walk_files(root / "images"))
+    files = list(image_files.walk_files(root / "images"))
     names = {_name(root / "images", path) for path in files}
     noted = [
         (path, "labels of no image", "Name it as its image, or remove it.")
-        for path in walk_files(root / "labels")
+        for path in image_files.walk_files(root / "labels")
         if _name(root / "labels", path) not in names
     ]
-    others = [path for path in files if path.suffix.lower() not in IMAGE_SUFFIXES]
+    others = [path for path in files if path.suffix.lower() not in image_files.IMAGE_SUFFIXES]
     noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
-    expected = f"images ({', '.join(IMAGE_SUFFIXES)}) and labels (.png) of the same names"
+    expected = (
+        f"images ({', '.join(image_files.IMAGE_SUFFIXES)}) and labels (.png) of the same names"
+    )
     for path, found, remedy in noted:
         problems.add(DataError(path, found=found, expected=expected, remedy=remedy), str(path))
 
 
 def _name(folder: Path, path: Path) -> str:
-    return composed(path.relative_to(folder).with_suffix("").as_posix())
+    return image_files.composed(path.relative_to(folder).with_suffix("").as_posix())
 
 
 def _check_there(path: Path) -> None:
@@ -200,7 +194,7 @@ def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
         SettingError: It does not name one of the classes.
     """
     classes = read_classes(folder / "classes.json")
-    names, ignored = classes.names, list(map(composed, ignored))
+    names, ignored = classes.names, list(map(image_files.composed, ignored))
     if set(ignored) - set(names):
         found = ", ".join(sorted(set(ignored) - set(names)))
         raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")

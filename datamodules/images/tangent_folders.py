@@ -18,15 +18,7 @@ from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.images.videos import VIDEO_SUFFIXES
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_shape
-from tangent_train.rendering import Interpolation, equirect_to_tangent
-from tangent_train.rendering.camera_files import (
-    CAMERAS_FILE,
-    RIG_FILE,
-    CameraFile,
-    read_cameras,
-    read_rig,
-    write_cameras,
-)
+from tangent_train.rendering import Interpolation, camera_files, equirect_to_tangent
 from tangent_train.threads import in_threads
 
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
@@ -108,7 +100,7 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
 def write_tangent_folder(
     folder: Path,
     image: NDArray[Any],
-    cameras: CameraFile,
+    cameras: camera_files.CameraFile,
     interpolation: Interpolation,
     progress: Callable[[float], object],
 ) -> None:
@@ -132,7 +124,7 @@ def write_tangent_folder(
 
     with replaced_folder(folder) as unfinished:
         write_each(render, dict(zip(cameras.files, cameras.faces, strict=True)), progress)
-        write_cameras(unfinished / CAMERAS_FILE, cameras)
+        camera_files.write_cameras(unfinished / camera_files.CAMERAS_FILE, cameras)
 
 
 @contextmanager
@@ -188,8 +180,11 @@ def _remove_earlier(folder: Path) -> None:
 
 
 def _written(folder: Path) -> set[Path]:
-    if (folder / RIG_FILE).is_file():
-        images = read_rig(folder / RIG_FILE).images
+    if (folder / camera_files.RIG_FILE).is_file():
+        images = camera_files.read_rig(folder / camera_files.RIG_FILE).images
         masks = (Path("masks", f"{image}.png") for image in images)
-        return {Path(RIG_FILE), *(Path("images", image) for image in images), *masks}
-    return {Path(CAMERAS_FILE), *map(Path, read_cameras(folder / CAMERAS_FILE).files)}
+        return {Path(camera_files.RIG_FILE), *(Path("images", image) for image in images), *masks}
+    return {
+        Path(camera_files.CAMERAS_FILE),
+        *map(Path, camera_files.read_cameras(folder / camera_files.CAMERAS_FILE).files),
+    }

@@ -12,14 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ray_lengths
-from datamodules.images.pixel_files import (
-    LOSSY_SUFFIXES,
-    READABLE_SUFFIXES,
-    array_file,
-    check_writable,
-    read_pixels,
-    write_pixels,
-)
+from datamodules.images import pixel_files
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import Blend, tangent_to_equirect
@@ -62,7 +55,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
         )
     there: dict[str, list[Path]] = {}
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() in READABLE_SUFFIXES:
+        if file.suffix.lower() in pixel_files.READABLE_SUFFIXES:
             there.setdefault(file.stem, []).append(file)
     stems = [Path(name).stem for _, name in sorted(zip(cameras.faces, cameras.files, strict=True))]
     wrong = [stem for stem in stems if len(there.get(stem, [])) != 1]
@@ -108,7 +101,7 @@ class TangentResults:
             DataError: A file cannot be read, is not square, differs from the others, or cannot be
                 of this kind.
         """
-        arrays = list(in_threads(partial(read_pixels, indices=kind != "color"), files))
+        arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
         first = arrays[0]
         height, width = first.shape[:2]
         for file, array in zip(files, arrays, strict=True):
@@ -157,11 +150,11 @@ class TangentResults:
         suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
         if z_depth and self.kind != "depth":
             raise SettingError("z_depth", found=f"true for {self.kind}", expected="depth")
-        if suffix in LOSSY_SUFFIXES and self.kind != "color":
+        if suffix in pixel_files.LOSSY_SUFFIXES and self.kind != "color":
             expected = f"png, tif or npy: {suffix} would change the {self.kind}"
             raise SettingError("output", found=path.name, expected=expected)
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
-        check_writable(suffix, dtype, channels[0] if channels else 1)
+        pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
         size = self.arrays[0].shape[0]
         grid = self.grid if size == self.grid.dim else self.grid.resized(size)
         arrays = self.arrays
@@ -169,12 +162,12 @@ class TangentResults:
             arrays = [_distances(array, grid, path) for array in arrays]
         whole = (*shape, *channels)
         if suffix == ".npy":
-            with array_file(path, whole, dtype) as out:
+            with pixel_files.array_file(path, whole, dtype) as out:
                 self._render(arrays, grid, blend, out)
         else:
             panorama = np.empty(whole, arrays[0].dtype)
             self._render(arrays, grid, blend, panorama)
-            write_pixels(path, panorama.astype(dtype, copy=False))
+            pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
 
     def _image_dtype(self) -> np.dtype[Any]:
         dtype = self.arrays[0].dtype

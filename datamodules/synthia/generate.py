@@ -23,23 +23,7 @@ from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_
 from datamodules.core.problems import Problems
 from datamodules.core.progress import show_progress
 from datamodules.images.pixel_files import read_rgb, write_pixels
-from datamodules.synthia.reader import (
-    FRAMES,
-    GET_IT,
-    INVALID,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
-    VIEWS,
-    SynthiaReader,
-    choose_frames,
-    list_frames,
-    panorama_files,
-    read_first_channel,
-    read_ids,
-    read_view_camera,
-    sequence_folder,
-    view_files,
-)
+from datamodules.synthia import reader
 from tangent_train.errors import DataError, at_least
 from tangent_train.geometry import (
     equirect_latitudes,
@@ -124,7 +108,7 @@ def _view_positions(
     """
     width = 2 * height
     level = lonlat_to_xyz(np.stack([equirect_longitudes(width), np.zeros(width)], axis=-1))
-    turns = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(VIEWS))]
+    turns = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
     ahead, right, _ = np.moveaxis(np.stack([level @ turn for turn in turns]), -1, 0)
     owner = ahead.argmax(axis=0)
     columns = np.arange(width)
@@ -139,7 +123,7 @@ def make_panoramas(
     sequences: Sequence[str],
     problems: Problems,
     *,
-    frames: int = FRAMES,
+    frames: int = reader.FRAMES,
     height: int = HEIGHT,
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
@@ -166,8 +150,10 @@ def make_panoramas(
     jobs: list[Callable[[], None]] = []
     total = 0
     for sequence in sequences:
-        if _claim(sequence_folder(root, sequence), frames, height):
-            chosen = choose_frames(list_frames(sequence_folder(root, sequence)), frames)
+        if _claim(reader.sequence_folder(root, sequence), frames, height):
+            chosen = reader.choose_frames(
+                reader.list_frames(reader.sequence_folder(root, sequence)), frames
+            )
             jobs += _unfinished(root, sequence, chosen, height, problems)
             total += len(chosen)
     # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
@@ -181,11 +167,14 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
     """Mark a folder in which panoramas are to be generated; False if there are none."""
     pano = folder / "pano"
     is_ours, has_files = (pano / MANIFEST).exists(), any(pano.glob("**/[!.]*.png"))
-    if not list_frames(folder):
+    if not reader.list_frames(folder):
         if is_ours or has_files:
             return False
         raise DataError(
-            folder, found="neither views nor panoramas", expected="RGB, GT, Depth", remedy=GET_IT
+            folder,
+            found="neither views nor panoramas",
+            expected="RGB, GT, Depth",
+            remedy=reader.GET_IT,
         )
     if has_files and not is_ours:
         return False
@@ -200,24 +189,28 @@ def _unfinished(
     size: tuple[int, int] | None = None
     whole = []
     for frame in frames:
-        target = panorama_files(root, sequence, frame, with_depth=True)
+        target = reader.panorama_files(root, sequence, frame, with_depth=True)
         if _is_whole(target, height):
             continue
-        views = [view_files(root, sequence, frame, view, with_depth=True) for view in VIEWS]
+        views = [
+            reader.view_files(root, sequence, frame, view, with_depth=True) for view in reader.VIEWS
+        ]
         for view in views:
             one = view._replace(name=target.name)
-            size = check_headers(one, SynthiaReader(VIEW_FORMATS), problems) or size
+            size = check_headers(one, reader.SynthiaReader(reader.VIEW_FORMATS), problems) or size
         if target.name not in problems.items:
             whole.append((views, target))
     if size is None or not whole:
         return []
-    stitcher = ViewStitcher(read_view_camera(sequence_folder(root, sequence), size), size, height)
+    stitcher = ViewStitcher(
+        reader.read_view_camera(reader.sequence_folder(root, sequence), size), size, height
+    )
     return [partial(_make, stitcher, views, target, problems) for views, target in whole]
 
 
 def _is_whole(files: ImageFiles, height: int) -> bool:
     problems = Problems()
-    size = check_headers(files, SynthiaReader(PANORAMA_FORMATS), problems)
+    size = check_headers(files, reader.SynthiaReader(reader.PANORAMA_FORMATS), problems)
     return size == (height, 2 * height) and not problems.items
 
 
@@ -225,11 +218,13 @@ def _make(
     stitcher: ViewStitcher, views: Sequence[ImageFiles], target: ImageFiles, problems: Problems
 ) -> None:
     with problems.noted(target.name):
-        depth = [read_first_channel(view.parts["depth"]) for view in views]
+        depth = [reader.read_first_channel(view.parts["depth"]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
-            "labels": stitcher.stitch([read_ids(v.labels) for v in views], "nearest", INVALID),
+            "labels": stitcher.stitch(
+                [reader.read_ids(v.labels) for v in views], "nearest", reader.INVALID
+            ),
             # Last: frames with this file have a panorama.
             "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }

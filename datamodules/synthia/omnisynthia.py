@@ -25,24 +25,8 @@ from datamodules.core.index import DatasetIndex, Split
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
+from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from datamodules.synthia.reader import (
-    CLASSES,
-    FRAMES,
-    GET_IT,
-    NORMALIZATIONS,
-    PANORAMA_FORMATS,
-    VIEW_FORMATS,
-    VIEWS,
-    Formats,
-    SynthiaReader,
-    choose_frames,
-    list_frames,
-    list_panorama_frames,
-    panorama_files,
-    sequence_folder,
-    view_files,
-)
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
@@ -74,15 +58,15 @@ class SynthiaSequences(ImageDataModule):
         SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *CLASSES)
-    normalizations = NORMALIZATIONS
-    formats: ClassVar[Formats]
-    remedy: ClassVar[str] = GET_IT
+    class_names = ("unknown", *reader.CLASSES)
+    normalizations = reader.NORMALIZATIONS
+    formats: ClassVar[reader.Formats]
+    remedy: ClassVar[str] = reader.GET_IT
 
     inputs: Sequence[Input] = ("rgb",)
     train_sequences: Sequence[str] = TRAIN
     test_sequences: Sequence[str] = TEST
-    frames: int = FRAMES
+    frames: int = reader.FRAMES
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -105,7 +89,7 @@ class SynthiaSequences(ImageDataModule):
 
     def find_images(
         self, problems: Problems
-    ) -> tuple[SynthiaReader, dict[Split, list[ImageFiles]]]:
+    ) -> tuple[reader.SynthiaReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
         found: dict[str, list[list[ImageFiles]]] = {}
         for sequence in self.sequences:
@@ -115,13 +99,13 @@ class SynthiaSequences(ImageDataModule):
                 found[sequence] = self.list_images(sequence, with_depth=with_depth)
                 if not found[sequence]:
                     raise DataError(
-                        sequence_folder(self.root, sequence),
+                        reader.sequence_folder(self.root, sequence),
                         found=f"no {self.noun}",
                         expected="000000.png and others",
                         remedy=self.remedy,
                     )
         splits = divide(found, self.test_sequences, self.validation_fraction)
-        return SynthiaReader(self.formats), splits
+        return reader.SynthiaReader(self.formats), splits
 
 
 def divide(
@@ -169,8 +153,8 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         SettingError: A setting is invalid.
     """
 
-    formats = PANORAMA_FORMATS
-    remedy = f"Run tangent-prepare to make them from the views. {GET_IT}"
+    formats = reader.PANORAMA_FORMATS
+    remedy = f"Run tangent-prepare to make them from the views. {reader.GET_IT}"
 
     panorama_height: int = HEIGHT
 
@@ -203,8 +187,8 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
         return [
-            [panorama_files(self.root, sequence, frame, with_depth=with_depth)]
-            for frame in list_panorama_frames(sequence_folder(self.root, sequence))
+            [reader.panorama_files(self.root, sequence, frame, with_depth=with_depth)]
+            for frame in reader.list_panorama_frames(reader.sequence_folder(self.root, sequence))
         ]
 
 
@@ -217,12 +201,15 @@ class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
         SettingError: A setting is invalid.
     """
 
-    formats = VIEW_FORMATS
+    formats = reader.VIEW_FORMATS
 
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
-        frames = list_frames(sequence_folder(self.root, sequence))
+        frames = reader.list_frames(reader.sequence_folder(self.root, sequence))
         return [
-            [view_files(self.root, sequence, frame, v, with_depth=with_depth) for v in VIEWS]
-            for frame in choose_frames(frames, self.frames)
+            [
+                reader.view_files(self.root, sequence, frame, v, with_depth=with_depth)
+                for v in reader.VIEWS
+            ]
+            for frame in reader.choose_frames(frames, self.frames)
         ]

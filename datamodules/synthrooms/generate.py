@@ -14,19 +14,11 @@ from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
 from datamodules.core.progress import show_progress
 from datamodules.stanford2d3ds.files import AREAS
+from datamodules.synthrooms import writer
 from datamodules.synthrooms.camera import PanoramaRays, PictureRays, Pose, ViewKind, draw_rays
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
 from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.writer import (
-    PANORAMA,
-    RoomPlan,
-    camera_identifier,
-    encode_picture,
-    label_indices,
-    label_strings,
-    pose_record,
-)
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import write_bytes, write_text
 
@@ -93,9 +85,9 @@ class RoomSettings:
         return [area for area, count in self.rooms.items() if count]
 
 
-def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
+def plan_rooms(settings: RoomSettings) -> list[writer.RoomPlan]:
     """Return all rooms of a data set, in the order of the label table."""
-    plans: list[RoomPlan] = []
+    plans: list[writer.RoomPlan] = []
     numbers = {area[0]: 0 for area in AREAS}
     for area in (area for area, count in settings.rooms.items() for _ in range(count)):
         number = numbers[area[0]] = numbers[area[0]] + 1
@@ -103,10 +95,10 @@ def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
         kind = draw_room_type(rng)
         drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
         cameras = tuple(
-            camera_identifier(settings.seed, area, f"{kind}_{number}", k)
+            writer.camera_identifier(settings.seed, area, f"{kind}_{number}", k)
             for k in range(max(settings.least_cameras, drawn))
         )
-        plans.append(RoomPlan(area, kind, number, len(plans), cameras, rng))
+        plans.append(writer.RoomPlan(area, kind, number, len(plans), cameras, rng))
     return plans
 
 
@@ -128,8 +120,8 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
     plans = plan_rooms(settings)
     labels = root / "semantic_labels.json"
     if not labels.exists():
-        write_text(labels, json.dumps(label_strings(plans)))
-    frames = (PANORAMA, *map(str, range(settings.views_per_camera)))
+        write_text(labels, json.dumps(writer.label_strings(plans)))
+    frames = (writer.PANORAMA, *map(str, range(settings.views_per_camera)))
     unfinished = [
         plan for plan in plans if not all((root / file).exists() for file in plan.files(frames))
     ]
@@ -138,7 +130,7 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
     show_progress(making, "Rendering rooms", "rooms", len(plans), before)
 
 
-def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
+def make_room(root: Path, settings: RoomSettings, plan: writer.RoomPlan) -> None:
     """Furnish a room, render its pictures and write their files.
 
     Args:
@@ -150,19 +142,19 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan) -> None:
     room = furnish(rng, plan.kind)
     scene = RayScene(room)
     holes = draw_holes(rng, scene)
-    labels = label_indices(plan, room.items)
+    labels = writer.label_indices(plan, room.items)
     cameras: list[Camera] = []
     for identifier in plan.cameras:
         camera = draw_camera(rng, scene, room.plan, cameras)
         cameras.append(camera)
         original = Pose.looking(camera.location, camera.heading)
-        views: dict[str, PictureRays] = {PANORAMA: PanoramaRays(original, settings.height)}
+        views: dict[str, PictureRays] = {writer.PANORAMA: PanoramaRays(original, settings.height)}
         for k in range(settings.views_per_camera):
             views[str(k)] = draw_rays(rng, settings.views, camera.location, settings.view_size)
         for frame, view in views.items():
             picture = render_picture(scene, view, camera, holes, settings.supersample, rng)
-            files = encode_picture(picture, labels)
-            pose = pose_record(plan, identifier, frame, view, original)
+            files = writer.encode_picture(picture, labels)
+            pose = writer.pose_record(plan, identifier, frame, view, original)
             files["pose"] = json.dumps(pose).encode() + b"\n"
             for kind, content in files.items():
                 write_bytes(root / plan.file(identifier, frame, kind), content)

@@ -25,7 +25,7 @@ _OF_A_SWEEP = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)"
 
 
 def config_folder() -> Path:
-    """The Hydra tree: the copy inside the wheel first, the checkout's second."""
+    """Return the Hydra tree: the copy inside the wheel first, the checkout's second."""
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
@@ -65,14 +65,14 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
 
 
 def values_of_sweep(value: str, arguments: Sequence[str]) -> list[str]:
-    """The values that commas separate in a sweep; without ``-m`` on the command line, the value."""
+    """Return the values between commas in a sweep; without ``-m``, the whole value."""
     if {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments):
         return [value]
     return _OF_A_SWEEP.findall(f"{value},")[:-1]
 
 
 def path_text(value: str) -> str:
-    """The path that a value on a command line stands for, see `literal_paths`."""
+    """Return the path that a value on a command line stands for, see `literal_paths`."""
     within = _in_quotes(value)
     if within is not None:
         return re.sub(r"(\\*)\1\\\$\{", r"\1${", within)
@@ -140,7 +140,7 @@ def _annotations(groups: Sequence[str], name: str, arguments: str) -> str:
 
 @cache
 def _source(module: str) -> str:
-    """The source code of a module, and of all below it in a package of this program."""
+    """Return the source code of a module, and of all modules below it in our packages."""
     top, *rest = module.split(".")
     # Of a whole package: finding a module in it would import the package.
     spec = find_spec(top) if top.isidentifier() else None

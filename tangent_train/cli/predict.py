@@ -1,4 +1,4 @@
-"""``tangent-predict``: label maps of the user's own panoramas and photos."""
+"""``tangent-predict``: label maps of user panoramas and photos."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Masks
@@ -41,6 +40,7 @@ from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
     Entry,
+    LabeledImage,
     PredictionFolder,
     class_shares,
     is_result_in,
@@ -51,10 +51,10 @@ _DECISIVE = (
     "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
-"""Settings that results depend on: those of resumed predictions must be the same."""
+"""Settings that results depend on: resumed predictions must have the same."""
 
 _SAVED_EVERY_S = 10.0
-"""So much work is done again after a process was killed."""
+"""Seconds of work that may be lost when a process is killed."""
 
 
 def predict(config: Mapping[str, Any]) -> None:
@@ -164,20 +164,12 @@ def _finish(
     print_text(f"Results are in {settings.output}.")
 
 
-class _Labelled(NamedTuple):
-    """An image with its labels; `area` is their part of a panorama, None of photos."""
-
-    image: InputImage
-    labels: NDArray[np.unsignedinteger]
-    area: PanoramaArea | None
-
-
 class _Labeller:
     """Reads images, predicts their labels and writes these.
 
     Args:
-        settings: Of the command.
-        original: The network with its own classes, which tells which way is up.
+        settings: Settings of the command.
+        original: The network before classes are mapped, which estimates up.
         trained: The network.
         folder: Output folder.
         shown: Names of the images of the report.
@@ -207,7 +199,7 @@ class _Labeller:
             return read_photo(image, given.fov, depth), None
         return read_panorama(image, given.crop, given.upright, depth)
 
-    def __call__(self, job: Job, progress: Callable[[float], object]) -> _Labelled:
+    def __call__(self, job: Job, progress: Callable[[float], object]) -> LabeledImage:
         """Predict the labels of one image that was read."""
         image, area = job.value
         if self._settings.upright == "auto" and area is not None:
@@ -216,26 +208,27 @@ class _Labeller:
         scores = self._predictor.predict(image, progress, probabilities=probabilities)
         self._folder.write_probabilities(job.item, scores, area)  # here: scores are large
         labels = self._trained.labels(scores.labels())
-        return _Labelled(image, labels if area is None else area.cut(labels), area)
+        return LabeledImage(image, labels if area is None else area.cut(labels), area)
 
     def write(self, job: Job) -> Entry:
         """Write the labels of one image, and return its entry of the summary."""
-        image, labels, area = job.value
+        image, labels, area = labeled = job.value
         counted = np.array(True)
         if area is not None:
             counted = area.cut(self._masks.read(job.item, area)) > 0
             labels = np.where(counted, labels, labels.dtype.type(0))
+            labeled = LabeledImage(image, labels, area)
         folder = self._folder.of_frames if is_video(job.path) else self._folder
-        folder.write(job.item, image, labels, area)
+        folder.write(job.item, labeled)
         rows, columns = labels.shape
         entry: Entry = {"rows": rows, "columns": columns}
         if is_video(job.path):
             entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        entry["classes"] = class_shares(labels, self._folder.class_names, image, area, counted)
+        entry["classes"] = class_shares(labeled, self._folder.class_names, counted)
         if job.item in self._shown:
-            self._shown[job.item] = self._folder.viewer_image(job.item, image, labels, area)
+            self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
@@ -252,8 +245,8 @@ class _Labeller:
             labels = self._folder.files(job.item).get("labels")
             if labels is not None and not job.error:
                 image, area = self.read(job)
-                read = read_pixels(labels, indices=True)
-                self._shown[job.item] = self._folder.viewer_image(job.item, image, read, area)
+                labeled = LabeledImage(image, read_pixels(labels, indices=True), area)
+                self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
         others = [name for name in self._shown if name not in wanted]
         made = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
         shown = (self._shown[name] for name in names if name in made[:count])
@@ -276,7 +269,7 @@ def _make_videos(
 
 
 def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork]:
-    """The network with its own classes, and with those of the class map."""
+    """The network with its original classes, and with those of the class map."""
     if settings.class_map is None:
         return (load_trained(settings.checkpoint, settings.trust),) * 2
     class_map = load_class_map(settings.class_map)

@@ -1,4 +1,4 @@
-"""Shards of predictions: what each has done, in a file of its own, and all of them together."""
+"""Shards of predictions: the results of each in one file, and of all together."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tangent_train.results.predictions import Entry
 
 @dataclass(frozen=True)
 class PredictionShard:
-    """One of the shards of predictions, which know of each other by their files alone.
+    """One of the shards of predictions, which see each other only through their files.
 
     Attributes:
-        shard: Which one.
-        folder: Of the files of all, ``3-of-16.json``.
-        names: Of the images and videos of all, in order.
-        settings: Settings that all must share.
+        shard: Number of the shard, and of all shards.
+        folder: Folder of the files of all shards, ``3-of-16.json``.
+        names: Names of the images and videos of all shards, in order.
+        settings: Settings that all shards must share.
     """
 
     shard: Shard
@@ -33,16 +33,16 @@ class PredictionShard:
 
     @property
     def path(self) -> Path:
-        """Its file, which is there from its start."""
+        """File of the shard, written when it begins."""
         return self._path(self.shard.number)
 
     def begin(self, entries: Sequence[Entry], *, resume: bool, overwrite: bool) -> None:
-        """Say that it has begun.
+        """Mark the shard as begun.
 
         Args:
-            entries: Of images done before.
-            resume: Whether it may have begun before.
-            overwrite: Whether it may replace what is there.
+            entries: Entries of images done before.
+            resume: True if it may have begun before.
+            overwrite: True if it may replace earlier files.
 
         Raises:
             SettingError: It has begun before, or others in the folder do not belong to it.
@@ -65,12 +65,12 @@ class PredictionShard:
                 if not known:
                     self.path.unlink()
                 name = unlike[0]
-                own, others = f"{name}={self._common[name]}", f" ({content.get(name)})"
+                found, others = f"{name}={self._common[name]}", f" ({content.get(name)})"
                 if name == "names":
-                    own, others = "images of other names", ""
+                    found, others = "images of other names", ""
                 raise SettingError(
                     "shard",
-                    found=f"{own} than those of {path}{others}",
+                    found=f"{found} than those of {path}{others}",
                     expected="the same images and settings for all shards of a folder",
                     remedy="Give another output, or overwrite=true.",
                 )
@@ -81,14 +81,14 @@ class PredictionShard:
         """Write its file.
 
         Args:
-            entries: Of the images done so far.
-            done: Whether there are no others.
+            entries: Entries of the images done so far.
+            done: True if no images are left.
         """
         content = {**self._common, "done": done, "images": list(entries)}
         write_text(self.path, json.dumps(content, indent=1) + "\n")
 
     def together(self) -> tuple[int, list[Entry]]:
-        """How many shards are done, and all their entries in the order of `names`."""
+        """Number of shards that are done, and their entries in the order of `names`."""
         read = [_read(self._path(number)) for number in range(1, self.shard.count + 1)]
         done = [c for c in read if c.get("done") and self._common.items() <= c.items()]
         entries = [entry for content in done for entry in content["images"]]
@@ -110,7 +110,7 @@ class PredictionShard:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Content of the file of a shard; nothing if it is not there, or no such file."""
+    """Content of the file of a shard; empty if it is missing or broken."""
     try:
         content = parse_json(path.read_bytes())
     except (OSError, ValueError):

@@ -28,12 +28,12 @@ class SigtermError(KeyboardInterrupt):
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:
-    """The command line of one run.
+    """Return the command line of one run.
 
     Args:
         command: train, evaluate, …
         arguments: Options, then overrides.
-        folder: Of the run.
+        folder: Folder of the run.
     """
     program = [sys.executable, "-m", "tangent_train.cli.main"]
     return [*program, command, *arguments, f"hydra.run.dir={quoted(str(folder))}"]

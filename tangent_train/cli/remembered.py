@@ -34,7 +34,7 @@ def remember_paths(folder: Path, paths: Mapping[str, str]) -> None:
 
     Args:
         folder: The run's folder.
-        paths: By the name of the setting.
+        paths: Paths by the name of the setting.
     """
     with suppress(OSError, NoRoomError):
         if paths:

@@ -40,7 +40,7 @@ def parse_settings(kind: type[_Settings], config: Mapping[str, Any]) -> _Setting
 
     Args:
         kind: The class.
-        config: A value for every field without a default, and perhaps others.
+        config: Values of all fields without a default, and perhaps further ones.
 
     Raises:
         SettingError: A value is missing or of another type.
@@ -61,7 +61,7 @@ def check_new(settings: Any, *outputs: Path | None) -> None:
     """Refuse to replace files and folders without `settings.overwrite`; empty folders are new.
 
     Raises:
-        SettingError: There is one.
+        SettingError: One exists.
     """
     for path in () if settings.overwrite else filter(None, outputs):
         if any(path.iterdir()) if path.is_dir() else path.exists():

@@ -66,7 +66,7 @@ class StoredRun:
 
     @property
     def arguments(self) -> list[str]:
-        """The command line for Hydra: options, then overrides, of which the last one counts."""
+        """Command line for Hydra: options, then overrides, of which the last one counts."""
         options = [a for a in self.user_overrides if "=" not in a or a[0] == "-"]
         overrides = [a for a in self.user_overrides if a not in options]
         return [*options, *self.added, *overrides, *self.place]
@@ -139,7 +139,7 @@ class StoredNetwork:
     Attributes:
         path: The file.
         user_overrides: Overrides of the user, without the file.
-        added: None, see `StoredRun`.
+        added: Empty, see `StoredRun`.
     """
 
     path: Path
@@ -263,7 +263,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
 
 
 def run_settings(path: Path) -> dict[str, Any] | None:
-    """The settings of a run in a checkpoint; None in a network that knows no run.
+    """Return the settings of a run in a checkpoint; None without settings of a run.
 
     Raises:
         DataError: It cannot be read.
@@ -301,7 +301,7 @@ def _check_evaluation(path: Path, typed: set[str], *, of_run: bool) -> None:
 
 
 def is_own_option(group: str, option: str) -> bool:
-    """Whether it is an option of this program's configs."""
+    """Return True for an option in the configs of this program."""
     folder = config_folder() / group
     return group in GROUPS and folder / f"{option}.yaml" in folder.rglob("*.yaml")
 

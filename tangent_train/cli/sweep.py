@@ -27,7 +27,7 @@ _GROUPS = ("launcher=", "sweep=")
 
 
 def in_sweep() -> bool:
-    """Whether this is a job of a sweep, to be run by `run_job`."""
+    """Return True in a job of a sweep, to be run by `run_job`."""
     return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
@@ -37,8 +37,8 @@ def run_job(
     """Run one job of a sweep as a process and wait for it.
 
     Args:
-        command: Of the sweep.
-        config: Of the job.
+        command: Command of the sweep.
+        config: Config of the job.
         added: Overrides that were not typed.
         visible_gpus: ``CUDA_VISIBLE_DEVICES`` where the sweep was started.
 

@@ -59,7 +59,7 @@ def transfer(config: DictConfig) -> None:
 
 
 def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
-    """The transfer of a network whose file knows no run: it is evaluated as it is."""
+    """Return the config and the network of a file without settings of a run: only evaluated."""
     overrides = list(HydraConfig.get().overrides.task)
     for text in overrides:
         name = text.lstrip("+~").partition("=")[0]

@@ -48,15 +48,15 @@ class Stage:
     """One run of a transfer.
 
     Attributes:
-        name: As above.
+        name: Name of the stage, see the table above.
         fold: The tested fold; None for data without folds.
-        seed: Of all its randomness.
-        folder: Of the run.
+        seed: Seed of all randomness.
+        folder: Folder of the run.
         command: train or evaluate.
         config: All its settings, resolved, but for where its weights come from.
         weights: Checkpoint of its network; None to start from scratch.
-        view: Of a stage that only evaluates on panoramas; "" for the transfer's own.
-        condition: Of the panoramas of such a stage.
+        view: Name of the view, if panoramas are evaluated; "" for that of the transfer.
+        condition: Condition of these panoramas.
     """
 
     name: str
@@ -152,7 +152,7 @@ class _Planner:
         return dict(resolved)
 
     def _slower(self, settings: dict[str, Any]) -> dict[str, Any]:
-        """The optimizer of fine-tuning; other settings are those of P's training."""
+        """Return the optimizer of fine-tuning; other settings are those of P's training."""
         tuned, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
         optimizer = tuned if "_target_" in tuned else before | tuned
         if optimizer.get("lr") is None:
@@ -241,7 +241,7 @@ def run_stage(stage: Stage, state: State) -> int:
 
     Args:
         stage: Not finished.
-        state: From `stage_state`.
+        state: Its `stage_state`.
 
     Returns:
         The exit status, as in a shell.
@@ -282,7 +282,7 @@ def run_stage(stage: Stage, state: State) -> int:
 
 
 def stage_command(stage: Stage) -> list[str]:
-    """The command line of the stage's run."""
+    """Return the command line of a stage."""
     config = (f"--config-dir={stage.folder}", "--config-name=stage")
     return command_line(stage.command, config, stage.folder)
 

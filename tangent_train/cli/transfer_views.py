@@ -23,7 +23,7 @@ _NAME = re.compile(r"\w[\w.+-]*")
 
 
 def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, dict[str, Any]]:
-    """The views by name, each as changes of settings: those of ``compare``, or of the study.
+    """Return the views by name, each as changes of settings: those of ``compare``, or of the study.
 
     A view is an option of ``representation`` (a name alone, or ``option``) or, without one, the
     transfer's own, with the other settings changed. ``level`` is also that of the stage.
@@ -50,7 +50,7 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
 
 
 def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
-    """The conditions of the test panoramas by name, each as changes of settings.
+    """Return the conditions of the test panoramas by name, each as changes of settings.
 
     Args:
         config: The composed ``transfer.yaml``.
@@ -65,7 +65,7 @@ def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
 
 
 def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
-    """The different whole numbers of a list.
+    """Return the different whole numbers of a list.
 
     Args:
         config: The composed ``transfer.yaml``.
@@ -111,7 +111,7 @@ def _view(
 
 
 def _named(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
-    """The settings in a list, by their names."""
+    """Return the settings in a list by name."""
     found = config[setting]
     entries: Any = OmegaConf.to_container(found) if isinstance(found, ListConfig) else [None]
     named: dict[str, dict[str, Any]] = {}

@@ -1,4 +1,4 @@
-"""The user's own images as network input, from files and from memory."""
+"""User images as network input, from files and from memory."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def read_panorama(
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
-    """A panorama with its zenith: its own, or else as estimated.
+    """A panorama with its zenith: as given, or else as estimated.
 
     Args:
         image: A panorama.

@@ -69,7 +69,7 @@ def label_canvas(
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:
-    """Write the best classes of all pixels that some images own or, feathered, see.
+    """Write the best classes of all pixels that some images own, or see where they are feathered.
 
     Args:
         scores: ``(n, K, h, w)`` of the images; of all images, for feathering.
@@ -105,7 +105,7 @@ def zero_sums(
     Args:
         shape: ``(H, W)``.
         channels: K.
-        spare: Sums that nobody uses any more; clearing them is faster than new memory.
+        spare: Sums that are no longer used; clearing them is faster than new memory.
 
     Returns:
         ``(H, W, Kp)``, see `kernels`.

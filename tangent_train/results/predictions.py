@@ -7,7 +7,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -59,51 +59,57 @@ def is_result_in(output: Path) -> Callable[[Path], bool]:
     return lambda path: any(path.resolve().is_relative_to(result) for result in results)
 
 
+class LabeledImage(NamedTuple):
+    """An image with its labels.
+
+    Attributes:
+        image: The photo, or the whole sphere.
+        labels: ``(h, w)`` labels of the image, or of its area; 0 unknown.
+        area: Part of the sphere of the labels; None for photos.
+    """
+
+    image: InputImage
+    labels: NDArray[np.unsignedinteger]
+    area: PanoramaArea | None = None
+
+
 def class_shares(
-    labels: NDArray[np.integer],
-    class_names: Sequence[str],
-    image: InputImage,
-    area: PanoramaArea | None = None,
-    counted: NDArray[np.bool_] | bool = True,
+    labeled: LabeledImage, class_names: Sequence[str], counted: NDArray[np.bool_] | bool = True
 ) -> dict[str, float]:
-    """Share of the solid angle that every class has, the unknown class too.
+    """Share of the solid angle of every class, including the unknown class.
 
     Args:
-        labels: ``(H, W)`` of the image, or of its area; 0 unknown.
+        labeled: A panorama or photo.
         class_names: K + 1 names, the unknown class first.
-        image: A panorama or photo.
-        area: The part of the sphere that the labels are of.
         counted: ``(H, W)`` pixels that are not masked; all by default.
 
     Returns:
-        By name; they add up to 1, or are all 0 where everything is masked.
+        Shares by name; they add up to 1, or are all 0 if everything is masked.
     """
-    count = len(class_names)
+    labels, count = labeled.labels, len(class_names)
     total, kept = np.zeros(count), np.broadcast_to(counted, labels.shape)
-    angles = _solid_angles(labels.shape, image, area)
-    for line, weights, own in zip(labels, angles, kept, strict=True):
-        total += np.bincount(line, weights * own, minlength=count)
+    for line, weights, is_kept in zip(labels, _solid_angles(labeled), kept, strict=True):
+        total += np.bincount(line, weights * is_kept, minlength=count)
     shares = dict.fromkeys(class_names, 0.0)  # a network's own class may be called unknown, too
     for name, share in zip(class_names, total / (total.sum() or 1), strict=True):
         shares[name] += float(share)
     return shares
 
 
-def _solid_angles(
-    shape: tuple[int, ...], image: InputImage, area: PanoramaArea | None
-) -> Iterator[NDArray[np.float64]]:
+def _solid_angles(labeled: LabeledImage) -> Iterator[NDArray[np.float64]]:
     """Relative solid angles of the pixels, row by row: no array as large as the image.
 
     A photo's pixel at (x, y) on the plane at distance 1 is seen under (1 + x² + y²)^(−3/2).
     """
+    image, (height, width) = labeled.image, labeled.labels.shape
     if image.camera_matrix is None:
         rows = equirect_solid_angles((image.rgb.shape[0], image.rgb.shape[1])).ravel()
-        for weight in rows if area is None else rows[area.places()[0]]:
-            yield np.full(shape[1], weight)
+        for weight in rows if labeled.area is None else rows[labeled.area.places()[0]]:
+            yield np.full(width, weight)
         return
     (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
-    x = (np.arange(shape[1]) - cx) / fx
-    for row in range(shape[0]):
+    x = (np.arange(width) - cx) / fx
+    for row in range(height):
         yield (1 + x**2 + ((row - cy) / fy) ** 2) ** -1.5
 
 
@@ -184,22 +190,14 @@ class PredictionFolder:
         """The same for frames of a video, whose pictures are videos."""
         return replace(self, kinds=[kind for kind in self.kinds if kind not in _PICTURES])
 
-    def write(
-        self,
-        name: str,
-        image: InputImage,
-        labels: NDArray[np.unsignedinteger],
-        area: PanoramaArea | None = None,
-    ) -> None:
-        """Write labels and pictures of one image, those that are wanted.
+    def write(self, name: str, labeled: LabeledImage) -> None:
+        """Write the wanted labels and pictures of one image.
 
         Args:
             name: From `short_names`.
-            image: The photo, or the whole sphere.
-            labels: ``(h, w)`` of the image, or of its area.
-            area: Part of the sphere that the labels are of.
+            labeled: The image.
         """
-        files = self.files(name)
+        (image, labels, area), files = labeled, self.files(name)
         if "labels" in files:
             write_pixels(files["labels"], labels)
         if "color" in files:
@@ -299,17 +297,11 @@ class PredictionFolder:
         rows = [[name, percent(mean[name])] for name in seen]
         return Table("Mean over the images", ["class", "solid angle, %"], rows)
 
-    def viewer_image(
-        self,
-        name: str,
-        image: InputImage,
-        labels: NDArray[np.unsignedinteger],
-        area: PanoramaArea | None,
-    ) -> EncodedImage:
-        """An image for `write_page`, of 0.1 to a few megabytes; see `write`."""
+    def viewer_image(self, name: str, labeled: LabeledImage) -> EncodedImage:
+        """An image for `write_page`, of 0.1 to a few megabytes."""
+        (image, labels, area), count = labeled, len(self.class_names)
         placed = labels if area is None else area.place(labels)
-        count, sphere = len(self.class_names), area is not None
-        return encode_image(name, image.rgb, count, prediction=placed, sphere=sphere)
+        return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)
 
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import inspect
 import os
 import re
 import shlex
@@ -16,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import lightning
 import pytest
 import torch
 from torch import nn
@@ -515,3 +517,22 @@ def test_an_incomplete_test_leaves_no_results(
     run("evaluate", f"checkpoint={checkpoint}", rooms, *one)
     assert "1 of 2 test panoramas were evaluated" in capsys.readouterr().out
     assert not list((tmp_path / "part").glob("results.*"))
+
+
+def test_the_calls_from_a_command_to_its_training(
+    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls: list[str] = []
+
+    class BegunError(Exception):
+        pass
+
+    def fit(*_: object, **__: object) -> None:
+        package = str(Path(main.__file__).parents[1])
+        calls.extend(f.function for f in inspect.stack() if f.filename.startswith(package))
+        raise BegunError
+
+    monkeypatch.setattr(lightning.Trainer, "fit", fit)
+    with pytest.raises(BegunError):
+        run("train", *SETTINGS, rooms, "hydra.run.dir=run")
+    assert calls == ["train", "_run", "job", "_main"]

@@ -100,22 +100,6 @@ def test_torch_gives_the_results_of_the_compiled_kernels(
             torch.testing.assert_close(*probabilities, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_scores_that_are_not_numbers_have_no_probability(blend: Blend) -> None:
-    sets = TangentRepresentation(0, 5).view_sets()
-    scores = torch.zeros(20, 300, 32, 32)
-    scores[:, 1], scores[:, 2] = -torch.inf, torch.nan
-    scores[:, 299] = 1
-    how: Any = {"blend": blend, "averaged": True, "backend": "torch"}
-    mosaic = _filled(sets, (64, 128), 300, [scores], **how)
-    assert not mosaic.probabilities(slice(None))[..., 1:3].any()
-    labels = mosaic.labels()
-    assert labels.dtype == torch.uint16
-    assert (labels.numpy() == 299).all()
-    nothing = _filled(sets, (64, 128), 300, [scores * torch.nan], **how)
-    assert not nothing.labels().numpy().any()
-
-
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_nothing_leaves_the_device(name: str, blend: Blend) -> None:

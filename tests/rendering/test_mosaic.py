@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,16 +109,20 @@ def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() ->
     np.testing.assert_allclose(result.sums.sum(axis=2), 1, atol=1e-5)  # each counted once
 
 
+@pytest.mark.parametrize("backend", ["numba", "torch"])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_infinite_and_nan_scores_have_no_probability(blend: Blend) -> None:
+def test_infinite_and_nan_scores_have_no_probability(blend: Blend, backend: Any) -> None:
     grid, shape = GRIDS[0]
-    scores = torch.zeros(20, 4, grid.dim, grid.dim)
-    scores[:, 1], scores[:, 2] = -torch.inf, torch.nan
-    result = _added(ScoreMosaic(shape, 4, blend, averaged=True), scores, grid)
-    found = _probabilities(result)
-    np.testing.assert_allclose(found, np.broadcast_to([0.5, 0, 0, 0.5], found.shape), atol=1e-6)
-    nothing = _added(ScoreMosaic(shape, 4, blend, averaged=True), scores * torch.nan, grid)
-    assert not nothing.labels().numpy().any()
+    scores = torch.full((20, 300, grid.dim, grid.dim), -torch.inf)
+    scores[:, 2], scores[:, 1], scores[:, 299] = torch.nan, 0, 0
+    result = ScoreMosaic(shape, 300, blend, averaged=True, backend=backend)
+    found = _probabilities(_added(result, scores, grid))
+    np.testing.assert_allclose(found[..., [1, 299]], 0.5, atol=1e-6)
+    np.testing.assert_allclose(found.sum(axis=-1), 1, atol=1e-6)
+    assert _labels(result).dtype == np.uint16
+    assert (_labels(result) == 1).all()
+    nothing = ScoreMosaic(shape, 300, blend, averaged=True, backend=backend)
+    assert not _labels(_added(nothing, scores * torch.nan, grid)).any()
 
 
 def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:

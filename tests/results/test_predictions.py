@@ -15,7 +15,7 @@ from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.images import InputImage
-from tangent_train.results.predictions import PredictionFolder, class_shares
+from tangent_train.results.predictions import LabeledImage, PredictionFolder, class_shares
 
 NAMES = ("unknown", "up", "down")
 
@@ -57,7 +57,7 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
     labels[60:] = 0  # below 30°: half of it
     cap = (1 - math.sin(math.pi / 3)) / 2
     area = area_of_crop((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
-    shares = class_shares(labels, NAMES, image, area)
+    shares = class_shares(LabeledImage(image, labels, area), NAMES)
     assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})
 
 
@@ -74,4 +74,4 @@ def test_pixels_of_photos_count_by_their_solid_angle() -> None:
         return math.atan(x * y / math.sqrt(1 + x * x + y * y))
 
     part = 2 * (quarter(1, 1) - quarter(0.5, 1)) / (4 * quarter(1, 1))
-    assert class_shares(labels, NAMES, image)["down"] == pytest.approx(part, rel=1e-3)
+    assert class_shares(LabeledImage(image, labels), NAMES)["down"] == pytest.approx(part, rel=1e-3)

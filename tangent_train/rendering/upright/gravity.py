@@ -70,7 +70,7 @@ def estimate_up(
         max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 is any orientation.
             Choose it slightly above the camera's tilt: beyond it, another axis of the room may be
             taken for up.
-        judge: What else is known of directions, such as what a network sees by them
+        judge: Other evidence about directions, such as the confidence of a network
             (`tangent_train.inference.judge`). Asked once at most, for those of the best frame that
             are not hopeless.
 
@@ -158,18 +158,18 @@ def cues(
     even, odd = [], []
     for axis in range(3):
         height = heights[:, axis]
-        own = weights * (agreement > 0) * (column == axis)
+        followers = weights * (agreement > 0) * (column == axis)
         across = heights[:, [(axis + 1) % 3, (axis + 2) % 3]] @ np.array([1, 1j])
         even.append(
             [
                 _mean(column == axis, weights * agreement),
                 _mean(np.abs(height) < _BELT, weights),
                 _mean(np.abs(height) > _CAP, weights) / (1 - _CAP),
-                _mean(height**2, own),
-                abs(_mean(across / np.maximum(np.abs(across), 1e-9), own)),
+                _mean(height**2, followers),
+                abs(_mean(across / np.maximum(np.abs(across), 1e-9), followers)),
             ]
         )
-        odd.append([_mean(height, own), _mean(height, clutter), light[axis]])
+        odd.append([_mean(height, followers), _mean(height, clutter), light[axis]])
     return np.array(even), np.array(odd)
 
 

@@ -45,6 +45,9 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 """Figures of one pair, condition and representation, see `Comparer.compare`."""
 
+_Views = tuple[DepthView, DepthView]
+"""Depth and pose of the left and of the right panorama."""
+
 _Keypoints = dict[tuple[str, int], dict[str, SphericalKeypoints]]
 """Keypoints by representation, of a panorama by name and level."""
 
@@ -157,12 +160,8 @@ class Comparer:
             )
             image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level)
-        views = [
-            None if side.distance_m is None or side.pose is None
-            else DepthView(side.distance_m, side.pose)
-            for side in sides
-        ]  # fmt: skip
-        overlap = None if None in views else _defined(fov_overlap(*views))  # type: ignore[arg-type]
+        views = _depth_views(pair)
+        overlap = None if views is None else _defined(fov_overlap(*views))
         known = {
             "pair": pair.name,
             "split": pair.split,
@@ -178,7 +177,7 @@ class Comparer:
             comparison.images[condition], comparison.found[condition] = (images[0], image), found
             for name, matched in found.items():
                 row = known | {"condition": condition, "representation": name}
-                comparison.rows.append(row | self._figures(matched, rotation, *views))
+                comparison.rows.append(row | self._figures(matched, rotation, views))
         return comparison
 
     def _level(self, pair: PanoramaPair) -> int:
@@ -208,17 +207,11 @@ class Comparer:
         geometry = estimate_two_view(*rays, self.max_error_deg, seed=self.seed)
         return MatchedPair(left, right, matches, geometry)
 
-    def _figures(
-        self,
-        found: MatchedPair,
-        rotation: Floats,
-        left: DepthView | None,
-        right: DepthView | None,
-    ) -> Row:
+    def _figures(self, found: MatchedPair, rotation: Floats, views: _Views | None) -> Row:
         visible = keypoints = len(found.left), len(found.right)
         truth: Row = dict.fromkeys(_TRUTH)
-        if left is not None and right is not None:
-            visible, truth = _truth(found, rotation, left, right, self.max_error_deg)
+        if views is not None:
+            visible, truth = _truth(found, rotation, views, self.max_error_deg)
         putative, inliers = len(found.matches), int(found.geometry.inliers.sum())
         share = sum(1 / n for n in visible) / 2 if all(visible) else None
         return {
@@ -243,14 +236,10 @@ _TRUTH = (
 
 
 def _truth(
-    found: MatchedPair,
-    rotation: Floats,
-    left: DepthView,
-    right: DepthView,
-    max_error_deg: float,
+    found: MatchedPair, rotation: Floats, views: _Views, max_error_deg: float
 ) -> tuple[tuple[int, int], Row]:
     """Visible keypoints on either side, and the scores that need depth and pose."""
-    left_xyz = found.left.directions_xyz
+    (left, right), left_xyz = views, found.left.directions_xyz
     # In the right panorama as it is, whose depth needs no resampling.
     right_xyz = found.right.directions_xyz @ rotation
     visible = visible_from(left_xyz, left, right), visible_from(right_xyz, right, left)
@@ -267,6 +256,14 @@ def _truth(
     figures = (*map(_defined, errors), *areas, *shares)
     counts = int(visible[0].sum()), int(visible[1].sum())
     return counts, dict(zip(_TRUTH, figures, strict=True))
+
+
+def _depth_views(pair: PanoramaPair) -> _Views | None:
+    left, right = (
+        None if side.distance_m is None or side.pose is None else (side.distance_m, side.pose)
+        for side in (pair.left, pair.right)
+    )
+    return None if left is None or right is None else (DepthView(*left), DepthView(*right))
 
 
 def _defined(value: float) -> float | None:

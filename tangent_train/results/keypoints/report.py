@@ -93,9 +93,11 @@ class KeypointReport:
 
     def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
         """Means over the pairs of which a figure is defined; the paper's below them."""
-        for split, rows in _by_split(self.rows).items():
+        groups = _grouped(with_splits(self.rows), "split")
+        for split in sorted(groups, key=lambda name: (name != "hard", name != "easy")):
+            rows = groups[split]
             printed = _paper().get(split, {}) if self.published and condition == AS_GIVEN else {}
-            title = f"{split} ({len({row['pair'] for row in rows})})"
+            title = f"{split or 'all'} ({len({row['pair'] for row in rows})})"
             of = _grouped([row for row in rows if row["condition"] == condition], "representation")
             for metric, key in _METRICS.items():
                 known = [
@@ -148,12 +150,6 @@ def with_splits(rows: Sequence[Row]) -> list[Row]:
     ordered = sorted(overlaps, key=lambda name: overlaps[name])
     hard = set(ordered[: len(ordered) // 2])
     return [{**row, "split": "hard" if row["pair"] in hard else "easy"} for row in rows]
-
-
-def _by_split(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    groups = _grouped(with_splits(rows), "split")
-    order = sorted(groups, key=lambda name: (name != "hard", name != "easy"))
-    return {name or "all": groups[name] for name in order}
 
 
 def _grouped(rows: Sequence[Row], key: str) -> dict[Any, list[Row]]:
