@@ -135,7 +135,7 @@ def _check_resumed(settings: Mapping[str, Any], checkpoint: Path) -> None:
             name,
             found=f"{now!r} for a run that began with {then!r}",
             expected="the same as before",
-            remedy="Start a new run for it.",
+            remedy="Give the same, or start a new run.",
         )
     begun, epochs = (content["epoch"] or 0) + 1, settings["trainer"].get("max_epochs")
     if isinstance(epochs, int) and -1 < epochs < begun:  # other types are refused when it is made
