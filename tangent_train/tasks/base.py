@@ -380,7 +380,11 @@ class Task(lightning.LightningModule, ABC):
         return predictions
 
     def on_validation_epoch_end(self) -> None:
-        """Log the scores of the validation or test split."""
+        """Log the scores of the validation or test split.
+
+        Raises:
+            SettingError: A score has no heading.
+        """
         stage = "test" if self.trainer.testing else "val"
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
@@ -391,8 +395,12 @@ class Task(lightning.LightningModule, ABC):
             self.log("val/loss", loss / norm, sync_dist=True)
             for total in self._losses:
                 total.reset()
+        scores = self.logged_scores(self.result)
+        if scores.keys() - self.headings.keys():
+            place = f"headings of {type(self).__name__}"
+            raise SettingError(place, found=[*self.headings], expected=f"those of {[*scores]}")
         # Every process has the same numbers: the mean over processes changes nothing.
-        for name, score in self.logged_scores(self.result).items():
+        for name, score in scores.items():
             key = f"{stage}/{name}"
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
         for name, score in self.class_scores(self.result).items():

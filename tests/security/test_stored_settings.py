@@ -127,6 +127,7 @@ def test_what_cannot_be_resumed_is_said_in_a_line(
     endless = {**content["config"], "trainer": {**content["config"]["trainer"], "max_epochs": {}}}
     for changed, message in (
         ({"callbacks": "x"}, said),
+        ({"state_dict": {}}, said),
         ({"optimizer_states": [{"state": {}, "param_groups": "x"}]}, said),
         ({"config": endless}, r"trainer\.max_epochs"),
     ):
