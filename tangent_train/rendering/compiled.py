@@ -4,9 +4,9 @@ Compiled loops are serial and release the GIL; `over_rows` runs them on several 
 parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, its
 portable layer dies when two threads use it at once.
 
-Compiled code is cached in a folder of the user and checked against its source file alone, so a loop
-must not call compiled functions of another file. The cache holds pickles: the folder has to be
-private. Without one, loops are compiled in every process.
+Compiled code is cached in a folder of the user that is named after the content of its source file,
+so a loop must not call compiled functions of another file. The cache holds pickles: the folder has
+to be private. Without one, loops are compiled in every process.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any, TypeVar
+from zlib import crc32
 
 import torch
 from numba import config, njit
@@ -81,7 +82,9 @@ def njit_fast(function: Function) -> Function:
 def _compiled(function: Function, **settings: Any) -> Function:
     loop = njit(nogil=True, error_model="numpy", **settings)(function)
     if _CACHE is not None:
-        users, config.CACHE_DIR = config.CACHE_DIR, str(_CACHE)
+        # Numba unpickles the code of another version before it finds that it is outdated.
+        source = Path(function.__code__.co_filename).read_bytes()
+        users, config.CACHE_DIR = config.CACHE_DIR, str(_CACHE / f"{crc32(source):08x}")
         loop.enable_caching()
         config.CACHE_DIR = users
     return loop
