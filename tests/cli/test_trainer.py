@@ -82,7 +82,10 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
     assert _last(Path("cut"))["stopped"] is True
 
 
-def test_loggers_and_plugins_of_the_user_are_used(tmp_path: Path) -> None:
+def test_loggers_and_plugins_of_the_user_are_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     plugin = "{_target_: lightning.pytorch.plugins.DoublePrecision}"
     settings = composed_settings(
         "train",
