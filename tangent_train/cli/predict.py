@@ -298,16 +298,10 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
-    how = trained, settings.levels, settings.base_level, settings.blend
-    views: PhotoViews | PanoramaViews
-    if settings.projection == "equirectangular":
-        views = PanoramaViews(*how, settings.rotations)
-    elif settings.rotations == 1:
-        views = PhotoViews(*how)
-    else:
-        raise SettingError("rotations", found=settings.rotations, expected="1 for photos")
+    kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
+    how = settings.levels, settings.base_level, settings.blend, settings.rotations
     of_forward = settings.device, settings.images_per_forward
-    return Predictor(trained, views, *of_forward, settings.min_confidence)
+    return Predictor(trained, kind(trained, *how), *of_forward, settings.min_confidence)
 
 
 def _masks(settings: PredictSettings) -> Masks:

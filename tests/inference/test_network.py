@@ -277,6 +277,12 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
         network.labels(image)
 
 
+def test_photos_have_no_rotations(tmp_path: Path) -> None:
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), rotations=2)
+    with pytest.raises(SettingError, match="rotations: found 2; expected 1 for photos"):
+        network.labels(_RGB, fov=60)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
