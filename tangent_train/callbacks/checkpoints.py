@@ -64,7 +64,8 @@ class CheckpointContents(Callback):
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
         # A resumed run may get more time.
-        out_of_time = any(isinstance(one, Timer) for one in trainer.callbacks)  # type: ignore[attr-defined]
+        timers = [one for one in trainer.callbacks if isinstance(one, Timer)]  # type: ignore[attr-defined]
+        out_of_time = any((timer.time_remaining() or 0) <= 0 for timer in timers)
         checkpoint["stopped"] = trainer.should_stop and not out_of_time
         # Data has generators of its own, see `sample_rng`.
         cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []

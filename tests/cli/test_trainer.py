@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import csv
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import Callback, RichModelSummary
+from lightning.pytorch.callbacks import Callback, RichModelSummary, Timer
 from lightning.pytorch.plugins import DoublePrecision
 
-from tangent_train.callbacks.checkpoints import AtomicCheckpointIO
+from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.cli import trainer as trainer_module
 from tangent_train.cli.trainer import build_trainer
 from tangent_train.errors import SettingError
@@ -87,6 +88,15 @@ class Named(Callback):
 
     def __init__(self, name: str | None, save_dir: str | None) -> None:
         self.given = name, save_dir
+
+
+@pytest.mark.parametrize(("seconds", "stopped"), [(3600, True), (0, False)])
+def test_an_early_stop_before_its_time_is_over_is_kept(seconds: int, stopped: bool) -> None:
+    timer = Timer({"seconds": seconds})
+    trainer: Any = SimpleNamespace(callbacks=[timer], should_stop=True, world_size=1)
+    checkpoint: dict[str, Any] = {}
+    CheckpointContents({}).on_save_checkpoint(trainer, shape_task(), checkpoint)
+    assert checkpoint["stopped"] is stopped
 
 
 def test_loggers_and_plugins_of_the_user_are_used(
