@@ -28,6 +28,9 @@ _ELSEWHERE = {
 }
 """Arguments of Lightning's trainer that every run sets, and where a user sets them."""
 
+_EXTRAS = ("mlflow", "wandb")
+"""Loggers with an extra of this package."""
+
 
 def build_trainer(
     settings: Mapping[str, Any],
@@ -63,7 +66,7 @@ def build_trainer(
         at_least("trainer.max_epochs", epochs, 1)
     loggers = _build_named(settings, "logger", {"save_dir": str(folder), **_names(folder)})
     monitor = {"monitor": task.monitor, "mode": task.monitor_mode}
-    plugins = section.pop("plugins", None) or []
+    place, plugins = "trainer.plugins", section.pop("plugins", None) or []
     named = dict(enumerate(plugins if isinstance(plugins, list) else [plugins]))
     trainer: lightning.Trainer = build_from_config(
         section,
@@ -82,7 +85,7 @@ def build_trainer(
             *[LearningRateMonitor()] * bool(loggers),
         ],
         logger=loggers,
-        plugins=[AtomicCheckpointIO(), *_build_named({"plugins": named}, "plugins", {})],
+        plugins=[AtomicCheckpointIO(), *_build_named({place: named}, place, {})],
         use_distributed_sampler=False,
     )
     for logger in trainer.loggers:
@@ -108,9 +111,10 @@ def _build_named(settings: Mapping[str, Any], group: str, known: Mapping[str, An
         try:
             built.append(build_from_config(_fill(entry, known), place))
         except SettingError as error:
-            if group != "logger" or not isinstance(error.__cause__, ModuleNotFoundError):
-                raise
             package = entry["_target_"].rpartition(".")[2].removesuffix("Logger").lower()
+            is_missing = isinstance(error.__cause__, ModuleNotFoundError)
+            if not is_missing or package not in _EXTRAS:
+                raise
             remedy = f"pip install 'tangent-train[{package}]'"
             expected = "an installed package"
             raise SettingError(
