@@ -14,7 +14,7 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
 from models.auxiliary_head import stage_channels
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.registry import registered
 
 
@@ -55,8 +55,7 @@ class SphereContext(nn.Module):
         tokens: int = 4,
     ) -> None:
         super().__init__()
-        if tokens < 1:
-            raise SettingError("network.tokens", found=tokens, expected="1 or more")
+        at_least("network.tokens", tokens, 1)
         self.network = network
         self.mixer = mixer(channels=stage_channels(network, stage, in_channels))
         self.tokens = tokens

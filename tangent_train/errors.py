@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from numbers import Integral
 
 _LONGEST = 400  # characters of what was found: a file may hold anything
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
@@ -84,14 +85,14 @@ class DataError(_ExplainedError):
 
 
 def at_least(name: str, value: object, least: int) -> int:
-    """A setting that has to be an integer of `least` or more.
+    """A setting that has to be an integer of `least` or more, perhaps of NumPy.
 
     Raises:
         SettingError: It is something else.
     """
-    if type(value) is not int or value < least:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise SettingError(name, found=value, expected=f"an integer of {least} or more")
-    return value
+    return int(value)
 
 
 @contextmanager

@@ -145,7 +145,7 @@ def build_from_config(
     except (DataError, SettingError):
         raise
     except Exception as error:
-        _refuse(error, settings["_target_"], place, source)
+        _refuse(error, section, place, source)
 
 
 def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, Any]) -> Any:
@@ -163,8 +163,8 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
         name = f"{place}.{inside[1]}" if inside else place
         places = {re.sub(r"\.(?=\d)", "", at): at for _, at in _sections(section, place)}
         at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
-        targets = {at: inner["_target_"] for inner, at in _sections(section, place)}
-        _refuse(error.__cause__ or error, targets[at], at, None)
+        sections = {at: inner for inner, at in _sections(section, place)}
+        _refuse(error.__cause__ or error, sections[at], at, None)
     make = partial(make.func, *make.args, **make.keywords | given)
     return make if section.get("_partial_") else make()
 
@@ -198,13 +198,21 @@ def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]
         yield from _sections(one, f"{place}.{name}")
 
 
-def _refuse(error: BaseException, name: str, place: str, source: SettingsFile | None) -> NoReturn:
-    """Raise an error of building an object: in one line, unless a user's own class raised it."""
+def _refuse(
+    error: BaseException, section: Mapping[str, Any], place: str, source: SettingsFile | None
+) -> NoReturn:
+    """Raise an error of building an object: in one line, unless a user's own class raised it.
+
+    A class that hands its arguments on to another one may raise an error about a setting.
+    """
     if isinstance(error, DataError | SettingError):
         raise error
+    name = section["_target_"]
     foreign = _find(name) is None and not name.startswith("lightning.")
     of_hydra = type(error).__module__.startswith(("hydra.", "omegaconf."))
-    if source is None and not of_hydra and (foreign or isinstance(error, OSError)):
+    unknown = re.search(r"unexpected keyword argument '(\w+)'$", str(error))
+    of_setting = of_hydra or (unknown is not None and unknown[1] in section)
+    if source is None and not of_setting and (foreign or isinstance(error, OSError)):
         raise error
     reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
     found, expected = f"{name} cannot be made ({reason})", "settings that it takes"

@@ -24,6 +24,13 @@ class Kept:
         self.positional, self.named = positional, named
 
 
+class Handing(Kept):
+    """Hands its arguments on to a function that does not have all of them."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(pair(1, **settings))
+
+
 def pair(first: Any, second: Any = None) -> tuple[Any, Any]:
     """Return both arguments."""
     return first, second
@@ -74,6 +81,11 @@ def test_text_is_not_interpreted_again(text: str) -> None:
         ({"_target_": f"{ME}.Absent"}, r"^network\._target_: .*Absent, which cannot be imported"),
         ({"_target_": "os.unlink", "path": "x"}, r"^network: found os\.unlink cannot be made"),
         ({"_target_": f"{ME}.Kept", "_args_": 3}, r"^network: .*InstantiationException"),
+        ({"_target_": f"{ME}.Handing", "x": 1}, r"^network: .*Handing cannot .* argument 'x'"),
+        (
+            {"_target_": f"{ME}.Kept", "i": {"_target_": f"{ME}.Handing", "x": 1}},
+            r"^network\.i: .*Handing cannot .* argument 'x'",
+        ),
         (None, r"^network: found None; expected a section"),
     ],
 )

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sized
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, Sampler, Subset
+from torch.utils.data import DataLoader, Dataset, Sampler, SequentialSampler, Subset
 
 from tangent_train.errors import DataError, SettingError
 
@@ -99,6 +99,25 @@ class EpochSampler(Sampler[tuple[int, int]]):
             yield epoch, int(index)
 
 
+class ResumedOrder(SequentialSampler):
+    """The order of the data set, which in the first epoch begins after some samples.
+
+    Lightning keeps it with ``overfit_batches``.
+
+    Args:
+        dataset: The data set.
+        consumed: Number of these samples.
+    """
+
+    def __init__(self, dataset: Sized, consumed: int) -> None:
+        super().__init__(dataset)
+        self._consumed = consumed
+
+    def __iter__(self) -> Iterator[int]:
+        first, self._consumed = self._consumed, 0
+        yield from range(first, len(self))
+
+
 def share_of_process(dataset: Dataset[Any]) -> Dataset[Any]:
     """Return the samples of this process: of n processes, process r gets every n-th one from r on.
 
@@ -138,7 +157,7 @@ def make_loader(
     batch_size: int,
     num_workers: int,
     seed: int,
-    sampler: EpochSampler | None = None,
+    sampler: Sampler[Any] | None = None,
 ) -> DataLoader[Any]:
     """Return batches of samples.
 

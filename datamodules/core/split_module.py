@@ -9,11 +9,17 @@ from typing import Any, TypeVar
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities import rank_zero_warn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader, Dataset, Sampler
 
 from datamodules.core.index import SPLITS, Item, Split
 from datamodules.core.labeled_data import REMEDY, LabeledData
-from datamodules.core.loading import EpochSampler, make_loader, share_of_process, this_process
+from datamodules.core.loading import (
+    EpochSampler,
+    ResumedOrder,
+    make_loader,
+    share_of_process,
+    this_process,
+)
 from datamodules.core.problems import Problems
 from tangent_train.errors import SettingError
 
@@ -105,7 +111,8 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
     def train_dataloader(self) -> DataLoader[Any]:
         """Batches for training; with ``overfit_batches`` the same views in every epoch."""
         if getattr(self.trainer, "overfit_batches", 0):
-            return self._loader(share_of_process(self.dataset("train")), self.per_step)
+            share: Any = share_of_process(self.dataset("train"))
+            return self._loader(share, self.per_step, ResumedOrder(share, self._start[1]))
         rank, world_size = this_process()
         count = len(self.source("train"))
         if left_out := count % world_size:
@@ -130,7 +137,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         return self._loader(share_of_process(self.dataset(split)), self.evaluation_size())
 
     def _loader(
-        self, dataset: Dataset[Any], batch_size: int, sampler: EpochSampler | None = None
+        self, dataset: Dataset[Any], batch_size: int, sampler: Sampler[Any] | None = None
     ) -> DataLoader[Any]:
         return make_loader(dataset, batch_size, self.num_workers, self.seed, sampler)
 

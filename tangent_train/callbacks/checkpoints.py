@@ -17,7 +17,7 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, T
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.console import print_text
-from tangent_train.errors import SettingError
+from tangent_train.errors import at_least
 from tangent_train.files import atomic_path
 
 
@@ -113,8 +113,8 @@ class LastCheckpoint(Checkpoint):
     def __init__(
         self, folder: Path | str, every_n_steps: int | None = None, typed: Sequence[str] = ()
     ) -> None:
-        if every_n_steps is not None and every_n_steps < 1:
-            raise SettingError("checkpoint_every_n_steps", found=every_n_steps, expected="≥ 1")
+        if every_n_steps is not None:
+            at_least("checkpoint_every_n_steps", every_n_steps, 1)
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
         self.typed = typed

@@ -68,6 +68,7 @@ def predict(config: Mapping[str, Any]) -> None:
         DataError: The checkpoint cannot be read, or there are no images.
     """
     settings = parse_settings(PredictSettings, config)
+    _check_projection(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.of(settings.shard)
     original, trained = _networks(settings)
@@ -187,7 +188,7 @@ class _Labeller:
         self._predictor = _predictor(settings, trained)
         self._judge = NetworkJudge(original, self._predictor.device)
         self._depth = _depth_folder(settings, trained)
-        self._masks = _masks(settings)
+        self._masks = Masks(settings.mask)
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
@@ -298,22 +299,20 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
-    how = trained, settings.levels, settings.base_level, settings.blend
-    views: PhotoViews | PanoramaViews
-    if settings.projection == "equirectangular":
-        views = PanoramaViews(*how, settings.rotations)
-    elif settings.rotations == 1:
-        views = PhotoViews(*how)
-    else:
-        raise SettingError("rotations", found=settings.rotations, expected="1 for photos")
+    kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
+    how = settings.levels, settings.base_level, settings.blend, settings.rotations
     of_forward = settings.device, settings.images_per_forward
-    return Predictor(trained, views, *of_forward, settings.min_confidence)
+    return Predictor(trained, kind(trained, *how), *of_forward, settings.min_confidence)
 
 
-def _masks(settings: PredictSettings) -> Masks:
-    if settings.mask is not None and settings.projection == "perspective":
-        raise SettingError("mask", found=settings.mask, expected="null for photos")
-    return Masks(settings.mask)
+def _check_projection(settings: PredictSettings) -> None:
+    """Refuse settings of photos for panoramas, and of panoramas for photos."""
+    of_photos = settings.projection == "perspective"
+    others = ("crop", "upright", "mask") if of_photos else ("fov",)
+    for name in others:
+        if (found := getattr(settings, name)) is not None:
+            expected = "null for photos" if of_photos else "null without projection=perspective"
+            raise SettingError(name, found=found, expected=expected)
 
 
 def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

@@ -61,14 +61,8 @@ def build_trainer(
     every, epochs = section.get("check_val_every_n_epoch"), section.get("max_epochs")
     if epochs not in (None, -1):
         at_least("trainer.max_epochs", epochs, 1)
-    # Null settings of loggers and callbacks that the run knows.
-    known = {
-        "save_dir": str(folder),
-        "monitor": task.monitor,
-        "mode": task.monitor_mode,
-        **_names(folder),
-    }
-    loggers = _build_named(settings, "logger", known)
+    loggers = _build_named(settings, "logger", {"save_dir": str(folder), **_names(folder)})
+    monitor = {"monitor": task.monitor, "mode": task.monitor_mode}
     plugins = section.pop("plugins", None) or []
     named = dict(enumerate(plugins if isinstance(plugins, list) else [plugins]))
     trainer: lightning.Trainer = build_from_config(
@@ -80,7 +74,7 @@ def build_trainer(
         default_root_dir=str(folder),
         callbacks=[
             *callbacks,
-            *_build_named(settings, "callbacks", known),
+            *_build_named(settings, "callbacks", monitor),
             CheckpointContents(contents),
             ProgressBar(),
             PredictionPanels(folder / "panels", settings["panels"]),
@@ -97,7 +91,13 @@ def build_trainer(
 
 
 def _build_named(settings: Mapping[str, Any], group: str, known: Mapping[str, Any]) -> list[Any]:
-    """Build the entries of a section of the user's config, by Hydra; null ones are left out."""
+    """Build the entries of a section of the user's config, by Hydra; null ones are left out.
+
+    Args:
+        settings: Settings of the run.
+        group: Name of the section.
+        known: Values for null settings of the entries.
+    """
     built = []
     for name, entry in (settings.get(group) or {}).items():
         place = f"{group}.{name}"

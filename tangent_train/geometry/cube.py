@@ -61,8 +61,9 @@ class CubeGrid(PinholeGrid):
     rotation: NDArray[np.float64] | None
 
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
-        across = at_least("dim", dim, 2 + 2 * at_least("margin", margin, 0)) - 2 * margin
-        self._set(rotation, dim=dim, pitch=2 / across)
+        margin = at_least("margin", margin, 0)
+        dim = at_least("dim", dim, 2 + 2 * margin)
+        self._set(rotation, dim=dim, pitch=2 / (dim - 2 * margin))
 
     @property
     def neighbors(self) -> NDArray[np.int32]:

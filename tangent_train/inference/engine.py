@@ -23,7 +23,7 @@ from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.inference.representations import PanoramaViews
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.resampling import resize
@@ -226,7 +226,8 @@ class Predictor:
         device: Device of the network, the views and the mosaic.
 
     Raises:
-        SettingError: There is no such device, or the confidence is not a probability.
+        SettingError: There is no such device, the confidence is not a probability, or there are no
+            views per call.
     """
 
     def __init__(
@@ -248,7 +249,9 @@ class Predictor:
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
-        self._per_forward = images_per_forward or views_per_forward(view_sets.image_size)
+        self._per_forward = views_per_forward(view_sets.image_size)
+        if images_per_forward is not None:
+            self._per_forward = at_least("images_per_forward", images_per_forward, 1)
         self._trained, self._view_sets = trained, view_sets
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)

@@ -68,7 +68,7 @@ def load(
         levels: Level s, the angular resolution, or several to average over; None as trained.
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
-        rotations: Rotations about the vertical to average over; of panoramas.
+        rotations: Rotations about the vertical to average over; 1 for photos.
         images_per_forward: Images per call of the network, which bounds memory; None for 2^20
             pixels' worth.
         min_confidence: Pixels whose best class has a lower probability get the label 0.
@@ -83,13 +83,13 @@ def load(
     trained = original
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
-    views = PanoramaViews(trained, levels, base_level, blend, rotations)
+    views = trained, levels, base_level, blend, rotations
     how = device, images_per_forward, min_confidence
-    panoramas = Predictor(trained, views, *how)
+    panoramas = Predictor(trained, PanoramaViews(*views), *how)
     return Network(
         trained,
         panoramas,
-        lambda: Predictor(trained, PhotoViews(trained, levels, base_level, blend), *how),
+        lambda: Predictor(trained, PhotoViews(*views), *how),
         NetworkJudge(original, panoramas.device),
     )
 

@@ -112,9 +112,10 @@ class PhotoViews:
         levels: See `Levels`.
         base_level: Crops of the size of tangent images of another base level b.
         blend: ``feather``: crops overlap by a quarter and are averaged.
+        rotations: 1: photos have no other.
 
     Raises:
-        SettingError: The network cannot take such crops.
+        SettingError: The network cannot take such crops, or there are other rotations.
     """
 
     def __init__(
@@ -123,7 +124,10 @@ class PhotoViews:
         levels: Levels = None,
         base_level: int | None = None,
         blend: Blend = "feather",
+        rotations: int = 1,
     ) -> None:
+        if rotations != 1:
+            raise SettingError("rotations", found=rotations, expected="1 for photos")
         if "elevation" in trained.inputs:
             raise SettingError(
                 "projection",

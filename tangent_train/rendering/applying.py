@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_panorama
@@ -77,9 +77,9 @@ def apply(
             expected="(C, H, W)",
             remedy="Call apply for each panorama of a batch.",
         )
-    if images_per_call is not None and images_per_call < 1:
-        raise SettingError("images_per_call", found=images_per_call, expected="1 or more")
-    step = images_per_call or max(1, _PIXELS_PER_CALL // grid.dim**2)
+    step = max(1, _PIXELS_PER_CALL // grid.dim**2)
+    if images_per_call is not None:
+        step = at_least("images_per_call", images_per_call, 1)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     parts: Iterator[_Part] = _results(function, panorama, grid, step)
     start = next(parts)

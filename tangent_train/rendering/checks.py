@@ -58,12 +58,6 @@ def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
         raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
 
 
-def check_count(name: str, value: int) -> None:
-    """Raise SettingError unless a number counts at least one."""
-    if not isinstance(value, int) or value < 1:
-        raise SettingError(name, found=value, expected="a whole number from 1")
-
-
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
     """``(H, W)`` as two positive integers, or SettingError."""
     whole = [isinstance(side, int | np.integer) and side > 0 for side in shape]

@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.results.evaluation import plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.record import Heading, Record
@@ -98,8 +98,8 @@ class Task(lightning.LightningModule, ABC):
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
-        if images_per_chunk is not None and images_per_chunk < 1:
-            raise SettingError("task.images_per_chunk", found=images_per_chunk, expected="from 1")
+        if images_per_chunk is not None:
+            at_least("task.images_per_chunk", images_per_chunk, 1)
         if not (isinstance(backbone_lr_factor, int | float) and 0 < backbone_lr_factor < math.inf):
             raise SettingError(
                 "task.backbone_lr_factor",

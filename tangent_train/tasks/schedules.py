@@ -106,6 +106,8 @@ class Schedule:
             length: Number of epochs (or steps); negative for a training without an end.
             make_optimizer: Builds the optimizer from parameters.
         """
+        if self._is_null("mode"):  # of `ReduceLROnPlateau`, which has no length
+            return False
         optimizer = make_optimizer([{"params": [torch.zeros(1, requires_grad=True)]}])
         scheduler = self.build(optimizer)
         if isinstance(scheduler, ReduceLROnPlateau):

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
@@ -91,7 +91,6 @@ class SegmentationTask(Task):
         super().__init__(network, representation, class_names, *arguments, **settings)
         names, classes = get_args(ClassWeights), self.class_names[1:]
         for name, value, fits, expected in (
-            ("images_per_forward", images_per_forward, images_per_forward >= 1, "1 or more"),
             ("absent_class", absent_class, absent_class in get_args(AbsentClass), "skip or zero"),
             ("auxiliary_weight", auxiliary_weight, auxiliary_weight >= 0, "0 or more"),
             (
@@ -115,7 +114,7 @@ class SegmentationTask(Task):
             )
         self.weighting = class_weights
         self.auxiliary_weight = auxiliary_weight
-        self.images_per_forward = images_per_forward
+        self.images_per_forward = at_least("task.images_per_forward", images_per_forward, 1)
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(classes)))
 

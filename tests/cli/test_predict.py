@@ -246,6 +246,16 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         ({"input": "nowhere"}, "nowhere"),
         ({"device": "abacus"}, "device"),
         ({"min_confidence": 70}, "min_confidence: found 70.0; expected 0 to 1"),
+        ({"fov": 70}, "fov: found 70.0; expected null without projection=perspective"),
+        *(
+            ({"projection": "perspective", **of_panoramas}, f"{next(iter(of_panoramas))}: found")
+            for of_panoramas in (
+                {"crop": "[0,90,0,45]"},
+                {"upright": "auto"},
+                {"mask": -30},
+                {"rotations": 2},
+            )
+        ),
         ({"class_map": "night"}, "class_map: found night; expected ade20k_to_stanford2d3ds"),
     ],
 )

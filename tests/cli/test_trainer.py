@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 import torch
-from lightning.pytorch.callbacks import RichModelSummary
+from lightning.pytorch.callbacks import Callback, RichModelSummary
 from lightning.pytorch.plugins import DoublePrecision
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO
@@ -82,6 +82,13 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
     assert _last(Path("cut"))["stopped"] is True
 
 
+class Named(Callback):
+    """A callback with settings that are called as those of loggers."""
+
+    def __init__(self, name: str | None, save_dir: str | None) -> None:
+        self.given = name, save_dir
+
+
 def test_loggers_and_plugins_of_the_user_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -95,12 +102,15 @@ def test_loggers_and_plugins_of_the_user_are_used(
         "+logger.mine={_target_: lightning.pytorch.loggers.CSVLogger, save_dir: here, name: x}",
         "+logger.none=null",
         "callbacks=model_summary",
+        f"+callbacks.mine={{_target_: {__name__}.Named, name: null, save_dir: null}}",
     )
     trainer: Any = build_trainer(settings, tmp_path, shape_task(), {"config": {}})
     assert isinstance(trainer.precision_plugin, DoublePrecision)
     assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO), "that of every run too"
     assert [logger.save_dir for logger in trainer.loggers] == ["here"]
     assert any(isinstance(one, RichModelSummary) for one in trainer.callbacks)
+    (mine,) = (one for one in trainer.callbacks if isinstance(one, Named))
+    assert mine.given == (None, None), "a callback's own nulls stay"
 
 
 @pytest.mark.parametrize(

@@ -33,6 +33,14 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
 
 
+def test_integers_of_numpy_are_integers() -> None:
+    grid = CubeGrid(np.int64(9), margin=np.int32(1))  # type: ignore[arg-type]
+    assert (type(grid.dim), grid.pitch) == (int, 2 / 7)
+    for dim in (True, 9.0):
+        with pytest.raises(SettingError, match="dim: "):
+            CubeGrid(dim)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize("rotation", [None, ROTATION])
 def test_every_direction_is_seen_by_its_owner_alone(
     rotation: NDArray[np.float64] | None,

@@ -277,6 +277,18 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
         network.labels(image)
 
 
+@pytest.mark.parametrize("count", [0, -1, 1.5])
+def test_a_network_sees_at_least_one_image_at_a_time(count: Any, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=f"images_per_forward: found {count}; .* 1 or more"):
+        tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=count)
+
+
+def test_photos_have_no_rotations(tmp_path: Path) -> None:
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), rotations=2)
+    with pytest.raises(SettingError, match="rotations: found 2; expected 1 for photos"):
+        network.labels(_RGB, fov=60)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [

@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import equirect_shape, random_rotation
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import Blend, check_choice, check_count
+from tangent_train.rendering.checks import Blend, check_choice
 from tangent_train.rendering.forward import Interpolation, Pixels, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
@@ -119,11 +119,11 @@ class EquirectRepresentation:
     ) -> None:
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
-        if rows is not None and rows < 1:
-            raise SettingError("representation.rows", found=rows, expected="1 or more, or null")
+        if rows is not None:
+            at_least("representation.rows", rows, 1)
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
-        check_count("representation.rotations", rotations)
+        at_least("representation.rotations", rotations, 1)
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
         self.crop_deg = crop_deg
         self.random_rotation = random_rotation

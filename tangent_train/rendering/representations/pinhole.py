@@ -10,7 +10,7 @@ from typing import ClassVar, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
@@ -20,7 +20,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import Blend, check_choice, check_count
+from tangent_train.rendering.checks import Blend, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
 _Grid = TypeVar("_Grid", bound=PinholeGrid)
@@ -240,8 +240,7 @@ def vertical_rotations(count: int, period_deg: float = 360.0) -> list[NDArray[np
     Raises:
         SettingError: The count is less than 1.
     """
-    check_count("rotations", count)
-    step = math.radians(period_deg / count)
+    step = math.radians(period_deg / at_least("rotations", count, 1))
     return [rotation_about((0, 0, 1), step * k) for k in range(count)]
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import LambdaCallback
 from lightning.pytorch.plugins import HalfPrecision
 from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
@@ -188,6 +189,7 @@ def test_processes_take_the_index_of_the_first_which_has_read_everything_once(
     assert len(read) == len(set(read)) == 14
 
 
+@pytest.mark.filterwarnings("ignore:.*your dataloader is not resumable")
 def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
     make_module: MakeModule, tmp_path: Path
 ) -> None:
@@ -217,11 +219,21 @@ def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
         "num_sanity_val_steps": 0,
     }
     task, module = Seen(), make_module(panoramas_per_step=1)
-    Trainer(max_epochs=2, overfit_batches=2, **quiet).fit(task, datamodule=module)
+
+    def save(trainer: Trainer, *_: Any) -> None:
+        if trainer.global_step == 1:
+            trainer.save_checkpoint(tmp_path / "within.ckpt")
+
+    saved = LambdaCallback(on_train_batch_end=save)
+    Trainer(max_epochs=2, overfit_batches=2, callbacks=saved, **quiet).fit(task, datamodule=module)
     first, second, *again = task.batches["train"]
     assert again == [first, second]
     assert [index for index, _ in (first, second)] == [0, 1]
     assert task.batches["val"][:1] == task.batches["val"][-1:]
+    resumed, trainer = Seen(), Trainer(max_epochs=2, overfit_batches=2, **quiet)
+    path = tmp_path / "within.ckpt"
+    trainer.fit(resumed, datamodule=make_module(panoramas_per_step=1), ckpt_path=path)
+    assert resumed.batches["train"] == [second, first, second]
     task = Seen()
     limits: dict[str, Any] = {"limit_train_batches": 3, "limit_val_batches": 1}
     Trainer(max_epochs=2, **limits, **quiet).fit(task, datamodule=module)
