@@ -316,7 +316,7 @@ def _build_task(
     *,
     trains: bool,
 ) -> Any:
-    parts: dict[str, Any] = {"optimizer": _no_optimizer}
+    parts: dict[str, Any] = {"optimizer": None}
     if trains:
         parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
@@ -333,10 +333,6 @@ def _build_task(
         class_names=data.class_names,
         **parts,
     )
-
-
-def _no_optimizer(*_: Any, **__: Any) -> Any:
-    raise RuntimeError("a task that is only evaluated has no optimizer")
 
 
 def _choices(settings: Mapping[str, Any], source: SettingsFile | None) -> dict[str, str]:

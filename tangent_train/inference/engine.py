@@ -274,17 +274,15 @@ class Predictor:
             The scores; score k is that of label k + 1, the last one perhaps of nothing, see
             `TrainedNetwork.groups`.
         """
-        sources = self._view_sets(image)
         network: Any = self._trained.network
-        device = self.device
         sets: list[tuple[Views, ViewImages, Tensor | None]] = []
-        for shown, shape, views in sources:
-            rendered = RenderedViews(self._trained, shown, shape, device)
+        for shown, shape, views in self._view_sets(image):
+            rendered = RenderedViews(self._trained, shown, shape, self.device)
             sets += [(part, rendered.of(part), None) for part in views]
         if sees_rays(network):
             network = partial(network, images_per_chunk=self._per_forward)
             if isinstance(self._view_sets, PanoramaViews):
-                rays = upright_rays(self._view_sets.representation, device)
+                rays = upright_rays(self._view_sets.representation, self.device)
                 sets = [(*part[:2], of_set) for part, of_set in zip(sets, rays, strict=True)]
         count = sum(len(views) for views, _, _ in sets)
         mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -124,7 +124,7 @@ class Network:
         self.class_names = trained.class_names
         self.palette = class_colors(len(trained.class_names))
         self._panoramas = panoramas
-        self._make_photos = photos
+        self._photos = cache(photos)
         self._judge = judge
 
     def __repr__(self) -> str:
@@ -229,7 +229,7 @@ class Network:
                 given = "crop" if crop is not None else "upright"
                 raise SettingError(given, found="one, with fov=", expected="None for photos")
             photo = read_photo(image, fov, of_size)
-            return self._photos.predict(photo, probabilities=probabilities), None
+            return self._photos().predict(photo, probabilities=probabilities), None
         if upright is not None:
             check_choice("upright", upright, ("pose", "auto"))
             if upright == "pose" and not isinstance(image, str | Path):
@@ -243,10 +243,6 @@ class Network:
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._judge)
         return self._panoramas.predict(panorama, probabilities=probabilities), area
-
-    @cached_property
-    def _photos(self) -> Predictor:
-        return self._make_photos()
 
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
         """Depth in steps of 1/512 m, of the size of the image."""

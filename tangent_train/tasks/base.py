@@ -42,7 +42,7 @@ class Task(lightning.LightningModule, ABC):
         network: The network to train.
         representation: Representation of its images.
         class_names: Names of the classes.
-        optimizer: Makes the optimizer from parameters.
+        optimizer: Makes the optimizer from parameters; None for a task that is only evaluated.
         scheduler: A `Schedule`, or builds a learning rate scheduler from the optimizer, which is
             stepped every epoch; None for a constant rate.
         label_smoothing: Fraction of the target that is spread over all classes.
@@ -86,7 +86,7 @@ class Task(lightning.LightningModule, ABC):
         network: nn.Module,
         representation: Any,
         class_names: Sequence[str],
-        optimizer: Callable[..., Optimizer],
+        optimizer: Callable[..., Optimizer] | None,
         scheduler: Schedule | Callable[..., LRScheduler] | None = None,
         label_smoothing: float = 0.0,
         images_per_chunk: int | None = None,
@@ -113,7 +113,7 @@ class Task(lightning.LightningModule, ABC):
             self.network.compile(**compile)  # in place: names of tensors stay as they are
         self.representation = representation
         self.class_names = tuple(class_names)
-        self.make_optimizer = optimizer
+        self.make_optimizer: Any = optimizer
         is_complete = scheduler is None or isinstance(scheduler, Schedule)
         self.schedule: Any = scheduler if is_complete else Schedule(scheduler)  # type: ignore[arg-type]
         self.label_smoothing = label_smoothing

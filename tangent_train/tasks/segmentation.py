@@ -226,8 +226,7 @@ class SegmentationTask(Task):
                     self._add_loss_of(scores, target[part])
         else:
             mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target)
-            best = mosaic.labels().long()
-            best = best.to(images.device)
+            best = mosaic.labels().long().to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
     def _mosaic(
@@ -246,10 +245,10 @@ class SegmentationTask(Task):
         count, several = self._num_scores, len(sets) > 1
         mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
         given = zip(sets, of_sets, rays, strict=True)
-        if target is None:
-            return fill(mosaic, self, given, self.images_per_forward)
 
         def add_loss(scores: Tensor, views: Any) -> None:
+            if target is None:
+                return
             if target.is_cpu:
                 labels = torch.from_numpy(views.render(target.numpy(), "nearest"))
             else:
