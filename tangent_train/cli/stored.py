@@ -16,7 +16,7 @@ from typing import Any, get_args, get_origin, get_type_hints
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli.command_settings import RunSettings
 from tangent_train.cli.compose import config_folder, path_text, quoted, values_of_sweep
-from tangent_train.cli.remembered import remembered_paths
+from tangent_train.cli.remembered import remembered_settings
 from tangent_train.cli.settings import Trust, names_of, parse_settings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, Text, check_fields
@@ -248,7 +248,7 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
             found=f"{chosen[0]} beside it",
             expected="single settings (data.root=…): the run keeps its options",
         )
-    left = [*_remembered(path, names_of(left)), *left]
+    left = [*_remembered(command, path, names_of(left)), *left]
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
@@ -274,16 +274,17 @@ def run_settings(path: Path) -> dict[str, Any] | None:
     return config if "data" in config else None
 
 
-def _remembered(path: Path, names: Collection[str]) -> list[str]:
-    """Overrides for the data of a run that were typed on this machine before, but not now.
+def _remembered(command: str, path: Path, names: Collection[str]) -> list[str]:
+    """Overrides of a run for this machine that were typed before, but not now.
 
     They count as typed. Which run it is follows from where the checkpoint is, not from what is in
-    it.
+    it. An evaluation has loggers and callbacks of its own.
     """
-    if "data" in names or path.parent.name != "checkpoints":
+    sections = {"data", *(_NEVER_STORED if command == "train" else ())} - set(names)
+    if path.parent.name != "checkpoints":
         return []
-    paths = remembered_paths(path.parents[1]).items()
-    return [f"++{name}={quoted(text)}" for name, text in paths if name not in names]
+    settings = remembered_settings(path.parents[1], sections).items()
+    return [f"++{name}={value}" for name, value in settings if name not in names]
 
 
 def _check_evaluation(path: Path, typed: set[str], *, of_run: bool) -> None:

@@ -24,8 +24,9 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.command_settings import TrainSettings
+from tangent_train.cli.compose import quoted
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
-from tangent_train.cli.remembered import remember_paths, remembered_paths
+from tangent_train.cli.remembered import remember_settings, remembered_settings
 from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
@@ -147,23 +148,26 @@ def _check_resumed(settings: Mapping[str, Any], checkpoint: Path) -> None:
 
 
 def _remember(run: Run) -> Collection[str]:
-    """Remember the paths of the user's data; returns the names of their settings.
+    """Remember the user's settings for this machine; returns the names of those that are kept.
 
-    Paths that were remembered are among the overrides of a resumed run.
+    Settings that were remembered are among the overrides of a resumed run.
     """
-    names = names_of(HydraConfig.get().overrides.task)
+    overrides = HydraConfig.get().overrides.task
+    names = names_of(overrides)
     choices = HydraConfig.get().runtime.choices
     options = [(group, choices.get(group)) for group in ("data", "experiment")]
     # Else the same options give the same paths again.
     is_composed = "data" in choices and all(o is None or is_own_option(g, o) for g, o in options)
-    paths = {
-        name: os.path.abspath(value)  # noqa: PTH100 - links stay
+    kept = {
+        name: quoted(os.path.abspath(value))  # noqa: PTH100 - links stay
         for name, value in flat_settings({"data": run.settings["data"]})
         if isinstance(value, str) and not from_file(name, value)
         if name in names or not is_composed
     }
-    rank_zero_only(remember_paths)(run.folder, paths)
-    return remembered_paths(run.folder)
+    typed = (text.lstrip("+").partition("=") for text in overrides)
+    kept |= {name: v for name, _, v in typed if name.startswith(("logger.", "callbacks."))}
+    rank_zero_only(remember_settings)(run.folder, kept)
+    return remembered_settings(run.folder, ("data", "logger", "callbacks"))
 
 
 def _typed_local(remembered: Collection[str]) -> list[str]:

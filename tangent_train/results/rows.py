@@ -209,7 +209,8 @@ def _identity(record: Record) -> dict[str, Any]:
     }
 
 
-def _labels(firsts: Sequence[Record]) -> list[str]:
+def _labels(firsts: Sequence[Record], shown: int | None = 3) -> list[str]:
+    """Names with the settings that differ: the first few, or all if these are not enough."""
     labels = []
     for record in firsts:
         own = _identity(record)
@@ -219,19 +220,20 @@ def _labels(firsts: Sequence[Record]) -> list[str]:
             for setting in sorted({key for other in others for key in other})
             if any(_differs(setting, other, own) for other in others)
         ]
-        text = ", ".join(differing[:3]) + (", …" if len(differing) > 3 else "")
+        text = ", ".join(differing[:shown]) + ", …" * (len(differing) > (shown or len(differing)))
         labels.append(str(own.get("name") or record.folder.name) + (f" ({text})" if text else ""))
-    return labels
+    is_clear = shown is None or len(set(labels)) == len(labels)
+    return labels if is_clear else _labels(firsts, None)
 
 
 def _differs(setting: str, other: Mapping[str, Any], own: Mapping[str, Any]) -> bool:
     """Return True if a setting differs, and not only because its section is of another class."""
     classes = [
         name
-        for name in own
+        for name in own.keys() | other.keys()
         if name.endswith("._target_") and setting.startswith(name.removesuffix("_target_"))
     ]
-    alike = all(other.get(name) == own[name] for name in classes if name != setting)
+    alike = all(other.get(name) == own.get(name) for name in classes if name != setting)
     return alike and other.get(setting) != own.get(setting)
 
 

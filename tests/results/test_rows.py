@@ -80,6 +80,20 @@ def test_other_settings_make_other_groups_named_by_what_differs() -> None:
     ]
 
 
+def test_groups_have_different_names_however_many_settings_differ() -> None:
+    stopping = {"_target_": "EarlyStopping", "patience": 3, "min_delta": 0.1, "mode": "max"}
+    records = [
+        made_record([0.1, 0.2, 0.3], callbacks__early_stopping=stopping),
+        made_record([0.1, 0.2, 0.3], optimizer__lr=0.02, level=6),
+        made_record([0.1, 0.2, 0.3], optimizer__lr=0.02, level=6, scheduler__gamma=0.5),
+        made_record([0.1, 0.2, 0.3], optimizer__lr=0.02, level=6, scheduler__gamma=0.6),
+    ]
+    labels = [row.label for row in group_runs(records)]
+    assert len(set(labels)) == 4
+    assert labels[1].startswith("mine (callbacks.early_stopping=None, level=6, optimizer.lr=0.02, ")
+    assert "patience" not in "".join(labels)
+
+
 def test_networks_from_elsewhere_make_other_groups() -> None:
     records = [
         replace(made_record([0.1, 0.2, 0.3], network=None, seed=seed), checkpoint=file)
