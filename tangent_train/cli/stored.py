@@ -252,8 +252,9 @@ def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetw
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
-    if command != "train":  # a file does not choose who sees the evaluation
-        choices = {g: name for g, name in choices.items() if g not in _NEVER_STORED}
+    # A file does not choose who sees a run, nor what else an evaluation does.
+    for group in ("logger",) if command == "train" else _NEVER_STORED:
+        choices.pop(group, None)
     typed = {a.partition("=")[0] for a in left}.intersection(GROUPS)
     if typed & _SECTIONS.keys():  # an experiment's settings of a section are for another option
         choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
@@ -284,7 +285,7 @@ def _remembered(command: str, path: Path, names: Collection[str]) -> list[str]:
     if path.parent.name != "checkpoints":
         return []
     settings = remembered_settings(path.parents[1], sections).items()
-    return [f"++{name}={value}" for name, value in settings if name not in names]
+    return [f"{'++' * ('.' in name)}{name}={v}" for name, v in settings if name not in names]
 
 
 def _check_evaluation(path: Path, typed: set[str], *, of_run: bool) -> None:

@@ -165,7 +165,7 @@ def _remember(run: Run) -> Collection[str]:
         if name in names or not is_composed
     }
     typed = (text.lstrip("+").partition("=") for text in overrides)
-    kept |= {name: v for name, _, v in typed if name.startswith(("logger.", "callbacks."))}
+    kept |= {n: v for n, _, v in typed if re.match(r"logger$|(logger|callbacks)\.", n)}
     rank_zero_only(remember_settings)(run.folder, kept)
     return remembered_settings(run.folder, ("data", "logger", "callbacks"))
 

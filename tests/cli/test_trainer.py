@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,6 +15,7 @@ from lightning.pytorch.plugins import DoublePrecision
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.cli import trainer as trainer_module
+from tangent_train.cli.stored import stored_run
 from tangent_train.cli.trainer import build_trainer
 from tangent_train.errors import SettingError
 from tests.cli.tiny_runs import SETTINGS, Run
@@ -75,6 +77,11 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
         machine.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
         with pytest.raises(SystemExit, match=r"callbacks\.cut\._target_: found None"):
             run("train", "resume=cut", rooms, *settings[-2:])
+    shutil.copytree("cut", "of_others")  # a file does not choose a logger
+    for folder, is_kept in (("cut", True), ("of_others", False)):
+        stored = stored_run("train", [f"resume={folder}"])
+        assert stored is not None
+        assert ("logger=csv" in stored.arguments) == is_kept
     for _ in range(2):  # the second time, its training is over
         run("train", "resume=cut")
         assert _epochs(Path("cut")) == _epochs(Path("whole"))
