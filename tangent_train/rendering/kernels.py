@@ -284,9 +284,9 @@ def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers, taps: _Taps) ->
     """Write the taps of n pixels.
 
     Args:
-        n: How many.
+        n: Number of pixels.
         step: Places from a row to the next one, and the place of pixel (0, 0) of the image.
-        buffers: Their columns, rows and weights.
+        buffers: Columns, rows and weights of the pixels.
         taps: Written.
     """
     first, a, b, c, d = taps

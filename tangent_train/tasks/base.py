@@ -367,8 +367,8 @@ class Task(lightning.LightningModule, ABC):
         """Add to ``val/loss``, which is normalized as the training loss is.
 
         Args:
-            loss: A sum of losses.
-            labels: Their labels, see `loss_norm`.
+            loss: Sum of the losses.
+            labels: Labels that the losses are computed from, see `loss_norm`.
         """
         for total, value in zip(self._losses, (loss, self.loss_norm(labels)), strict=True):
             total.update(value)
@@ -385,7 +385,7 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: A score has no heading.
         """
-        stage = "test" if self.trainer.testing else "val"
+        stage = "test" if self.is_tested else "val"
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
         self._counted.reset()
