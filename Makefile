@@ -1,7 +1,7 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
 # make test   sets up and runs the tests, 3 to 5 minutes on two cores
 # make test-all  with the slow ones and the coverage, 25 to 35 minutes; what CI runs
-# make real ZIND=zind/sample_tour NETWORK=net.onnx  the tables of docs/real_panoramas.md, in hours
+# make real ZIND=zind/sample_tour NETWORK=net.onnx  the tables of docs/results/real_panoramas.md, in hours
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin

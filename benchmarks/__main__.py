@@ -5,7 +5,7 @@ python -m benchmarks images labels          some of it
 python -m benchmarks compare                measure, then compare with the baseline
 python -m benchmarks compare results.json   compare what was measured
 python -m benchmarks baseline results.json  make it the baseline, better of several runs
-python -m benchmarks gpu                    all that is measured on a GPU, see docs/gpu.md
+python -m benchmarks gpu                    all that is measured on a GPU, see docs/results/gpu.md
 python -m benchmarks gpu render step        some of it
 """
 

@@ -6,7 +6,7 @@ size and time of the files it was made from, and a checksum of everything before
 of date when the files change.
 
 Memory-mapped: rendering a tangent image touches only the pages it needs, shared by all processes.
-docs/store.md compares this with other formats.
+docs/how-to/prepared_store.md compares this with other formats.
 """
 
 from __future__ import annotations

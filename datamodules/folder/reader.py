@@ -89,7 +89,7 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
     """
     for folder in (root, root / "images", root / "labels"):
         if not folder.is_dir():
-            expected = "a data set: images/, labels/ and classes.json, see docs/own_data.md"
+            expected = "a data set: images/, labels/ and classes.json, see docs/how-to/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
     labels = image_files.NamedFiles(root / "labels")
