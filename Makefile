@@ -7,7 +7,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-DEMO := runs/make_demo
+DEMO := runs/demo/first
 AGAIN := status=$$?; echo "tangent-train ended with an error, see above; make demo goes on where it stopped."; exit $$status
 
 .PHONY: install demo test test-all lint docs real bench bench-compare
@@ -29,7 +29,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
-		echo "Rendering rooms, training and evaluating (14 minutes of CPU time) …"; \
+		echo "Rendering rooms, training and evaluating (5 to 14 minutes of CPU time) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 
