@@ -1,7 +1,8 @@
 """Every figure has one home: a CSV file in ``docs/results/data``.
 
-A comment before a table or paragraph names the file: ``<!-- data: demo.csv -->``. A table of a results page equals its
-file. In README.md, a table or paragraph with a score names one or more files, and its figures are found in them.
+A comment before a table or paragraph names the file: ``<!-- data: demo.csv -->``. A table of a
+results page equals its file. In README.md, a table or paragraph with a score names one or more
+files, and its figures are found in them.
 """
 
 from __future__ import annotations
