@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import yaml
+import yaml  # type: ignore[import-untyped]
 
 _COLUMN = 32
 _BASE = re.compile(r"^  - (?:/(\w+)@(\w+): )?(?!_self_)(\w+)$", re.MULTILINE)
@@ -86,7 +86,7 @@ def _settings(section: Any, text: str, prefix: str) -> Iterator[Setting]:
 def _option_comments(folder: Path) -> Comments:
     comments: Comments = {}
     files = sorted(folder.glob("*/*.yaml"))
-    # Of the options that build the same object, the one without a base last.
+    # The option without a base comes last: its comments replace those of others for its class.
     for file in sorted(files, key=lambda file: "\ndefaults:" not in file.read_text("utf-8")):
         settings = _with_bases(file)
         builds = [(s.value, s.name[:-8]) for s in settings.values() if s.name[-8:] == "_target_"]
