@@ -281,7 +281,7 @@ def test_levels_and_base_level_of_an_import(
 
 @pytest.mark.parametrize(
     ("size", "fov", "level", "photo_deg"),
-    [(512, 60, 10, 58), (384, 60, 10, 45), (128, 45, 8, 58)],
+    [(512, 60, 10, 58), (384, 60, 10, 45), (128, 60, 8, 58)],
 )
 def test_photos_keep_their_angular_resolution(
     size: int, fov: float, level: int, photo_deg: float, here: Path, run: Run
