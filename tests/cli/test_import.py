@@ -173,6 +173,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
     trained = load_trained(here / "net.ckpt")
+    assert (trained.image_size, trained.representation["levels"]) == ((520, 520), [9, 8])
     photo = torch.randint(0, 256, (3, 520, 520), dtype=torch.uint8)
     mean, std = (torch.tensor(v)[:, None, None] for v in vars(trained.normalization).values())
     with torch.no_grad():
