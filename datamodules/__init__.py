@@ -1,7 +1,7 @@
 """Data sets as Lightning data modules, a folder each.
 
-`core` is what they share (the data modules of panoramas and of photos, samples, transforms, the
-prepared store, checks), `images` reads and writes image files.
+`core` holds the common parts (data modules of panoramas and photos, samples, transforms, the
+prepared store, checks); `images` reads and writes image files.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def is_read(target: str) -> bool:
 
 
 def __getattr__(name: str) -> Any:
-    # On demand: the processes that make rooms need neither torch nor lightning.
+    # On demand: the processes that generate rooms need neither torch nor lightning.
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

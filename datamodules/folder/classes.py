@@ -20,7 +20,7 @@ from tangent_train.registry import is_class_name
 UNKNOWN_NAME = "unknown"
 """Name of label 0, pixels without a class."""
 
-_MOST_CLASSES = 255  # labels are uint8, and 0 is taken
+_MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
 _MOST_VALUE = 65535
 _UNKNOWN_VALUES = (255, 65535)
 _MOST_SHOWN = 8
@@ -36,9 +36,9 @@ class FolderClasses:
     """Mapping from values or colors of label images to classes.
 
     Attributes:
-        names: K names; the label of a class is its place here plus one.
-        codes: ``(n,)`` int32, in rising order: values, or colors as R · 65536 + G · 256 + B.
-        labels: ``(n,)`` uint8, the class of each.
+        names: K names; the label of a class is its index plus one.
+        codes: ``(n,)`` int32, ascending: values, or colors as R · 65536 + G · 256 + B.
+        labels: ``(n,)`` uint8 label of each code.
         in_colors: True if the codes are colors.
         length: Length of the list of names; None if the classes have values or colors.
     """
@@ -51,23 +51,23 @@ class FolderClasses:
 
     @property
     def fingerprint(self) -> str:
-        """Changes when pixels would get other labels."""
+        """Text that changes when the labels of pixels may change."""
         parts = [self.codes.tobytes(), self.labels.tobytes(), bytes([self.in_colors])]
         return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
     def decode(self, stored: NDArray[np.integer], path: object = "labels") -> NDArray[np.uint8]:
-        """Return labels of the pixels of a label image; 0 where they have no class.
+        """Return the labels of a label image, 0 for pixels without a class.
 
         Args:
             stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colors.
-            path: File of the pixels, for messages.
+            path: File of the label image, for error messages.
 
         Returns:
             ``(H, W)``.
 
         Raises:
-            DataError: A value is past the end of the list that names the classes, and does not mark
-                unknown pixels (255, and 65535 of 16 bits).
+            DataError: A value is past the end of the list of classes, and is not a value for
+                unknown pixels (255, and 65535 with 16 bits).
 
         >>> codes, labels = np.array([7], np.int32), np.array([1], np.uint8)
         >>> classes = FolderClasses(("wall",), codes, labels, in_colors=False)
@@ -82,21 +82,21 @@ class FolderClasses:
                     found=f"value {past.min()} in {counted(past.size, 'pixels')}",
                     expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
                     f"{_UNKNOWN_VALUES[0]}",
-                    remedy="Name the class, or write null in its place in the list.",
+                    remedy="Add the class to the list, or null for a value without a class.",
                 )
         codes = self.pack(stored)
         place = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
 
     def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
-        """Return one number for each pixel of a label image, as in `codes`."""
+        """Return the code of each pixel of a label image, as in `codes`."""
         numbers = stored.astype(np.int32)
         if not self.in_colors:
             return numbers
         return numbers[..., 0] << 16 | numbers[..., 1] << 8 | numbers[..., 2]
 
     def describe(self, codes: NDArray[np.int32]) -> str:
-        """Format some codes as in `classes.json`."""
+        """Format codes as in `classes.json`."""
         written = "#{:06x}" if self.in_colors else "{}"
         shown = [written.format(code) for code in codes[:_MOST_SHOWN].tolist()]
         shown += ["…"] if len(codes) > _MOST_SHOWN else []
@@ -106,8 +106,8 @@ class FolderClasses:
 def read_classes(path: Path) -> FolderClasses:
     """Read `classes.json`, in one of these forms.
 
-    * A list of names: the value of a class is its place in the list, from 0. ``null`` in the place
-      of a name leaves a value without a class::
+    * A list of names: the value of a class is its index in the list, from 0. ``null`` instead of a
+      name leaves a value without a class::
 
           [null, "wall", "floor"]
 
@@ -119,14 +119,14 @@ def read_classes(path: Path) -> FolderClasses:
 
           {"wall": "#ff0000", "floor": ["#00ff00", "#00ee00"]}
 
-    Values and colors that are not named, 255 among them, are unknown: such pixels count neither
-    in training nor in evaluation. "unknown" is therefore no class.
+    Other values and colors, including 255, are unknown: such pixels are ignored in training and
+    evaluation. "unknown" is therefore not a class.
 
     Args:
-        path: The file.
+        path: File to read.
 
     Raises:
-        DataError: It cannot be read, is in another form, gives a value twice, or nothing.
+        DataError: The file cannot be read, has another form, repeats a value, or has no classes.
     """
     if not path.exists():
         raise DataError(
