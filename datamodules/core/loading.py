@@ -119,7 +119,7 @@ class ResumedOrder(SequentialSampler):
 
 
 def share_of_process(dataset: Dataset[Any]) -> Dataset[Any]:
-    """Return the samples of this process: process r of n gets samples r, r + n, r + 2n, …
+    """Return the samples of this process: process r of n gets samples r, r + n, r + 2n and so on.
 
     Each sample belongs to exactly one process.
 

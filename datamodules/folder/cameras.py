@@ -99,8 +99,7 @@ class FolderCameras:
                 found=f"fx = {fx:g}, fy = {fy:g}, cx = {x:g}, cy = {y:g} for {files.name}",
                 expected=f"pixels of the photo as displayed, {width} across and {height} down: a "
                 f"principal point inside, a field of view below {_MOST_FOV_DEG}°",
-                remedy="Scale K if the photo was resized; rotate it if EXIF data rotate the "
-                "photo.",
+                remedy="Scale K if the photo was resized; rotate it if EXIF data rotate the photo.",
             )
         return matrix
 

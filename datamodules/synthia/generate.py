@@ -1,9 +1,9 @@
 """Generating OmniSYNTHIA from SYNTHIA: the four views of a frame form one panorama.
 
 The front view is in the middle of the panorama, every pixel belongs to one view, and depth is the
-distance from the center. The script of the published panoramas (Zhang et al. 2019) puts the left view
-in the middle (90° away), keeps the z-depth of the views, and averages overlapping views, including
-labels.
+distance from the center. The script of the published panoramas (Zhang et al. 2019) puts the left
+view in the middle (90° away), keeps the z-depth of the views, and averages overlapping views,
+including labels.
 """
 
 from __future__ import annotations
@@ -128,8 +128,8 @@ def make_panoramas(
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
-    Complete files are kept, so that the work can be interrupted. Published panoramas are not changed
-    or mixed with generated ones, whose heading differs.
+    Complete files are kept, so that the work can be interrupted. Published panoramas stay unchanged
+    and are not mixed with generated ones, whose heading differs.
 
     Args:
         root: Folder of the sequences.

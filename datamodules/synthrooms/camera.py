@@ -108,7 +108,7 @@ class PanoramaRays:
         """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
         lon = equirect_longitudes(2 * self.height, dx)
         lat = equirect_latitudes(self.height, dy)
-        # A direction is cos φ times its horizontal part plus the vertical: no trigonometry per pixel.
+        # A direction is cos φ times its horizontal part plus the vertical: no trigonometry here.
         turn = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
         level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ turn).astype(np.float32)
         vertical = np.sin(lat)[:, None] * turn[2]

@@ -1,7 +1,7 @@
 """Homes of ZInD: the panoramas in ``zind_data.json``.
 
-Its ``merger`` is read: floors contain complete rooms, these contain partial rooms, and these contain
-panoramas. Lengths are in camera heights. A point x of a panorama is at
+Its ``merger`` is read: floors contain complete rooms, these contain partial rooms, and these
+contain panoramas. Lengths are in camera heights. A point x of a panorama is at
 ``scale · R(rotation) x + translation`` of its floor, in units of ``scale_meters_per_coordinate``
 meters, which is null where unknown.
 """
