@@ -29,7 +29,7 @@ from datamodules.core.panoramas import (
     Panorama,
     PanoramaReading,
     PhotoReading,
-    Turn,
+    TestRotation,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -175,7 +175,7 @@ class PanoramaDataModule(ImageDataModule):
 
     panoramas_per_step: int = 4
     mask: Mask = None
-    test_rotation: Turn = None
+    test_rotation: TestRotation = None
     upright: Upright = None
     max_tilt_deg: float = 60.0
 

@@ -25,7 +25,7 @@ class LabeledImage(NamedTuple):
         labels: ``(H, W)`` uint8 indices into the class names of the data set, 0 where unknown.
         distance_m: ``(H, W)`` float32 meters from the center of the camera, NaN where missing; None
             without depth among the inputs of the data set.
-        pose: Pose; None if the data set has none. In a photo's axes, x is the optical axis, y
+        pose: Pose; None if unknown. In a photo's axes, x is the optical axis, y
             points to the right and z up in the image.
         camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
 

@@ -40,8 +40,8 @@ _Pixel = TypeVar("_Pixel", bound=np.generic)
 Unknown = Literal["labels", "any_black", "all_black"]
 """Pixels that are unknown in addition to unlabeled pixels; see `mask_black`."""
 
-Turn = float | Literal["so3"] | None
-"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or none."""
+TestRotation = float | Literal["so3"] | None
+"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or null."""
 
 STEPS_PER_M = 512
 """Steps of depth per meter, as in the files of Stanford2D3DS."""

@@ -187,7 +187,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
             raise SettingError(
                 f"trainer.devices and data.{self._per_step}",
                 found=f"{now[0]} processes of {now[1]} {self.noun}",
-                expected=f"{before[0]} of {before[1]}, as before",
+                expected=f"{before[0]} of {before[1]}, as in the interrupted run",
                 remedy="Within an epoch, resume as the run was started.",
             )
         self._start = state_dict["epoch"], state_dict["batches"] * self.per_step

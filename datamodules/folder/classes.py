@@ -26,7 +26,7 @@ _UNKNOWN_VALUES = (255, 65535)
 _MOST_SHOWN = 8
 _COLOR = re.compile(r"#[0-9a-fA-F]{6}")
 _EXPECTED = (
-    'a list of class names, ["wall", "floor"], or an object with the values or colours of each '
+    'a list of class names, ["wall", "floor"], or an object with the values or colors of each '
     'class, {"wall": 1, "floor": [2, 3]} or {"wall": "#ff0000"}'
 )
 
@@ -100,7 +100,7 @@ class FolderClasses:
         written = "#{:06x}" if self.in_colors else "{}"
         shown = [written.format(code) for code in codes[:_MOST_SHOWN].tolist()]
         shown += ["…"] if len(codes) > _MOST_SHOWN else []
-        return ("colours " if self.in_colors else "values ") + ", ".join(shown)
+        return ("colors " if self.in_colors else "values ") + ", ".join(shown)
 
 
 def read_classes(path: Path) -> FolderClasses:
@@ -133,7 +133,7 @@ def read_classes(path: Path) -> FolderClasses:
             path,
             found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
             expected="the classes of your images",
-            remedy="Give data.root=<folder>; docs/how-to/own_data.md says what is in it.",
+            remedy="Give data.root=<folder>; docs/how-to/own_data.md describes its files.",
         )
     guide = "docs/how-to/own_data.md shows how to bring your own data."
     content = read_json(path, _EXPECTED, guide)
@@ -179,23 +179,23 @@ def _check_names(path: Path, names: list[Any]) -> None:
             path,
             found=f"class {twice[0]!r} twice",
             expected="every name once",
-            remedy='For several values or colours, write {"floor": [2, 3]}.',
+            remedy='For several values or colors, write {"floor": [2, 3]}.',
         )
 
 
 def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:
     """Return the label of every value or color."""
     if len({isinstance(value, str) for _, values in named for value in values}) > 1:
-        raise DataError(path, found="values and colours", expected="either values or colours")
+        raise DataError(path, found="values and colors", expected="either values or colors")
     labels: dict[int, int] = {}
     for label, (name, values) in enumerate(named, start=1):
         if not values:
-            raise DataError(path, found=f"nothing for {name!r}", expected="a value or a colour")
+            raise DataError(path, found=f"nothing for {name!r}", expected="a value or a color")
         for value in values:
             other = named[labels.setdefault(_code(path, name, value), label) - 1][0]
             if other != name:
                 found = f"{value} for {other!r} and {name!r}"
-                raise DataError(path, found=found, expected="every value or colour once")
+                raise DataError(path, found=found, expected="every value or color once")
     return labels
 
 
@@ -207,5 +207,5 @@ def _code(path: Path, name: str, value: Any) -> int:
     raise DataError(
         path,
         found=f"{json.dumps(value)} for {name!r}",
-        expected=f'a value of 0 to {_MOST_VALUE}, a colour such as "#ff8000", or a list of either',
+        expected=f'a value of 0 to {_MOST_VALUE}, a color such as "#ff8000", or a list of either',
     )

@@ -23,8 +23,8 @@ from tangent_train.errors import DataError, SettingError
 
 # Allowed formats of label images. Gray of 1 to 4 bits is ambiguous: the stored numbers, or the gray
 # levels that they stand for. 16 bits with alpha cannot be decoded.
-_VALUES = ("8-bit grey", "16-bit grey", "8-bit grey with alpha", "palette")
-_COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "palette")
+_VALUES = ("8-bit gray", "16-bit gray", "8-bit gray with alpha", "palette")
+_COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit gray", "8-bit gray with alpha", "palette")
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class FolderReader(ImageReader):
     def settings(self) -> dict[str, str]:
         """See `ImageReader`: classes, depth units and, for photos, cameras."""
         units = f"{self.depth_units_per_m:g}"
-        settings = {"classes": self.classes.fingerprint, "depth units per metre": units}
+        settings = {"classes": self.classes.fingerprint, "depth units per meter": units}
         return settings | ({"cameras": self.cameras.fingerprint} if self.cameras else {})
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
@@ -160,7 +160,7 @@ def _check_kind(path: Path, header: PngHeader, *, in_colors: bool) -> None:
             path,
             found=kind,
             expected=f"{', '.join(allowed)}: "
-            f"classes.json names {'colours' if in_colors else 'values'}",
+            f"classes.json names {'colors' if in_colors else 'values'}",
             remedy="Convert the labels, or describe them in classes.json.",
         )
 

@@ -166,10 +166,10 @@ def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
         files: The depth maps.
         name: Path of the image below the folder of images, without suffix. The depth map has the
             same name, or that with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
-        remedy: Remedy if there is none.
+        remedy: Remedy for a missing file.
 
     Raises:
-        DataError: There is none, or there are several.
+        DataError: The file is missing, or there are several.
     """
     candidates = [files.path(f"{name}{end}{s}") for end in ("", "_depth") for s in DEPTH_SUFFIXES]
     found = [path for path in candidates if path.is_file()]

@@ -166,11 +166,11 @@ def _remove_earlier(folder: Path) -> None:
     """Remove a folder that holds only the files of an earlier run."""
     there = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
     if there:
-        ours = _written(folder)
-        if there - ours:
+        written = _written(folder)
+        if there - written:
             raise SettingError(
                 "output",
-                found=f"{folder / min(there - ours)}, which is not a tangent image of {folder}",
+                found=f"{folder / min(there - written)}, which is not a tangent image of {folder}",
                 expected="a folder that may be replaced",
                 remedy="Move the file, or choose another output.",
             )

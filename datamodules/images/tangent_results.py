@@ -119,7 +119,7 @@ class TangentResults:
                 found=f"{first.dtype} of shape {first.shape}",
                 expected=f"{decided}",
                 remedy=f"Choose kind={', '.join(get_args(ResultKind))}: labels and depth have one "
-                "channel, colours one or three.",
+                "channel, colors one or three.",
             )
         return cls(arrays, grid, decided)
 

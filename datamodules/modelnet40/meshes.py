@@ -65,7 +65,7 @@ def read_off(path: Path) -> Trimesh:
     counts = _COUNTS.search(lines)
     rows = len(re.findall(r"\n[^\S\n]*\S", lines[counts.end() :])) if counts else 0
     if counts is None or rows < int(counts[1]) + int(counts[2]):
-        raise _unreadable(path, f"{rows} lines of vertices and faces, fewer than its header says")
+        raise _unreadable(path, f"{rows} lines of vertices and faces, fewer than in its header")
     if not len(loaded["faces"]) or not np.isfinite(loaded["vertices"]).all():
         raise _unreadable(path, "no triangles with finite coordinates")
     return Trimesh(**loaded, process=False)

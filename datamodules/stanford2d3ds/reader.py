@@ -23,7 +23,7 @@ from tangent_train.geometry import PanoramaPose, is_camera_matrix
 UNKNOWN = 0
 """Label of pixels without a class, which are ignored in training and evaluation."""
 
-_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
+_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("gray",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _PANORAMA_KEYS = {
     "camera_rt_matrix": (3, 4),

@@ -108,8 +108,8 @@ def _view_positions(
     """
     width = 2 * height
     level = lonlat_to_xyz(np.stack([equirect_longitudes(width), np.zeros(width)], axis=-1))
-    turns = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
-    ahead, right, _ = np.moveaxis(np.stack([level @ turn for turn in turns]), -1, 0)
+    rotations = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
+    ahead, right, _ = np.moveaxis(np.stack([level @ rotation for rotation in rotations]), -1, 0)
     owner = ahead.argmax(axis=0)
     columns = np.arange(width)
     ahead, right = ahead[owner, columns], right[owner, columns]

@@ -86,14 +86,14 @@ Formats = dict[str, tuple[int, tuple[str, ...]]]
 VIEW_FORMATS: Formats = {
     "rgb": (8, ("RGB", "RGBA")),
     "labels": (16, ("RGB", "RGBA")),
-    "depth": (16, ("grey", "RGB", "RGBA")),
+    "depth": (16, ("gray", "RGB", "RGBA")),
 }
 """Pixel formats of a view."""
 
 PANORAMA_FORMATS: Formats = {
     "rgb": (8, ("RGB", "RGBA")),
-    "labels": (8, ("grey",)),
-    "depth": (16, ("grey",)),
+    "labels": (8, ("gray",)),
+    "depth": (16, ("gray",)),
 }
 """Pixel formats of a panorama."""
 
@@ -155,7 +155,7 @@ def list_panorama_frames(folder: Path) -> list[str]:
 
 
 def _names(*folders: Path) -> list[str]:
-    # Of a folder that is missing or closed there is none.
+    # A folder that is missing or unreadable has no frames.
     return sorted({path.stem for folder in folders for path in folder.glob(_NAME)})
 
 
@@ -202,7 +202,7 @@ def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]
         raise DataError(
             path,
             found=repr(text[:80]) if path.exists() else "no such file",
-            expected="focal length, centre x and y, and perhaps the baseline, in pixels of "
+            expected="focal length, center x and y, and perhaps the baseline, in pixels of "
             f"views of {width_height(size)}; only of {width_height(_SIZE)} is it known without",
             remedy="Extract the file again.",
         )

@@ -109,9 +109,11 @@ class PanoramaRays:
         lon = equirect_longitudes(2 * self.height, dx)
         lat = equirect_latitudes(self.height, dy)
         # A direction is cos φ times its horizontal part plus the vertical: no trigonometry here.
-        turn = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
-        level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ turn).astype(np.float32)
-        vertical = np.sin(lat)[:, None] * turn[2]
+        room_from_sphere = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
+        level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ room_from_sphere).astype(
+            np.float32
+        )
+        vertical = np.sin(lat)[:, None] * room_from_sphere[2]
         spread = np.cos(lat).astype(np.float32)[:, None, None] * level
         return spread + vertical.astype(np.float32)[:, None, :]
 

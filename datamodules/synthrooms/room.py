@@ -76,9 +76,9 @@ class RoomItem:
         """Add one of `_SHAPES`, scaled to `size` and rotated by `yaw` about its own vertical."""
         place = self.frame.at(*center, yaw)
         cos, sin = math.cos(place.yaw), math.sin(place.yaw)
-        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         unit = np.array(_SHAPES[shape].triangles, np.float64)
-        corners = unit * size @ turn.T + np.array(place[:3])
+        corners = unit * size @ rotation.T + np.array(place[:3])
         self.parts.append(RoomPart(self.index, material, corners))
 
     box = partialmethod(add, "box")

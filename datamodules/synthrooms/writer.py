@@ -158,12 +158,12 @@ def pose_record(
     if not isinstance(image, PerspectiveRays):
         image = PerspectiveRays(pose, image.height, math.pi / 2)
     focal, center = image.size / (2 * math.tan(image.fov_rad / 2)), image.size / 2
-    turn = pose.world_from_camera @ original.world_from_camera.T
+    rotation = pose.world_from_camera @ original.world_from_camera.T
     return {
         "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
         "field_of_view_rads": image.fov_rad,
         "camera_original_rotation": original.euler_angles.tolist(),
-        "rotation_from_original_to_point": euler_angles(turn).tolist(),
+        "rotation_from_original_to_point": euler_angles(rotation).tolist(),
         "point_uuid": camera,
         "camera_location": pose.location.tolist(),
         "frame_num": frame,

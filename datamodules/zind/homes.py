@@ -128,11 +128,11 @@ class HomePanorama:
         usable = len(numbers) == 6 and all(abs(number) <= _MOST for number in numbers)
         if not usable or min(lengths) <= 0:
             found = f"{moved}, a unit of {self.unit_m} m and camera_height={camera}"
-            raise self._wrong(found, "a place on the floor, in metres")
+            raise self._wrong(found, "a place on the floor, in meters")
         unit_m = lengths[0] * moved["scale"]
-        turn = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
+        rotation = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
         location_m = np.array([*moved["translation"], moved["scale"] * camera]) * lengths[0]
-        return PanoramaPose(turn @ _FROM_SPHERE, location_m), unit_m
+        return PanoramaPose(rotation @ _FROM_SPHERE, location_m), unit_m
 
     def _fixtures(self, kind: str, label: int) -> Iterator[Fixture]:
         points = self._points(kind)
@@ -226,5 +226,5 @@ def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:
     """True if a polygon goes round the origin once."""
     angles = np.arctan2(vertices[:, 1], vertices[:, 0])
     steps = np.diff(angles, append=angles[:1])
-    turned = (steps + np.pi) % (2 * np.pi) - np.pi
-    return bool(abs(abs(turned.sum()) - 2 * np.pi) < np.pi / 2)
+    angles = (steps + np.pi) % (2 * np.pi) - np.pi
+    return bool(abs(abs(angles.sum()) - 2 * np.pi) < np.pi / 2)

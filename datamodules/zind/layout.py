@@ -31,7 +31,7 @@ _OFF_WALL = 0.05
 """Largest distance of a fixture from its wall, in camera heights (sample tour: 0.002)."""
 
 _OFF_DIRECTION = 0.2
-"""Largest sine of the angle between a fixture and its wall: tells apart the walls of a corner."""
+"""Largest sine of the angle between a fixture and its wall; separates the walls of a corner."""
 
 _ROUNDING = 1e-9
 """Share by which walls are extended, so that a ray to a corner hits one of them."""

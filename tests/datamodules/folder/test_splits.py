@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from datamodules.core.index import SPLITS
-from datamodules.folder.labelled import FolderPanoramas
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import write_data_set

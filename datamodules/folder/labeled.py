@@ -35,7 +35,7 @@ _TRIED = 4
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class LabelledFolder(ImageDataModule):
+class LabeledFolder(ImageDataModule):
     """Files, splits and classes of a user-defined data set. Depth is clipped to 4 m.
 
     Args:
@@ -124,14 +124,14 @@ class LabelledFolder(ImageDataModule):
             raise DataError(
                 images[0].labels,
                 found=f"{shown}, in this file and the next",
-                expected=f"{classes.describe(classes.codes)}, as classes.json says",
+                expected=f"{classes.describe(classes.codes)}, from classes.json",
                 remedy="Correct classes.json: no pixel would have a class.",
             )
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class FolderPanoramas(LabelledFolder, PanoramaDataModule):
+class FolderPanoramas(LabeledFolder, PanoramaDataModule):
     """User-defined panoramas, with the classes of ``classes.json``.
 
     Raises:
@@ -142,7 +142,7 @@ class FolderPanoramas(LabelledFolder, PanoramaDataModule):
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class FolderPhotos(LabelledFolder, PhotoDataModule):
+class FolderPhotos(LabeledFolder, PhotoDataModule):
     """User-defined photos, with the classes of ``classes.json``.
 
     Args:
@@ -162,7 +162,7 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
         self.require("fov", fine, "degrees, more than 0 and less than 180")
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
-        """See `LabelledFolder`."""
+        """See `LabeledFolder`."""
         cameras = read_folder_cameras(self.root / "cameras.json", self.fov)
         cameras.check_names(images, problems)
         return FolderReader(self._classes, self.depth_units_per_m, cameras)
