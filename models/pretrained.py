@@ -81,7 +81,7 @@ def _equal(one: Tensor | None, other: Tensor | None) -> bool:
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Read the mappings with tensors in a file, by key, e.g. ``state_dict``; "" is the file.
+    """Read the mappings with tensors in a file, by key, e.g. ``state_dict``; "" is all.
 
     Names in nested mappings are joined by dots. If ``state_dict`` has tensors under ``network.``, as
     in checkpoints of this package, only these are returned.

@@ -160,7 +160,7 @@ def test_all_problems_of_cameras_are_listed(two: Path) -> None:
     assert [name for name, _, _ in found] == ["cameras.json"] * 4
     named = [finding.partition(",")[0].partition(":")[0] for _, finding, _ in found]
     assert named == ["'a'", "'hall'", "'hall/a.png'", "'images/hall/a'"]
-    assert "of which there is no image or folder" in found[0][1]
+    assert "which is not an image or folder" in found[0][1]
     with pytest.raises(DataError, match=r"found 4 problems"):
         _photos(two).setup()
 

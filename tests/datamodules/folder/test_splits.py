@@ -100,7 +100,7 @@ def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
 @pytest.mark.parametrize(
     ("lists", "message"),
     [
-        ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', of which there is no"),
+        ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', which is not an image"),
         ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
         ({"test": ""}, r"found no images for test; .* Name some in test\.txt"),
         ({"val": "# none"}, r"no images for val; .*data\.validation_fraction=0"),
