@@ -81,10 +81,10 @@ def _equal(one: Tensor | None, other: Tensor | None) -> bool:
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Read the mappings with tensors in a file, by key, e.g. ``state_dict``; "" is all.
+    """Read the mappings with tensors in a file, by key, e.g. ``state_dict``; "" is the file.
 
-    Names in nested mappings are joined by dots. If ``state_dict`` has tensors under ``network.``, as
-    in checkpoints of this package, only these are returned.
+    Names in nested mappings are joined by dots. If ``state_dict`` has tensors under ``network.``,
+    as in checkpoints of this package, only these are returned.
 
     Args:
         path: File from `torch.save`, from which only tensors and plain values are unpickled, or a
