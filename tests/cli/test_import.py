@@ -304,7 +304,7 @@ def test_photos_keep_their_angular_resolution(
 def test_labels_without_settings_are_those_of_both_levels(
     here: Path, run: Run, predict: Predict, capsys: Capture
 ) -> None:
-    """Of tangent-predict and of Python; one setting halves the number of views."""
+    """The same in tangent-predict and in Python; one setting halves the number of views."""
     run("import", *OF_ONNX, "output=ours.onnx")
     rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
     rgb = cv2.GaussianBlur(rgb, (0, 0), 3)
