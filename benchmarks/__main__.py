@@ -152,9 +152,7 @@ def compare(content: Mapping[str, Any]) -> None:
     """
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
     if content["cores"] not in baseline["cores"]:
-        print(
-            f"The baseline was measured on {baseline['cores']} cores, this run on {content['cores']}."
-        )
+        print(f"Cores of the baseline: {baseline['cores']}; of this run: {content['cores']}.")
     slower = 0
     for name, now in content["quotients"].items():
         then, verdict = baseline["quotients"].get(name), "same"
