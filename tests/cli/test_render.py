@@ -229,7 +229,7 @@ def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused
     again = {"input": room, "output": tmp_path / "tan", "overwrite": True, "format": "jpg"}
     (folder / "notes.txt").write_text("mine")
     before = contents(folder)
-    assert "notes.txt, which is no tangent image" in refused(base_level=0, **again)
+    assert "notes.txt, which is not a tangent image" in refused(base_level=0, **again)
     assert contents(folder) == before
     (folder / "notes.txt").unlink()
     render_with(base_level=0, **again)

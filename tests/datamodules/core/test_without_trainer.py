@@ -1,4 +1,4 @@
-"""Data sets in code of one's own: samples by index, whole images as arrays."""
+"""Data sets in user code: samples by index, whole images as arrays."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def test_the_pose_of_a_rotated_panorama_is_rotated(rooms: Path) -> None:
     assert _agreement(panorama, rotated, directions) > 0.8
 
 
-def test_what_a_data_set_lacks_is_none_or_nan(stanford_root: Path) -> None:
+def test_missing_depth_and_poses_are_nan_or_null(stanford_root: Path) -> None:
     panorama = Stanford2D3DS(stanford_root, level=3).panoramas("test")[0]
     assert panorama.pose is None
     assert panorama.distance_m is not None

@@ -69,7 +69,7 @@ def test_all_pairs_are_found(area: Path) -> None:
     assert (pair.left.distance_m[1:] == 2).all()
 
 
-def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path) -> None:
+def test_missing_and_ambiguous_names_are_listed_together(area: Path, tmp_path: Path) -> None:
     root = tmp_path / "copy"
     shutil.copytree(area, root)
     for name in ("f85a909", "33e598f"):
@@ -84,7 +84,7 @@ def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path
         _ = StanfordPairs(root).names
 
 
-def test_what_is_not_there_is_said(tmp_path: Path) -> None:
+def test_missing_areas_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"area_1.*Get Stanford2D3DS"):
         _ = StanfordPairs(tmp_path).names
     with pytest.raises(DataError, match=r"no two panoramas of one room; expected area_1"):
