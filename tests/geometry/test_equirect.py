@@ -48,7 +48,7 @@ def test_pixels_of_a_panorama_of_two_rows(
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_directions_are_those_of_the_pixel_centres(shape: Shape) -> None:
+def test_directions_are_those_of_the_pixel_centers(shape: Shape) -> None:
     height, width = shape
     rows, columns = np.mgrid[:height, :width]
     pixels = np.stack([columns, rows], axis=-1)

@@ -23,7 +23,7 @@ def test_a_panorama_in_a_right_handed_room() -> None:
     np.testing.assert_allclose(pose.points_m(ahead, 2), (3, 6, 1.5), atol=1e-15)
     np.testing.assert_allclose(pose.points_m(right, 2), (3, 4, 3.5), atol=1e-15)
     np.testing.assert_allclose(pose.points_m(up, 2), (1, 4, 1.5), atol=1e-15)
-    direction, distance = pose.seen((3, 4 - 1, 1.5 + np.sqrt(3)))
+    direction, distance = pose.project((3, 4 - 1, 1.5 + np.sqrt(3)))
     np.testing.assert_allclose(np.degrees(xyz_to_lonlat(direction)), (120, 0), atol=1e-12)
     assert distance == pytest.approx(2)
 

@@ -68,7 +68,7 @@ def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
         # Upside down nothing fits, and both classes are equally likely everywhere.
         assert likely.argmin() == (true + 3) % 6
         np.testing.assert_allclose(likely.min(), 12 * np.log(2), atol=0.4)
-        # Lying on a side, two views see the border upright (half of each fits), two one colour.
+        # Lying on a side, two views see the border upright (half of each fits), two one color.
         others = np.delete(likely, [true, (true + 3) % 6])
         np.testing.assert_allclose(others, 12 * np.log(4), atol=0.4)
 

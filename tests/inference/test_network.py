@@ -220,7 +220,7 @@ def test_no_more_images_than_asked_for_are_in_memory(tmp_path: Path) -> None:
     assert counts == [7, 7, 6]
 
 
-def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
+def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
     """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
     panorama = sphere(32)
@@ -236,7 +236,7 @@ def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
     assert (network.labels(panorama, depth=depth_m * 0) != expected).any()
     for wrong in (None, depth_m[:16], steps):
         with pytest.raises(
-            SettingError, match=r"depth: .*expected floats in metres, 64 × 32 \(width × height\)"
+            SettingError, match=r"depth: .*expected floats in meters, 64 × 32 \(width × height\)"
         ):
             network.labels(panorama, depth=wrong)
 
@@ -268,7 +268,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "room.jpg: found .*No such file"),
-        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colours"),
+        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colou?rs"),
         ([[0]], "found list; expected RGB"),
     ],
 )
@@ -300,7 +300,7 @@ def test_photos_have_no_rotations(tmp_path: Path) -> None:
         ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
         ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),
-        ({"depth": np.zeros((16, 32))}, "None: the network sees rgb"),
+        ({"depth": np.zeros((16, 32))}, "None: the network's inputs are rgb"),
         ({"mask": "none.png"}, "none.png: found no such file"),
         ({"mask": _RGB[..., 0].T}, r"mask: found 16 × 32 .*expected a whole panorama"),
         ({"mask": Path()}, r"\.png: found no such file; expected a mask .* of each panorama"),

@@ -184,7 +184,7 @@ def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
 def test_panoramas_of_any_size_get_labels_of_their_size(
     representation: dict[str, Any], height: int
 ) -> None:
-    """Smooth colours: the labels are those of a network that sees every pixel."""
+    """Smooth colors: the labels are those of a network that sees every pixel."""
     rgb = sphere(height)
     labels = _labels(trained_network(representation), InputImage(rgb))
     assert labels.shape == (height, 2 * height)
@@ -193,7 +193,7 @@ def test_panoramas_of_any_size_get_labels_of_their_size(
 
 
 def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
-    """A checkerboard finer than the network's pixels is grey to it."""
+    """A checkerboard finer than the network's pixels is gray to it."""
     board = (np.indices((128, 256)).sum(axis=0) % 2 * 255).astype(np.uint8)
     rgb = cv2.cvtColor(board, cv2.COLOR_GRAY2RGB)
     trained = trained_network(TANGENT)
@@ -253,7 +253,7 @@ def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
         ("feather", 3, (7, 9)),
     ],
 )
-def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
+def test_photos_with_the_networks_pixels_are_labeled_pixel_by_pixel(
     blend: str, channels: int, size: tuple[int, int]
 ) -> None:
     """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""

@@ -26,7 +26,7 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     for left in range(3):
         pose = PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3) * 0.6)
         order = rng.permutation(250)
-        seen_xyz = pose.seen(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
+        seen_xyz = pose.project(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
         found.append(keypoints_at(unit(seen_xyz)))
         places.append(np.argsort(order))
         for right in range(left):  # the order of names and of images differ

@@ -59,7 +59,7 @@ def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> 
 
 
 @pytest.mark.parametrize("tangent", [False, True])
-def test_a_blank_panorama_has_none_and_colour_is_grey(tangent: bool) -> None:
+def test_a_blank_panorama_has_none_and_color_is_gray(tangent: bool) -> None:
     def found(image: NDArray[np.uint8]) -> SphericalKeypoints:
         if tangent:
             return detect_on_tangent_images(image, TangentGrid(0, 5, dim=29), 21)

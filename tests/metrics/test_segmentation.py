@@ -58,7 +58,7 @@ def test_absent_classes(absent: str, mean: float) -> None:
     assert segmentation_scores(confusion, absent).miou == pytest.approx(mean)  # type: ignore[arg-type]
 
 
-def test_nothing_labelled() -> None:
+def test_nothing_labeled() -> None:
     empty = np.zeros((4, 4))
     scores = segmentation_scores(empty)
     assert np.isnan(scores.miou)
@@ -91,7 +91,7 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
 
 
 def test_latitude_bands_go_from_north_to_south() -> None:
-    # Rows of 1°: their centres are half a degree from the edges of the bands.
+    # Rows of 1°: their centers are half a degree from the edges of the bands.
     truth = torch.arange(1, 7).repeat_interleave(30)[:, None].expand(180, 4)
     metric = SegmentationMetric(7)
     metric.update(truth, truth)
@@ -102,7 +102,7 @@ def test_latitude_bands_go_from_north_to_south() -> None:
 
 
 def test_a_row_on_the_edge_of_two_bands_counts_in_the_northern_one() -> None:
-    """Row i of H has its centre at 90° − (2i + 1) · 90°/H, here in whole numbers of H-ths."""
+    """Row i of H has its center at 90° − (2i + 1) · 90°/H, here in whole numbers of H-ths."""
     for height in range(1, 64):
         expected = np.zeros(6, np.int64)
         for row in range(height):
@@ -203,7 +203,7 @@ def test_draws_without_labels_are_left_out() -> None:
     assert with_one == bootstrap_intervals(of_images.repeat(2, axis=0))
 
 
-def test_there_is_no_interval_of_one_image_or_of_nothing_labelled() -> None:
+def test_there_is_no_interval_of_one_image_or_of_nothing_labeled() -> None:
     _, of_images = _random_images(1)
     assert bootstrap_intervals(of_images) == {}
     assert bootstrap_intervals(of_images[:0]) == {}

@@ -38,7 +38,7 @@ def draw_room(shape: tuple[int, int], turn: NDArray[np.float64]) -> NDArray[np.u
 
 
 def _decoration(points: NDArray[Any], axis: NDArray[Any], upper: NDArray[Any]) -> NDArray[Any]:
-    """Grey added to walls and floor at points in metres."""
+    """Gray added to walls and floor at points in meters."""
     x, y, z = np.moveaxis(points, -1, 0)
     along = np.where(axis == 0, y, x)
     doors = (np.floor(along / 0.7) % 2 == 0) & (z < 0.55)

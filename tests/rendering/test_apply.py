@@ -23,7 +23,7 @@ def _smooth(height: int) -> NDArray[np.float32]:
 
 
 def _features(images: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Five features of every pixel and its neighbours."""
+    """Five features of every pixel and its neighbors."""
     blurred = (images + np.roll(images, 1, axis=2)) / 2
     return np.concatenate([blurred, np.sin(3 * images[..., :2])], axis=-1).astype(np.float64)
 
@@ -125,7 +125,7 @@ _ARRAY = np.zeros((8, 16, 3), np.float32)
         (lambda images: images.astype(complex), "complex128; expected a ndarray of numbers"),
         (torch.from_numpy, "found a Tensor"),
         (lambda _: None, "found a NoneType"),
-        (lambda images: images.astype(np.uint8), "blend: found 'feather' of results of uint8"),
+        (lambda images: images.astype(np.uint8), "blend: found 'feather' for results of uint8"),
         (
             _other_after_the_first([(10, 16, 16, 2), (10, 16, 16, 3)], [float, float]),
             r"found K = \(3,\)",

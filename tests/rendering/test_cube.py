@@ -15,7 +15,7 @@ from tangent_train.rendering import tangent_to_equirect, tangent_to_labels
 def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
     dim: int, shape: tuple[int, int]
 ) -> None:
-    """Beyond the outermost pixel centres, the outermost pixels go on: no mixing, no NaN."""
+    """Beyond the outermost pixel centers, the outermost pixels go on: no mixing, no NaN."""
     grid = CubeGrid(dim)
     images = torch.arange(1.0, 7.0)[:, None, None, None].expand(6, 1, dim, dim)
     panorama = tangent_to_equirect(images, grid, shape)[0].numpy()

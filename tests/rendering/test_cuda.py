@@ -56,7 +56,7 @@ def test_to_the_panorama_and_its_gradient(
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_labels_of_any_precision(blend: Blend, classes: int, dtype: torch.dtype) -> None:
     scores = _random(GRID.num_images, classes, GRID.dim, GRID.dim).to(dtype)
-    if blend == "nearest":  # feathered, NaN spreads to all neighbours
+    if blend == "nearest":  # feathered, NaN spreads to all neighbors
         scores[0], scores[1], scores[2, 0] = torch.nan, -torch.inf, torch.nan
     expected = tangent_to_labels(scores.double(), GRID, SHAPE, blend)
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()

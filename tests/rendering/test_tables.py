@@ -37,7 +37,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
 
 @pytest.mark.parametrize("base_level", [0, 1, 4])
 @pytest.mark.parametrize(("rotation", "shape"), [(None, (64, 128)), (ROTATION, (63, 125))])
-def test_owners_are_the_nearest_centres(
+def test_owners_are_the_nearest_centers(
     base_level: int, rotation: NDArray[np.float64] | None, shape: tuple[int, int]
 ) -> None:
     grid = TangentGrid(base_level, base_level + 3, rotation=rotation)

@@ -42,7 +42,7 @@ def test_distortion_has_its_closed_forms() -> None:
     corner = math.degrees(2 * math.asin((3 - math.sqrt(3)) / (3 + math.sqrt(3))))
     assert cube["angle worst °"] == pytest.approx(corner)
     assert cube["area most"] == pytest.approx(math.sqrt(3) * math.pi / 2, rel=1e-3)
-    # The icosahedron's vertices are 37.377° from the centres of its faces: 2 asin(tan²(θ/2)).
+    # The icosahedron's vertices are 37.377° from the centers of its faces: 2 asin(tan²(θ/2)).
     angle = math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15))
     assert first["angle worst °"] == pytest.approx(
         math.degrees(2 * math.asin(math.tan(angle / 2) ** 2))

@@ -121,7 +121,7 @@ _PROCESSORS = (
 def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
     name: str, tmp_path: Path
 ) -> None:
-    """Of one colour, what transformers' processor makes."""
+    """Of one color, what transformers' processor makes."""
     kind = getattr(networks.transformers, f"{name}ImageProcessor")
     kind().save_pretrained(tmp_path)
     path = tmp_path / "preprocessor_config.json"

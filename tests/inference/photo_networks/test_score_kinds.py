@@ -119,7 +119,7 @@ def test_kinds_of_half_precision_and_coarse_scores(
 
 @pytest.mark.parametrize("softmax", [True, False])
 def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path: Path) -> None:
-    """Of one colour each; without the logarithm, no class has a probability above 0.05."""
+    """Of one color each; without the logarithm, no class has a probability above 0.05."""
     colors = np.random.default_rng(3).integers(0, 256, (60, 3))
     weight, bias = 200 * colors / 255, -100 * ((colors / 255) ** 2).sum(axis=1)
     nodes = [_node("Softmax", "linear", "scores", axis=1)] * softmax

@@ -59,7 +59,7 @@ def test_crops_against_the_slow_reference(dim: int, fov_deg: float) -> None:
         assert np.abs(image - _triangle(photo, homography, dim)).max() < 1.01
 
 
-def test_labels_come_from_the_pixel_at_the_centre() -> None:
+def test_labels_come_from_the_pixel_at_the_center() -> None:
     labels = np.random.default_rng(0).integers(0, 14, SIZE).astype(np.uint8)
     depth = labels.astype(np.uint16) * 300
     crops = (
