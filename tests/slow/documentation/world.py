@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import multiprocessing
 import os
 import re
@@ -49,6 +50,8 @@ def build_world(folder: Path) -> Path:
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
+    classes = {name: [name] for name in ("wall", "floor", "window")}  # those of my_rooms
+    (folder / "my_map.json").write_text(json.dumps({"source": "ADE20K", "classes": classes}))
     _write_pictures(folder)
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
@@ -68,6 +71,7 @@ def build_world(folder: Path) -> Path:
     for root in ("synthrooms", "rooms_standard"):
         shutil.copytree(folder / "data" / "rooms_demo", folder / "data" / root)
     shutil.copyfile(folder / demo / "checkpoints" / "best.ckpt", folder / "other.ckpt")
+    shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
