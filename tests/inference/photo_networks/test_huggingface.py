@@ -111,7 +111,7 @@ def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
     networks.saved(networks.mask2former, tmp_path / "masks")
     config = {"id2label": {"0": "sky"}, "label2id": {"sky": 0}}
     networks.change_json(tmp_path / "masks" / "config.json", **config)
-    with pytest.raises(DataError, match="found masks of one class; expected two classes at least"):
+    with pytest.raises(DataError, match="found masks of one class; expected at least two classes"):
         networks.imported(tmp_path / "masks")
 
 
@@ -207,7 +207,7 @@ def test_missing_files_are_named(folder: Path, tmp_path: Path) -> None:
         networks.imported(folder)
     (folder / "pytorch_model.bin").rename(weights)
     (folder / "preprocessor_config.json").rename(tmp_path / "elsewhere.json")
-    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy that file"):
+    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy this file"):
         networks.imported(folder)
     nested = {"image_processor": json.loads((tmp_path / "elsewhere.json").read_text())}
     (folder / "processor_config.json").write_text(json.dumps(nested))
