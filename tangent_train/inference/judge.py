@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 _AROUND = np.arange(4)  # faces of a cube without up and down
 _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
 _EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
-_COUNTED = 20  # more, smaller views are no additional evidence
+_COUNTED = 20  # more, smaller views do not add evidence
 _LEAST_DOUBT = 1e-4
 
 

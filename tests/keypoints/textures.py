@@ -1,4 +1,4 @@
-"""Panoramas of closed forms: rotated ones are computed, not resampled."""
+"""Panoramas in closed form: rotated panoramas are computed, not resampled."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ def rotated(points: SphericalKeypoints, rotation: ArrayLike) -> SphericalKeypoin
 
 
 class Agreement:
-    """Keypoints of a panorama and of the rotated one, each with the most similar one near.
+    """Pairs keypoints of two panoramas: each with the most similar one nearby.
 
     Attributes:
-        share: Of all keypoints, those with another of similar size within 1°.
-        error_deg: Median angle between those.
+        share: Share of keypoints that have another of similar size within 1°.
+        error_deg: Median angle between such pairs.
         size_ratio: Median ratio of their sizes.
-        size_spread: Median of |log| of it.
+        size_spread: Median of the absolute logarithm of this ratio.
         turn_deg: Median angle between their orientations.
     """
 

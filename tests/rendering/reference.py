@@ -1,9 +1,8 @@
-"""Tangent images once more: slow, float64, written from the paper (section 3.2).
+"""A slow float64 reference for tangent images, written from the paper (section 3.2).
 
-No line here is shared with the library, which is tested against it. The mesh is trimesh's; the rest
-goes through longitude and latitude and the textbook formulas of the gnomonic projection (Snyder
-1987, chapter 22), where the library works with camera matrices. Faces come in an order of their
-own: `ReferenceGrid.order` matches them by their centers.
+It shares no code with the library, which is tested against it. The mesh comes from trimesh. Instead
+of camera matrices it uses longitude, latitude and the textbook formulas of the gnomonic projection
+(Snyder 1987, chapter 22). Faces are in another order: `ReferenceGrid.order` matches their centers.
 """
 
 from __future__ import annotations
@@ -132,11 +131,11 @@ class ReferenceGrid:
         return vertex_resolution(self.base_level - 1) / 2 ** (self.level - self.base_level)
 
     def order(self, centers_xyz: ArrayLike) -> NDArray[np.int64]:
-        """For each given center the face here that has it."""
-        own = to_xyz(self.centers_lonlat) @ self.rotation.T
-        closeness = np.asarray(centers_xyz) @ own.T
+        """Return the face of this grid for each center."""
+        centers = to_xyz(self.centers_lonlat) @ self.rotation.T
+        closeness = np.asarray(centers_xyz) @ centers.T
         order = closeness.argmax(axis=1)
-        if closeness.max(axis=1).min() < 1 - 1e-12 or len(set(order.tolist())) != len(own):
+        if closeness.max(axis=1).min() < 1 - 1e-12 or len(set(order.tolist())) != len(centers):
             raise AssertionError("the centers of the faces differ")
         return order
 
@@ -170,10 +169,10 @@ class ReferenceGrid:
         lonlat = to_lonlat(self._resting(shape))
         lon, lat = lonlat[..., 0], lonlat[..., 1]
         lon_0, lat_0 = self.centers_lonlat[face, 0], self.centers_lonlat[face, 1]
-        turn = np.cos(lon - lon_0)
-        cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * turn
+        cosine = np.cos(lon - lon_0)
+        cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * cosine
         x = np.cos(lat) * np.sin(lon - lon_0) / cos_c
-        y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * turn) / cos_c
+        y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * cosine) / cos_c
         middle = (self.dim - 1) / 2
         return middle - y / self.pitch, middle + x / self.pitch
 

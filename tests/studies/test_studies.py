@@ -22,13 +22,13 @@ PAGE = (DOCS / "results" / "distortion.md").read_text(encoding="utf-8")
 
 
 def test_the_page_shows_the_tables() -> None:
-    """Where the paper has a figure, it stands beside ours."""
+    """Figures of the paper are beside those of this project."""
     for rows in (fov(), surface_area(6), angular_resolution()):
         for line in markdown(rows).splitlines():
             assert line in PAGE
 
 
-def test_distortion_has_its_closed_forms() -> None:
+def test_distortions_agree_with_closed_forms() -> None:
     distortions = {row["images"]: row for row in representation_distortion((128, 256))}
     erp, cube, first = (distortions[name] for name in ("ERP", "cube", "b = 0"))
     gamma = math.gamma
@@ -68,7 +68,7 @@ def test_the_lens_agrees_with_a_slow_sampler(k1: float) -> None:
     np.testing.assert_allclose(found[0, 0], expected, atol=1e-9)
 
 
-def test_the_zoom_is_the_lens_on_average() -> None:
+def test_enlargement_is_the_mean_enlargement_of_the_lens() -> None:
     points = pixel_centers(torch.zeros(1, 1, 560, 560))
     body = points[points.abs().amax(dim=-1) < BODY]
     expected = float((1 + 0.5 * body.square().sum(dim=-1)).mean())

@@ -82,9 +82,9 @@ class Block:
 
     Attributes:
         place: Document and line.
-        commands: Lines of a shell, with what continues them.
-        python: The program.
-        files: What the document shows as files, by path.
+        commands: Lines of a shell, with their continuations.
+        python: Source of a Python program.
+        files: Content of files in the document, by path.
     """
 
     place: str
@@ -94,7 +94,7 @@ class Block:
 
 
 def blocks(name: str, text: str) -> Iterator[Block]:
-    """All that a Markdown text tells its reader to run."""
+    """Yield commands and programs in a Markdown text."""
     fences = [(m.start(), m[2], re.sub(rf"^{m[1]}", "", m[3], flags=re.M)) for m in
               _FENCE.finditer(text)]  # fmt: skip
     files = {found[1]: body for _, _, body in fences if (found := _FILE.match(body))}
@@ -154,14 +154,16 @@ def small(words: list[str], world: Path) -> list[str]:
     config = CONFIGS.get(program, "train" if any(w.startswith("data=") for w in given) else None)
     if config is None or any(word.startswith(("left=", "input=")) for word in given):
         return []
-    own = [w for w in given if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))]
+    settings = [
+        w for w in given if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))
+    ]
     if program == "tangent-evaluate":
-        own = [word for word in own if word.startswith(("data=", "representation="))]
+        settings = [word for word in settings if word.startswith(("data=", "representation="))]
     folders = [world / given[given.index("--config-dir") + 1]] if "--config-dir" in given else []
     search = ",".join(f"file://{folder}" for folder in folders)
-    found = composed(config, *own, f"hydra.searchpath=[{search}]")
+    found = composed(config, *settings, f"hydra.searchpath=[{search}]")
     known = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
-    if "experiment=zero_shot" in given:  # which has no training, and says so
+    if "experiment=zero_shot" in given:  # which has no training
         known = {n: v for n, v in known.items() if not n.startswith(("fine_tuning", "network"))}
     if program == "tangent-evaluate":
         known = {n: v for n, v in known.items() if n.startswith(("data.rooms", "representation."))}

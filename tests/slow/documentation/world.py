@@ -155,12 +155,12 @@ def run(words: list[str], variables: dict[str, str], world: Path) -> None:
         status = process.exitcode
         process.kill()
         output = Path(log.name).read_text(errors="replace")
-    told = f"was run as: {' '.join(words)}\n{output}"
-    assert status == 0, told
-    assert "Traceback" not in output, told
+    log_text = f"was run as: {' '.join(words)}\n{output}"
+    assert status == 0, log_text
+    assert "Traceback" not in output, log_text
     ready = ("tangent-check", "tangent-prepare", "python")
     if words[0] not in ready and "--help" not in words:
-        assert _times(world) != before, f"nothing was written: {told}"
+        assert _times(world) != before, f"nothing was written: {log_text}"
 
 
 def _times(folder: Path) -> dict[Path, int]:
