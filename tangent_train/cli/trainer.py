@@ -115,7 +115,7 @@ def _build_named(settings: Mapping[str, Any], group: str, known: Mapping[str, An
             is_missing = isinstance(error.__cause__, ModuleNotFoundError)
             if not is_missing or package not in _EXTRAS:
                 raise
-            remedy = f"pip install 'tangent-train[{package}]'"
+            remedy = f"Run in the checkout: pip install -e '.[{package}]'."
             expected = "an installed package"
             raise SettingError(
                 place, found=error.found, expected=expected, remedy=remedy

@@ -52,7 +52,7 @@ def test_what_a_map_leaves_is_missed_or_never_wins(
         arguments = [network, *ROOMS, rooms, given, f"unmapped={unmapped}"]
         arguments += ["representation.blend=nearest"]  # averages may change other classes, too
         run("evaluate", *arguments, f"hydra.run.dir={unmapped}")
-    said = "ceiling ← bright; floor ← dark; never given: beam, board, bookcase, chair, clutter, "
+    said = "ceiling ← bright; floor ← dark; not predicted: beam, board, bookcase, chair, clutter, "
     assert said in capsys.readouterr().out
     matrices = {name: _confusion(tmp_path / name) for name in ("unknown", "never")}
     floor, ceiling = (1 + CLASSES.index(name) for name in ("floor", "ceiling"))

@@ -69,7 +69,7 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(DataError, match=r"outputs \['a', 'b'\]; .* the only output"):
         OnnxNetwork(_linear(tmp_path / "two.onnx", outputs=("a", "b")))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(SettingError, match=r"onnxruntime.*pip install 'tangent-train\[export\]'"):
+    with pytest.raises(SettingError, match=r"onnxruntime.*pip install -e '\.\[export\]'"):
         OnnxNetwork(whole)
 
 

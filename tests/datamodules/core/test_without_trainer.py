@@ -75,7 +75,7 @@ def _agreement(panorama: LabeledImage, image: LabeledImage, directions: NDArray[
     known = np.isfinite(image.distance_m)
     assert known.mean() > 0.8
     points = image.pose.points_m(directions[known], image.distance_m[known])
-    seen, distance_m = panorama.pose.seen(points)
+    seen, distance_m = panorama.pose.project(points)
     row = (0.5 - np.arcsin(seen[..., 2]) / np.pi) * 64
     column = (0.5 + np.arctan2(seen[..., 1], seen[..., 0]) / (2 * np.pi)) * 128
     place = row.astype(int).clip(0, 63), column.astype(int) % 128

@@ -100,7 +100,7 @@ def _disagreement(left: Any, right: Any) -> float:
     """Median of |distance − its prediction from the left| / distance, where the right sees it."""
     known = np.isfinite(left.distance_m)
     points = left.pose.points_m(equirect_directions((64, 128))[known], left.distance_m[known])
-    seen, predicted = right.pose.seen(points)
+    seen, predicted = right.pose.project(points)
     rows = ((0.5 - np.arcsin(seen[:, 2].clip(-1, 1)) / np.pi) * 64).astype(int).clip(0, 63)
     columns = ((np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5) * 128).astype(int) % 128
     found = right.distance_m[rows, columns]

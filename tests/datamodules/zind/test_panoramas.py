@@ -226,7 +226,7 @@ def test_both_panoramas_see_the_same_room(tmp_path: Path) -> None:
         on_a_line = [np.abs(walls[:, axis, None] - corners[:, axis]) for axis in (0, 1)]
         np.testing.assert_allclose(np.min(on_a_line, axis=(0, 2)), 0, atol=1e-4)
         # A corner of the room is seen where the layout has it.
-        seen, away_m = side.pose.seen([0, 6 * unit_m, unit_m])
+        seen, away_m = side.pose.project([0, 6 * unit_m, unit_m])
         x, y = camera.local([(0, 6)])[0]
         np.testing.assert_allclose(seen * away_m, np.array([y, -x, 0]) * unit_m, atol=1e-9)
 
