@@ -320,8 +320,8 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
     described["settings"] = described.pop("network")
-    names = ("class_names", "inputs", "normalization", "groups", "score_kind")
-    names += ("fixed_size", "photo_level")
+    of_network = "class_names", "inputs", "normalization", "groups", "score_kind"
+    names = (*of_network, "fixed_size", "photo_level")
     described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
     tensors = {
         name.removeprefix(_PREFIX): tensor
