@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -310,12 +311,13 @@ def test_labels_without_settings_are_those_of_both_levels(
     rgb = cv2.GaussianBlur(rgb, (0, 0), 3)
     rgb = ((rgb.astype(np.float32) - 127) * 6 + 127).clip(0, 255).astype(np.uint8)
     cv2.imwrite("room.png", rgb[..., ::-1])
-    labels = {}
-    for name, given in {
+    labels: dict[str, Any] = {}
+    settings: dict[str, dict[str, Any]] = {
         "default": {},
         "both": {"levels": "[5,4]", "base_level": 0, "blend": "feather", "rotations": 1},
         "half": {"levels": 5},
-    }.items():
+    }
+    for name, given in settings.items():
         capsys.readouterr()
         predict(checkpoint="ours.onnx", input="room.png", output=name, **given)
         count = 20 if name == "half" else 40

@@ -6,6 +6,7 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -88,7 +89,7 @@ def import_network(
     side = min(network.image_size) if multiple else max(network.image_size)
     chosen = wide_levels(side) if levels is None else level_list(levels, 0)
     level = max(chosen)
-    seen = {"_target_": _TANGENT, "level": level, "levels": chosen}
+    seen: dict[str, Any] = {"_target_": _TANGENT, "level": level, "levels": chosen}
     seen |= images_of_side(side, level, base_level)
     described = TrainedNetwork(
         inner=network.network,
