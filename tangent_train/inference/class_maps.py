@@ -142,7 +142,7 @@ def map_classes(
         raise SettingError(
             f"class_map={class_map.name}",
             found=f"target classes {', '.join(sorted(foreign))}",
-            expected=f"only {', '.join(targets)}",
+            expected=f"names among {', '.join(targets)}",
         )
     target_of = {_plain(n): target for target, names in class_map.classes.items() for n in names}
     names = trained.class_names[1:]

@@ -115,7 +115,7 @@ def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
     trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))
     assert trained.trained.class_names == ("unknown", "wall", "sofa", "floor")
     assert trained.trained.groups == [[0], [], [1]]
-    with pytest.raises(SettingError, match="target classes wall; expected of floor, sofa"):
+    with pytest.raises(SettingError, match="target classes wall; expected names among floor, sofa"):
         map_classes(_trained(["wall"]), given, targets=("floor", "sofa"))
 
 

@@ -152,8 +152,8 @@ def imported_scores(trained: TrainedNetwork) -> Tensor:
     return trained.network(((rgb - mean) / std)[None])[0]
 
 
-def assert_same(scores: Tensor, own: Tensor) -> None:
-    torch.testing.assert_close(scores, own, rtol=0, atol=1e-4)
+def assert_same(scores: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(scores, expected, rtol=0, atol=1e-4)
 
 
 def tokenizer(folder: Path) -> Any:

@@ -66,8 +66,8 @@ def test_oneformer_gets_the_semantic_task(tmp_path: Path) -> None:
     (tmp_path / "classes.json").write_text(
         json.dumps({k: {"name": name, "isthing": 0} for k, name in enumerate(networks.NAMES)})
     )
-    own: dict[str, Any] = {"repo_path": str(tmp_path), "class_info_file": "classes.json"}
-    network, processor = networks.saved(lambda: networks.oneformer(**own), tmp_path)
+    settings: dict[str, Any] = {"repo_path": str(tmp_path), "class_info_file": "classes.json"}
+    network, processor = networks.saved(lambda: networks.oneformer(**settings), tmp_path)
     with pytest.raises(DataError, match=r"no tokenizer\.json or vocab\.json; expected the"):
         networks.imported(tmp_path)
     both = networks.transformers.OneFormerProcessor(
@@ -148,9 +148,11 @@ def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
     for change in changes:
         content = {n: v for n, v in (whole | change).items() if v is not None}
         path.write_text(json.dumps(content))
-        own = networks.transformers.AutoImageProcessor.from_pretrained(tmp_path)
-        sizes = {n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(own, n)}
-        pixels = np.asarray(own(photo, return_tensors="np", **sizes)["pixel_values"])
+        processor = networks.transformers.AutoImageProcessor.from_pretrained(tmp_path)
+        sizes = {
+            n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(processor, n)
+        }
+        pixels = np.asarray(processor(photo, return_tensors="np", **sizes)["pixel_values"])
         expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
         found = huggingface._processor(tmp_path)
         normalized = (color / 255 - found["mean"]) / found["std"]

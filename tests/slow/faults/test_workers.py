@@ -1,4 +1,4 @@
-"""Workers of a loader that die or fail: what is said, and what to do."""
+"""Loader workers that are killed or fail: messages and remedies."""
 
 from __future__ import annotations
 
