@@ -100,7 +100,7 @@ def _write_pictures(folder: Path) -> None:
             cv2.imwrite(str(path), image.astype(np.uint8 if image is panorama else np.uint16))
     cv2.imwrite(str(folder / "room.png"), panorama)
     cv2.imwrite(str(folder / "labels.png"), panorama[..., 0] // 32)
-    for name in ("tripod", "labels/labels/hall", "labels/labels/kitchen"):
+    for name in ("tripod", "poles", "labels/labels/hall", "labels/labels/kitchen"):
         path = folder / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), panorama[..., 0] // 64)
