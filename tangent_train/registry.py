@@ -272,14 +272,20 @@ def _check_taken(
     found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"
     if file is not None and file.gave(name):
         raise DataError(file.path, found=f"{place}: {found}", expected=expected)
-    raise SettingError(
-        place,
-        found=found,
-        expected=expected,
-        remedy=f"{nearest(unknown[0], known)}Remove it with ~{name}, or choose an option of "
-        f"{place}=. Experiments have settings of their own data set; recipe=small is for any "
-        "panoramas.",
-    )
+    remedy = f"Remove it with ~{name}, or choose an option of {place}=."
+    if _is_typed(name):
+        remedy = f"{nearest(unknown[0], known)}Remove it."
+    elif place == "data":
+        remedy += " An experiment is for its data set; recipe=small is for other panoramas."
+    raise SettingError(place, found=found, expected=expected, remedy=remedy)
+
+
+def _is_typed(name: str) -> bool:
+    """Return True if the user added a setting on the command line."""
+    from hydra.core.hydra_config import HydraConfig
+
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
+    return any(text.lstrip("+").startswith(f"{name}=") for text in overrides)
 
 
 def resolve_target(settings: Any, place: str, file: SettingsFile | None = None) -> Any:

@@ -1,8 +1,7 @@
-"""Views of the panoramas, in several conditions, on which a transfer evaluates its network.
+"""Views and conditions of the panoramas that a transfer evaluates its network on.
 
-Both are lists of the user's own settings with names: ``compare`` of the representation,
-``conditions`` of the data. Every view is evaluated in every condition, always on the same
-panoramas, rotated alike.
+Both are lists of named settings: ``compare`` changes the representation, ``conditions`` the data.
+Every view is evaluated in every condition, on the same panoramas with the same rotations.
 """
 
 from __future__ import annotations
@@ -19,18 +18,19 @@ from tangent_train.errors import SettingError
 from tangent_train.inference.representations import panorama_settings
 
 _NAME = re.compile(r"\w[\w.+-]*")
-"""It becomes part of a folder's name."""
+"""Names that can be part of a folder's name."""
 
 
 def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, dict[str, Any]]:
-    """Return the views by name, each as changes of settings: those of ``compare``, or of the study.
+    """Return the views of ``compare`` or of the study by name, each as changes of settings.
 
-    A view is an option of ``representation`` (a name alone, or ``option``) or, without one, the
-    transfer's own, with the other settings changed. ``level`` is also that of the stage.
+    A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
+    without an option, it is the transfer's own representation with changed settings. ``level`` also
+    sets the level of the stage.
 
     Args:
-        config: The composed ``transfer.yaml``.
-        trained: The given network, if its file knows no run.
+        config: Composed ``transfer.yaml``.
+        trained: Network from a file without settings of a run; else None.
 
     Raises:
         SettingError: The list is invalid.
@@ -42,7 +42,7 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
         return {f"level-{n}": _view(config, trained, level=n, erp_height=rows[n]) for n in levels}
     own = HydraConfig.get().runtime.choices.get("representation")
     views = {}
-    for name, given in _named(config, "compare").items():
+    for name, given in _named_entries(config, "compare").items():
         if given or name != own:
             settings = given or {"option": name}
             views[name] = _view(config, trained, **settings)
@@ -53,27 +53,27 @@ def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
     """Return the conditions of the test panoramas by name, each as changes of settings.
 
     Args:
-        config: The composed ``transfer.yaml``.
+        config: Composed ``transfer.yaml``.
 
     Raises:
         SettingError: The list is invalid.
     """
-    found = _named(config, "conditions")
-    if not found:
-        raise SettingError("conditions", found="[]", expected="one or more: [upright]")
-    return {name: {f"data.{n}": v for n, v in given.items()} for name, given in found.items()}
+    conditions = _named_entries(config, "conditions")
+    if not conditions:
+        raise SettingError("conditions", found="[]", expected="at least one: [upright]")
+    return {n: {f"data.{key}": v for key, v in c.items()} for n, c in conditions.items()}
 
 
 def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
-    """Return the different whole numbers of a list.
+    """Return a list of different whole numbers.
 
     Args:
-        config: The composed ``transfer.yaml``.
-        setting: The list, ``section.setting``.
-        least: The smallest that is allowed.
+        config: Composed ``transfer.yaml``.
+        setting: Name of the list, ``section.setting``.
+        least: Smallest allowed number.
 
     Raises:
-        SettingError: It holds something else.
+        SettingError: The list has other values, or equal ones.
     """
     found = OmegaConf.select(config, setting)
     numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
@@ -110,8 +110,8 @@ def _view(
     return {"representation": section} | ({} if level is None else {"level": level})
 
 
-def _named(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
-    """Return the settings in a list by name."""
+def _named_entries(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
+    """Return the entries of a list, names or named settings, as settings by name."""
     found = config[setting]
     entries: Any = OmegaConf.to_container(found) if isinstance(found, ListConfig) else [None]
     named: dict[str, dict[str, Any]] = {}

@@ -403,9 +403,39 @@ class Task(lightning.LightningModule, ABC):
         for name, score in scores.items():
             key = f"{stage}/{name}"
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
-        for name, score in self.class_scores(self.result).items():
+        of_classes = self.class_scores(self.result)
+        for name, score in of_classes.items():
             if not math.isnan(score):
                 self.log(f"{stage}_{name}", score, sync_dist=True)
+        if not self.is_tested:
+            self._check_monitors(
+                {*self.trainer.callback_metrics, *(f"val_{n}" for n in of_classes)}
+            )
+
+    def _check_monitors(self, logged: Collection[str]) -> None:
+        """Refuse monitored validation values that are not logged; the first check is early.
+
+        Lightning validates a few images before the training.
+        """
+        monitors = [
+            (f"monitor of {type(callback).__name__}", getattr(callback, "monitor", None))
+            for callback in self.trainer.callbacks  # type: ignore[attr-defined]
+            if getattr(callback, "strict", True)
+        ]
+        monitors += [
+            ("scheduler.monitor", config.monitor)
+            for config in self.trainer.lr_scheduler_configs
+            if isinstance(config.scheduler, ReduceLROnPlateau)
+        ]
+        for name, monitor in monitors:
+            if str(monitor).startswith("val") and monitor not in logged:
+                raise SettingError(
+                    name,
+                    found=monitor,
+                    expected=f"one of {', '.join(sorted(logged))}",
+                    remedy="A callback that logs values only later needs "
+                    "trainer.num_sanity_val_steps=0.",
+                )
 
     test_step = validation_step
     on_test_epoch_end = on_validation_epoch_end
@@ -436,7 +466,13 @@ class Task(lightning.LightningModule, ABC):
             super().lr_scheduler_step(scheduler, metric)
 
     def configure_optimizers(self) -> Any:
-        """Optimizer, and scheduler if there is one."""
+        """Build the optimizer, and the scheduler if there is one.
+
+        Raises:
+            SettingError: The schedule ends before the training.
+        """
+        if self.schedule is not None:
+            self.schedule.check_length(self._length())
         return self.optimization(self._length)
 
     def optimization(self, length: Callable[[], Mapping[str, int]]) -> Any:

@@ -96,6 +96,25 @@ class Schedule:
             "reduce_on_plateau": False,
         }
 
+    def check_length(self, length: Mapping[str, int]) -> None:
+        """Refuse a `total_steps` from the user that is less than the length of the training.
+
+        Args:
+            length: Number of epochs and steps of the training.
+
+        Raises:
+            SettingError: The schedule ends before the training.
+        """
+        total = getattr(self.build, "keywords", {}).get("total_steps")
+        steps = length[self.interval] // self.frequency
+        if isinstance(total, int) and total < steps:
+            raise SettingError(
+                "scheduler.total_steps",
+                found=total,
+                expected=f"{steps} or more, the length of the training, or null",
+                remedy="A smaller number would end the schedule before the training.",
+            )
+
     def ends_at(self, length: int, make_optimizer: Callable[..., Any]) -> bool:
         """Return True if the schedule was made for a length, whatever its settings are called.
 

@@ -182,7 +182,7 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
     for name, home in (("theirs", None), (str(run_folder), str(tmp_path / "other machine"))):
         if home is not None:
             monkeypatch.setenv("XDG_STATE_HOME", home)
-        with pytest.raises(SystemExit, match=r"data\.root: found none, as checkpoints do not say"):
+        with pytest.raises(SystemExit, match=r"data\.root: found null: paths are not taken"):
             run("evaluate", f"checkpoint={name}/checkpoints/best.ckpt")
     assert not [path for path in run_folder.rglob("*.json") if "data.root" in path.read_text()]
 
@@ -193,14 +193,16 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
         ("train", "optimizer.lr=1", r"optimizer\.lr: found 1 for a run that began with 0\.003"),
         ("train", "seed=3", r"seed: found 3 for a run that began with 0"),
         ("train", "network.widths=[4,9]", r"network\.widths: found \[4, 9\]"),
-        ("train", "data=folder", r"found data=folder beside it"),
+        ("train", "data=folder", r"found data=folder in the same"),
         ("train", "trainer.max_epochs=1", r"max_epochs: found 1 for a run that is in its epoch 2"),
         ("train", "trainer.max_epochs=3", r"trainer\.max_epochs, .*: found 12 training steps"),
         ("evaluate", "data.inputs=[rgb]", "network: found .*|found inputs .* which the"),
         ("evaluate", "data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
         ("evaluate", "network.widths=[4,9]", "network: found other tensors than in"),
-        ("evaluate", "experiment=rooms/demo", r"found experiment=rooms/demo beside it"),
-        ("evaluate", "recipe=small", r"found recipe=small beside it"),
+        ("evaluate", "experiment=rooms/demo", r"found experiment=rooms/demo in the same"),
+        ("evaluate", "recipe=small", r"found recipe=small in the same"),
+        ("evaluate", "optimizer.lr=3", r"optimizer\.lr: .*tangent-evaluate does not train"),
+        ("evaluate", "+scheduler.gamma=1", r"scheduler\.gamma: .*tangent-evaluate does not train"),
     ],
 )
 def test_a_run_is_neither_resumed_nor_evaluated_as_another(
@@ -319,7 +321,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["~scheduler.max_lr", "~scheduler.pct_start", f"{_SCHEDULER}.StepLR"], "step_size"),
         (
             ["scheduler=cosine", "scheduler.T_max=abc"],
-            "scheduler: found .*; expected settings that .*CosineAnnealingLR takes",
+            "scheduler: found .*; expected settings that .*CosineAnnealingLR accepts",
         ),
         (
             ["network._target_=tests.cli.tiny_runs.results"],
@@ -507,7 +509,8 @@ def test_an_incomplete_test_leaves_no_results(
     run("train", *SETTINGS, rooms, "trainer.max_epochs=1", typed, "hydra.run.dir=run")
     count = 0 if limit == "batches=0" else 1
     assert (
-        f"{count} of 2 test panoramas were evaluated, as trainer.limit" in capsys.readouterr().out
+        f"{count} of 2 test panoramas were evaluated because of trainer.limit"
+        in capsys.readouterr().out
     )
     assert not list((tmp_path / "run").glob("results.*"))
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"

@@ -30,7 +30,7 @@ def test_the_suffix_says_the_format(
     assert re.fullmatch(
         rf"{re.escape(name)}: {path.stat().st_size / 1e6:.1f} MB\n"
         r"images: 4 channels, any size, multiples of 2; scores: 13 classes\n"
-        r"largest difference to PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
+        r"largest difference from PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
         said,
     )
     assert load_trained(path).in_channels == 4
@@ -41,7 +41,7 @@ def test_the_suffix_says_the_format(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "checkpoint: found none; expected a file"),
+        ([], "checkpoint: found null; expected a file"),
         (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
         (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
         (["checkpoint={}", "output=x.safetensors", "image_size=[9,9]"], "image_size and opset:"),

@@ -59,7 +59,7 @@ def test_two_panoramas(run: Run, panoramas: Path, tmp_path: Path, capsys: Captur
         assert int(row["putative"]) == kept["putative"] > 0
     pictures = sorted(path.name for path in (output / "matches").iterdir())
     assert pictures == ["000_a_b_as_given.png", "000_a_b_rotated.png"]
-    assert "Results are in out (1)." in capsys.readouterr().out
+    assert "Results: out (1)" in capsys.readouterr().out
 
 
 def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
@@ -132,7 +132,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["input=in"], "output: found none"),
+        (["input=in"], "output: found null"),
         (["left={}/a.png", "output=o"], "input: found left="),
         (["input={}", "pairing=every", "output=o"], "pairing: found every"),
         (["left={}", "right={}/a.png", "output=o"], "found 4; expected two panoramas"),

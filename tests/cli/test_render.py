@@ -328,7 +328,7 @@ _IN = {"input": "in", "output": "tan"}
     ("settings", "message"),
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
-        ({"input": "in"}, "output: found none"),
+        ({"input": "in"}, "output: found null"),
         ({**_IN, "faces": [80]}, "80"),
         ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
@@ -336,7 +336,7 @@ _IN = {"input": "in", "output": "tan"}
             "found jpg; .* others change pix",
         ),
         ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
-        ({**_IN, "mask": "in/room.png"}, "none without colmap=true"),
+        ({**_IN, "mask": "in/room.png"}, "null without colmap=true"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],

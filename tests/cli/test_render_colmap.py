@@ -234,7 +234,7 @@ def test_earlier_projects_are_kept_unless_told(
 def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
     settings = {"input": panoramas, "output": tmp_path / "out", "colmap": True}
     assert "format: found npy" in refused(format="npy", **settings)
-    assert "figure: found a.png; expected none with colmap" in refused(figure="a.png", **settings)
+    assert "figure: found a.png; expected null with colmap" in refused(figure="a.png", **settings)
     assert "mask_classes: found sky; expected mask=" in refused(mask_classes=["sky"], **settings)
     write_pixels(tmp_path / "mask.jpg", smooth(16))
     said = refused(mask=tmp_path / "mask.jpg", **settings)

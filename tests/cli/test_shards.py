@@ -72,7 +72,7 @@ def test_an_interrupted_shard_resumes(told: Told, monkeypatch: pytest.MonkeyPatc
         return read_panorama(path, *args)
 
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
-    assert "resume=true continues" in told("out", 2, 2)
+    assert "Continue with resume=true" in told("out", 2, 2)
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
     before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.png")}
     assert {path.stem for path in before} == {"a", "c"}

@@ -158,5 +158,5 @@ def test_runs_are_named_by_their_folders_and_grouped_by_sweep_and_transfer() -> 
         ("runs/transfer/mine/fold_1/seed_0/P", "transfer/mine/fold_1/seed_0/P", "transfer/mine"),
         ("/somewhere/out/b", "out/b", "out"),
     ):
-        names = trainer_module._names(Path(folder))
+        names = trainer_module._logger_names(Path(folder))
         assert names == {"name": name, "run_name": name, "group": group}

@@ -158,7 +158,7 @@ def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_
     with pytest.raises(REFUSED, match=r"seed_0/P: found stage P of another .* class map; expected"):
         run_transfer(*arguments)
     for typed in ("optimizer.lr=1", "network.widths=[4]", "fine_tuning.epochs=[1]"):
-        with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training beside"):
+        with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training with"):
             run_transfer(*arguments, typed)
 
 

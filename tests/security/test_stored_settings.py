@@ -70,7 +70,7 @@ def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
     assert masked(-60, "data.mask=null")[0] is None
     mask, source = masked(-60, "data.mask=pole.png")
     assert (mask, source.gave("data.mask")) == ("pole.png", False)
-    with pytest.raises(SettingError, match=r"data\.mask: found none.*had data\.mask='pole\.png'"):
+    with pytest.raises(SettingError, match=r"data\.mask: found null.*had data\.mask='pole\.png'"):
         masked("pole.png")
 
     settings, source = settled(with_config(content, tmp_path))
@@ -123,7 +123,7 @@ def test_what_cannot_be_resumed_is_said_in_a_line(
     monkeypatch.chdir(run.parent)
     theirs = tmp_path / "theirs"
     (theirs / "checkpoints").mkdir(parents=True)
-    said = "found what cannot be resumed"
+    said = "found a checkpoint that cannot be resumed"
     endless = {**content["config"], "trainer": {**content["config"]["trainer"], "max_epochs": {}}}
     for changed, message in (
         ({"callbacks": "x"}, said),

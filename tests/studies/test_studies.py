@@ -17,7 +17,9 @@ from studies.output import markdown
 from studies.representation_distortion import representation_distortion
 from studies.surface_area import surface_area
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "results" / "distortion.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).resolve().parents[2] / "docs" / "results" / "distortion.md").read_text(
+    encoding="utf-8"
+)
 
 
 def test_the_page_shows_the_tables() -> None:
