@@ -2,14 +2,15 @@
 # make test   sets up and runs the tests, 3 to 5 minutes on two cores
 # make test-all  with the slow ones and the coverage, 25 to 35 minutes; what CI runs
 # make real ZIND=zind/sample_tour NETWORK=net.onnx  the tables of docs/results/real_panoramas.md, in hours
+# make docs  builds the documentation site in site/, offline, in under a minute
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
-DEMO := runs/make_demo
+DEMO := runs/demo/first
 AGAIN := status=$$?; echo "tangent-train ended with an error, see above; make demo goes on where it stopped."; exit $$status
 
-.PHONY: install demo test test-all lint real bench bench-compare
+.PHONY: install demo test test-all lint docs real bench bench-compare
 
 install: $(READY)
 
@@ -28,7 +29,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
-		echo "Rendering rooms, training and evaluating (14 minutes of CPU time) …"; \
+		echo "Rendering rooms, training and evaluating (5 to 14 minutes of CPU time) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 
@@ -46,6 +47,9 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+docs: install
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
 
 # NETWORK was written by tangent-import; repeated, both commands go on where they were interrupted.
 real: install

@@ -135,9 +135,8 @@ def read_classes(path: Path) -> FolderClasses:
             expected="the classes of your images",
             remedy="Give data.root=<folder>; docs/how-to/own_data.md says what is in it.",
         )
-    content = read_json(
-        path, _EXPECTED, "docs/how-to/own_data.md shows how to bring your own data."
-    )
+    guide = "docs/how-to/own_data.md shows how to bring your own data."
+    content = read_json(path, _EXPECTED, guide)
     if isinstance(content, list):
         named = [(name, [place]) for place, name in enumerate(content) if name is not None]
     elif isinstance(content, dict):

@@ -12,7 +12,7 @@ from tangent_train.imports import elsewhere
 
 
 def report(arguments: Sequence[str]) -> None:
-    """Read runs, print the table, and write ``report.md``, ``.csv``, ``.json`` and ``.png``.
+    """Read runs, print the table, and write ``report.md``, ``.csv`` and ``.png``.
 
     Args:
         arguments: Command line after the program's name.
@@ -54,6 +54,6 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path("report"),
         metavar="FOLDER",
-        help="where report.md, .csv, .json and .png are written (default: report)",
+        help="folder for report.md, report.csv and report.png (default: report)",
     )
     return parser

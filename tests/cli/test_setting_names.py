@@ -158,7 +158,7 @@ def test_arguments_that_a_class_does_not_take(
 
 
 def test_overrides_on_both_sides_of_an_option(tmp_path: Path, run: Run) -> None:
-    with pytest.raises(SystemExit, match="^tangent-train: level: found nix"):
+    with pytest.raises(SystemExit, match=r"^tangent-train: level: found nix"):
         run("train", "seed=1", "--config-dir", str(tmp_path), "level=nix")
 
 

@@ -1,4 +1,4 @@
-"""The studies of distortion, against closed forms, the paper's numbers and ``docs/results/distortion.md``."""
+"""The studies of distortion, against closed forms, the paper and ``docs/results/distortion.md``."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from studies.output import markdown
 from studies.representation_distortion import representation_distortion
 from studies.surface_area import surface_area
 
-PAGE = (Path(__file__).resolve().parents[2] / "docs" / "results" / "distortion.md").read_text(
-    encoding="utf-8"
-)
+DOCS = Path(__file__).resolve().parents[2] / "docs"
+PAGE = (DOCS / "results" / "distortion.md").read_text(encoding="utf-8")
 
 
 def test_the_page_shows_the_tables() -> None:

@@ -1,0 +1,140 @@
+"""Every figure has one home: a CSV file in ``docs/results/data``.
+
+A comment before a table or paragraph names the file: ``<!-- data: demo.csv -->``. A table of a
+results page equals its file. In README.md, a table or paragraph with a score names one or more
+files, and its figures are found in them.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+RESULTS = ROOT / "docs" / "results"
+DATA = RESULTS / "data"
+
+MARK = re.compile(r"<!-- data: (.+?) -->")
+SCORE = re.compile(r"\bmIoU\b|\bmAcc\b")
+FIGURE = re.compile(r"(?<![\w.,])\d+\.\d(?![\w.])")
+
+
+class Block(NamedTuple):
+    """Lines between empty lines, and the data files that the comment before them names."""
+
+    text: str
+    files: list[str]
+
+
+def blocks(page: str) -> Iterator[Block]:
+    """Yield the tables, paragraphs and lists of a page.
+
+    Args:
+        page: Markdown. Blocks of code are skipped.
+    """
+    files: list[str] = []
+    for text in re.split(
+        r"\n\s*\n", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE)
+    ):
+        marks = MARK.findall(text)
+        files = marks[-1].split() if marks else files
+        content = MARK.sub("", text).strip()
+        if content:
+            yield Block(content, files)
+            files = []
+
+
+def plain(cell: str) -> str:
+    """Return a cell without bold type, code marks, links and non-breaking spaces.
+
+    Args:
+        cell: Markdown.
+    """
+    cell = re.sub(r"\[(.+?)\]\([^)]*\)", r"\1", cell)
+    return re.sub(r"\*\*|`", "", cell).replace("&nbsp;", "").replace(r"\|", "|").strip()
+
+
+def table(text: str) -> list[list[str]]:
+    """Return the plain cells of a Markdown table, header included.
+
+    Args:
+        text: Lines of the table.
+    """
+    lines = [line.strip() for line in text.splitlines()]
+    rows = [re.split(r"(?<!\\)\|", line.strip("|")) for line in lines]
+    return [[plain(cell) for cell in row] for row in (rows[0], *rows[2:])]
+
+
+def cells(file: str) -> list[list[str]]:
+    """Return the cells of a data file.
+
+    Args:
+        file: Name in ``docs/results/data``.
+    """
+    with (DATA / file).open(encoding="utf-8", newline="") as stream:
+        return list(csv.reader(stream))
+
+
+def tables(page: Path) -> Iterator[tuple[list[list[str]], list[str]]]:
+    """Yield the cells and files of the tables of a page that hold figures.
+
+    Args:
+        page: Markdown file.
+    """
+    for text, files in blocks(page.read_text(encoding="utf-8")):
+        if text.startswith("|"):
+            rows = table(text)
+            if any(re.match(r"[−-]?\d", cell) for row in rows[1:] for cell in row[1:]):
+                yield rows, files
+
+
+def is_found(figure: str, files: list[str]) -> bool:
+    """Return True if a cell of the files contains a number.
+
+    Args:
+        figure: Number as printed.
+        files: Names of data files.
+    """
+    number = re.compile(rf"(?<![\d.]){re.escape(figure)}(?![\d.])")
+    return any(number.search(cell) for file in files for row in cells(file) for cell in row)
+
+
+TO_DO = {"distortion", "real_panoramas", "settings", "speed", "README"}
+"""Pages without data files so far."""
+
+PAGES = [page for page in sorted(RESULTS.glob("*.md")) if page.stem not in TO_DO]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_tables_of_results_equal_their_data(page: Path) -> None:
+    for rows, files in tables(page):
+        assert len(files) == 1, f"no <!-- data: ….csv --> before the table {rows[0]}"
+        assert rows == cells(files[0])
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_results_state_when_and_how_they_were_measured(page: Path) -> None:
+    if page.stem != "index":
+        first = page.read_text(encoding="utf-8").split("\n\n")[1]
+        assert re.match(r"Measured on 20\d\d-\d\d-\d\d", first), first
+        assert "version" in first
+
+
+def test_every_data_file_is_shown() -> None:
+    shown = [file for page in PAGES for _, files in tables(page) for file in files]
+    assert sorted(shown) == sorted(path.name for path in DATA.glob("*.csv"))
+
+
+@pytest.mark.skipif("README" in TO_DO, reason="to do")
+def test_figures_of_the_readme_are_in_the_data() -> None:
+    for text, files in blocks((ROOT / "README.md").read_text(encoding="utf-8")):
+        if SCORE.search(text) or files:
+            prose = re.sub(r"`[^`]*`|\]\([^)]*\)", "", text)
+            for figure in FIGURE.findall(prose):
+                assert files, f"no <!-- data: ….csv --> before {text}"
+                assert is_found(figure, files), f"{figure} is not in {files}: {text}"
