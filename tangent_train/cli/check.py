@@ -36,17 +36,17 @@ def check(settings: Mapping[str, Any]) -> None:
         Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
-    labelled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
+    labeled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
     warnings = sorted(problems.warnings) + [
         doubt
-        for split, counts in labelled.items()
+        for split, counts in labeled.items()
         for doubt in label_doubts(split, counts, data.class_names)
     ]
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
-        if labelled:
-            shares = [[percent(share) for share in n / n.sum()] for n in labelled.values()]
+        if labeled:
+            shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
             columns = zip(data.class_names, *shares, strict=True)
-            Table("Pixels of each class, %", ["class", *labelled], list(map(list, columns))).print()
+            Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     summary = counted(len(listed), "problems") if listed else "No problems"

@@ -1,7 +1,7 @@
 """Entry points of the console scripts.
 
-Nothing heavy is imported before Hydra has composed the settings, so that ``--help`` and a misspelt
-override return at once. ``python -m tangent_train.cli.main train …`` is ``tangent-train …``.
+Nothing heavy is imported before Hydra has composed the settings: ``--help`` and a misspelled
+override return immediately. ``python -m tangent_train.cli.main train …`` is ``tangent-train …``.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def predict(config: Mapping[str, Any]) -> None:
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     names = inputs.names()
     shown = [names[number] for number in evenly_spread(settings.report, len(names))]
-    label = _Labeller(settings, original, trained, folder, shown)
+    label = _Labeler(settings, original, trained, folder, shown)
     if shard is None:
         done = _label(settings, decisive, inputs, label, folder)
         _finish(settings, inputs, label, folder, done)
@@ -97,7 +97,7 @@ def _label(
     settings: PredictSettings,
     decisive: Mapping[str, Any],
     inputs: Inputs,
-    label: _Labeller,
+    label: _Labeler,
     folder: PredictionFolder,
     part: PredictionShard | None = None,
 ) -> list[Entry]:
@@ -122,7 +122,7 @@ def _label(
     print_text(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write
-    labelled = set()
+    labeled = set()
     saved = -math.inf
     save()
     try:
@@ -130,7 +130,7 @@ def _label(
             for job in done:
                 entry = {"error": job.error} if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
-                labelled.add(job.path)
+                labeled.add(job.path)
                 if time.monotonic() - saved > _SAVED_EVERY_S:
                     save()
                     saved = time.monotonic()
@@ -141,7 +141,7 @@ def _label(
         save()
         if part is None and not any("classes" in entry for entry in entries):
             folder.remove_summary()
-    if unmade := _make_videos(inputs, folder, entries, labelled):
+    if unmade := _make_videos(inputs, folder, entries, labeled):
         entries += unmade
         save()
     return entries
@@ -150,7 +150,7 @@ def _label(
 def _finish(
     settings: PredictSettings,
     inputs: Inputs,
-    label: _Labeller,
+    label: _Labeler,
     folder: PredictionFolder,
     entries: Sequence[Entry],
 ) -> None:
@@ -165,7 +165,7 @@ def _finish(
     print_text(f"Results: {settings.output}")
 
 
-class _Labeller:
+class _Labeler:
     """Reads images, predicts their labels and writes them.
 
     Args:
@@ -234,11 +234,11 @@ class _Labeller:
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
-        """Return the pictures of the report; images labelled by other processes are read again.
+        """Return the pictures of the report; images labeled by other processes are read again.
 
         Args:
             inputs: All images and videos.
-            used: Names of the labelled images and frames.
+            used: Names of the labeled images and frames.
         """
         count, names = self._settings.report, [name for name in inputs.names() if name in used]
         wanted = [names[number] for number in evenly_spread(count, len(names))]
@@ -256,14 +256,14 @@ class _Labeller:
 
 
 def _make_videos(
-    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labelled: set[Path]
+    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labeled: set[Path]
 ) -> list[Entry]:
-    """Write the result videos of videos whose frames are all labelled; return errors as entries."""
+    """Write the result videos of videos whose frames are all labeled; return errors as entries."""
     failed = {entry["file"] for entry in entries if "error" in entry}
     videos = [job for job in inputs.videos.values() if str(job.path) not in failed]
 
     def write(job: Job, _: Callable[[float], object]) -> None:
-        again = job.path in labelled
+        again = job.path in labeled
         folder.write_videos(job.item, job.path, job.value, inputs.every, again=again)
 
     done = run_jobs("Making videos", videos, len(videos), write)

@@ -235,7 +235,7 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
     representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
-        expected = "labelled images or shapes; pairs are for tangent-keypoints"
+        expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()

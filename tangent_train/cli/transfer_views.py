@@ -38,15 +38,17 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
     if config.study_levels:
         most = config.study_max_rows
         levels = {n: 2 ** (n + 1) for n in numbers(config, "study_levels", 0)}
-        rows = {n: own if most is None else min(own, most) for n, own in levels.items()}
-        return {f"level-{n}": _view(config, trained, level=n, erp_height=rows[n]) for n in levels}
-    own = HydraConfig.get().runtime.choices.get("representation")
-    views = {}
-    for name, given in _named_entries(config, "compare").items():
-        if given or name != own:
-            settings = given or {"option": name}
-            views[name] = _view(config, trained, **settings)
-    return views
+        heights = {n: rows if most is None else min(rows, most) for n, rows in levels.items()}
+        return {
+            f"level-{n}": _view(config, trained, level=n, erp_height=rows)
+            for n, rows in heights.items()
+        }
+    chosen = HydraConfig.get().runtime.choices.get("representation")
+    return {
+        name: _view(config, trained, **(changes or {"option": name}))
+        for name, changes in _named_entries(config, "compare").items()
+        if changes or name != chosen
+    }
 
 
 def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
@@ -75,55 +77,62 @@ def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
     Raises:
         SettingError: The list has other values, or equal ones.
     """
-    found = OmegaConf.select(config, setting)
-    numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
+    value = OmegaConf.select(config, setting)
+    numbers: list[Any] = list(value) if isinstance(value, list | ListConfig) else [None]
     if not all(type(n) is int and n >= least for n in numbers) or len(set(numbers)) < len(numbers):
-        raise SettingError(
-            setting, found=found, expected=f"a list of different whole numbers from {least}"
-        )
+        expected = f"a list of different whole numbers, {least} or more"
+        raise SettingError(setting, found=value, expected=expected)
     return numbers
 
 
 def _view(
-    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **given: Any
+    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **changes: Any
 ) -> dict[str, Any]:
-    level = given.get("level")
-    own: Any = OmegaConf.to_container(config.representation)
+    """Return a view as changes of settings: its representation, and its level if it has one.
+
+    Args:
+        config: Composed ``transfer.yaml``.
+        trained: Network from a file without settings of a run; else None.
+        option: Option of the group ``representation``; None for the representation of the transfer.
+        **changes: Changed settings of the representation.
+    """
+    level = changes.get("level")
+    composed: Any = OmegaConf.to_container(config.representation)
     section: Any
     if option is not None:
         search = [s for s in HydraConfig.get().overrides.hydra if s.startswith("hydra.searchpath")]
-        # The option alone: its references to other settings stay as they are.
+        # Composed alone, so that its references to other settings are not resolved.
         section = OmegaConf.to_container(compose(f"representation/{option}", search).representation)
-    elif trained is not None and {"level", "base_level"} & given.keys():
-        of_size = panorama_settings(trained, level, given.get("base_level"))
-        section = own if own["_target_"] == of_size["_target_"] else {}
-        section |= of_size
+    elif trained is not None and {"level", "base_level"} & changes.keys():
+        of_level = panorama_settings(trained, level, changes.get("base_level"))
+        section = composed if composed["_target_"] == of_level["_target_"] else {}
+        section |= of_level
     else:
-        section = own
+        section = composed
         dim = config.representation.get("dim")
         if level is not None and dim is not None:  # a side in pixels
             section["dim"] = max(1, round(dim * 2.0 ** (level - config.level)))
     rows = config.representation.get("erp_height")
     if rows is None and level is not None:
         rows = 2 ** (config.level + 1)
-    section |= ({} if rows is None else {"erp_height": rows}) | given
+    section |= ({} if rows is None else {"erp_height": rows}) | changes
     return {"representation": section} | ({} if level is None else {"level": level})
 
 
 def _named_entries(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
     """Return the entries of a list, names or named settings, as settings by name."""
-    found = config[setting]
-    entries: Any = OmegaConf.to_container(found) if isinstance(found, ListConfig) else [None]
+    value = config[setting]
+    entries: Any = OmegaConf.to_container(value) if isinstance(value, ListConfig) else [None]
     named: dict[str, dict[str, Any]] = {}
     for entry in entries:
-        given = {"name": entry} if isinstance(entry, str) else entry
-        name = given.get("name") if isinstance(given, dict) else None
+        settings = {"name": entry} if isinstance(entry, str) else entry
+        name = settings.get("name") if isinstance(settings, dict) else None
         if not isinstance(name, str) or not _NAME.fullmatch(name) or name in named:
             raise SettingError(
                 setting,
-                found=entry if isinstance(found, ListConfig) else found,
+                found=entry if isinstance(value, ListConfig) else value,
                 expected="a list of different names, or of settings with such a name: "
                 "[one, {name: another, …}]",
             )
-        named[name] = {key: value for key, value in given.items() if key != "name"}
+        named[name] = {key: inner for key, inner in settings.items() if key != "name"}
     return named

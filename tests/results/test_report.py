@@ -145,7 +145,7 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
     cells = _cells(_runs_report(record))
     assert cells["shapes"]["rotated in training / test"] == "z / SO3"
     assert cells["shapes"]["accuracy %"] == "80.0"
-    assert cells["shapes"]["mean of the classes %"] == "70.0"
+    assert cells["shapes"]["mean over classes %"] == "70.0"
     assert cells["tangent images (paper)"]["accuracy %"] == "89.1"
     assert len(cells) == 5
 

@@ -52,7 +52,7 @@ def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
         (["enc"], r"task\.frozen: found enc; .* such as encoder, neck, head"),
         (["encoder.7"], r"found encoder\.7; .* such as encoder\.0, encoder\.1, encoder\.2"),
         ([""], "found an empty name"),
-        (["encoder", "neck", "head"], "found all of the network"),
+        (["encoder", "neck", "head"], "found the whole network"),
     ],
 )
 def test_what_cannot_be_frozen_is_refused(names: list[str], message: str) -> None:
