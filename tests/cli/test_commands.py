@@ -341,7 +341,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
 @pytest.mark.parametrize(
     ("command", "argument", "said"),
     [
-        ("train", "--help", "backbone_lr_factor: 1.0       # of the learning rate"),
+        ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Key 'levl' is not in struct"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
     ],
