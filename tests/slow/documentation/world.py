@@ -68,8 +68,8 @@ def build_world(folder: Path) -> Path:
     for root in ("synthrooms", "rooms_standard"):
         shutil.copytree(folder / "data" / "rooms_demo", folder / "data" / root)
     shutil.copyfile(folder / demo / "checkpoints" / "best.ckpt", folder / "other.ckpt")
-    rgb = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
-    shutil.copyfile(rgb, folder / "net.ckpt")
+    best = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
+    shutil.copyfile(best, folder / "net.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
