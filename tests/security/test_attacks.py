@@ -144,7 +144,7 @@ def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
         _nothing_happens(load_record, folder, forbidden, (place, value))
     for place, text in _named_twice(settings, forbidden, yaml.safe_dump):
         (folder / "config.yaml").write_text(text)
-        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a name twice"):
+        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a repeated name"):
             pytest.fail(f"{place}: {load_record(folder)}")
     (folder / "config.yaml").write_text(f"<<: {{name: x}}\n{yaml.safe_dump(settings)}")
     with pytest.raises(DataError, match=r"config\.yaml: found ConstructorError"):

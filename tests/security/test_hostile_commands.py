@@ -121,7 +121,7 @@ def test_results(run: Path, use: Use) -> None:
     Path("theirs/config.yaml").write_text(yaml.safe_dump(_attack(yaml.safe_load(settings))))
     use("the name 'data.mask' in settings", "report", "theirs")
     Path("theirs/config.yaml").write_text(f"{settings}\ndata: {{_target_: {CANARY}.fire}}\n")
-    use("a name twice among", "report", "theirs")
+    use("a repeated name among", "report", "theirs")
     Path("theirs/config.yaml").write_text(settings)
     results = Path("theirs/results.json").read_text()
     Path("theirs/results.json").write_text(results.replace("{", '{"classes": [], ', 1))
