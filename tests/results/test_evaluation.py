@@ -125,7 +125,10 @@ def test_means_over_fewer_classes_say_so() -> None:
     """Of labels that have one class, 100 % mIoU is not that of all."""
     few = _record(_matrices({(1, 1): 90}))
     assert headline(few).endswith(" over 7 panoramas, 1 of 3 classes")
-    assert result_tables(few)[0].note == "Means without classes that no label has: floor, =sofa."
+    assert (
+        result_tables(few)[0].note
+        == "Means without classes that do not occur in the labels: floor, =sofa."
+    )
     as_zero = _record(_matrices({(1, 1): 90}), "zero")
     assert headline(as_zero).endswith(" over 7 panoramas")
     assert result_tables(as_zero)[0].note == ""

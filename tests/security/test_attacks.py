@@ -131,7 +131,7 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         _nothing_happens(describe_network, one, forbidden, (place, value))
     for place, text in _named_twice(described, forbidden, json.dumps):
         save_file(tensors, one, {METADATA_KEY: text})
-        with pytest.raises(DataError, match="is there twice"):
+        with pytest.raises(DataError, match="is repeated"):
             pytest.fail(f"{place}: {load_trained(one)}")
 
 
@@ -171,5 +171,5 @@ def test_in_lists_of_cameras_and_results_of_keypoints(
             _nothing_happens(use, path, forbidden, (path, place, value))
         for place, text in _named_twice(honest, forbidden, json.dumps):
             path.write_text(text)
-            with pytest.raises(DataError, match="is there twice"):
+            with pytest.raises(DataError, match="is repeated"):
                 pytest.fail(f"{place}: {use(path)}")

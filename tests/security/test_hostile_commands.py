@@ -125,7 +125,7 @@ def test_results(run: Path, use: Use) -> None:
     Path("theirs/config.yaml").write_text(settings)
     results = Path("theirs/results.json").read_text()
     Path("theirs/results.json").write_text(results.replace("{", '{"classes": [], ', 1))
-    use("'classes' is there twice", "report", "theirs")
+    use("'classes' is repeated", "report", "theirs")
 
 
 def test_results_of_keypoints(use: Use, run: Path) -> None:
@@ -134,7 +134,7 @@ def test_results_of_keypoints(use: Use, run: Path) -> None:
     Path("theirs").mkdir()
     Path("theirs/results.json").write_text('{"settings": {}, "rows": [], "rows": [{"pair": "a"}]}')
     pair = (f"left={panorama}", f"right={panorama}")
-    use("'rows' is there twice", "keypoints", *pair, "output=theirs", "base_level=[0]", "level=5")
+    use("'rows' is repeated", "keypoints", *pair, "output=theirs", "base_level=[0]", "level=5")
 
 
 @pytest.mark.parametrize("network", ["huggingface", "smp", "onnx"])
@@ -147,7 +147,7 @@ def test_networks_of_other_libraries(network: str, use: Use) -> None:
     suffix = "onnx" if network == "onnx" else "ckpt"
     write_linear(Path("net.onnx"), np.zeros((2, 3), np.float32), np.zeros(2, np.float32))
     arguments = (f"network={network}", source, *given, f"output=ours.{suffix}")
-    use("'0' is there twice", "import", *arguments)
+    use("'0' is repeated", "import", *arguments)
     if network == "huggingface":
         labels = {"id2label": {"0": "wall", "1": "floor"}}
         for config, found in _HUGGINGFACE:
