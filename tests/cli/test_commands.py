@@ -97,7 +97,7 @@ def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
     assert results(tmp_path / "cut") == results(run_folder)
 
 
-def test_ctrl_c_ends_a_run_as_a_shell_says_it(
+def test_ctrl_c_ends_a_run_with_the_status_of_a_shell(
     rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -240,7 +240,7 @@ def test_a_trial_of_a_network_finds_its_fault_whatever_the_memory_holds() -> Non
 def test_the_last_step_of_an_epoch_is_tried_before_training(
     faces: int, rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 7 panoramas, 2 a step; DeepLab's pooled features have one value per image and channel."""
+    """7 panoramas, 2 per step; DeepLab's pooled features have one value per image and channel."""
 
     class BegunError(Exception):
         pass
@@ -309,7 +309,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         ),
         (["data=folder"], "data: found rooms for datamodules.FolderPanoramas; .*recipe=small"),
         (["data=synthshapes"], "data: found panoramas_per_step, rooms for .*SynthShapes"),
-        (["data=zind_pairs"], "data: found ZindPairs; expected labelled images"),
+        (["data=zind_pairs"], "data: found ZindPairs; expected labeled images"),
         (
             ["scheduler=step", f"{_SCHEDULER}.ExponentialLR"],
             "found step_size for .*~scheduler.step",
@@ -339,7 +339,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
 
 
 @pytest.mark.parametrize(
-    ("command", "argument", "said"),
+    ("command", "argument", "message"),
     [
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Key 'levl' is not in struct"),
@@ -347,7 +347,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
     ],
 )
 def test_answers_before_anything_heavy_is_imported(
-    command: str, argument: str, said: str, tmp_path: Path
+    command: str, argument: str, message: str, tmp_path: Path
 ) -> None:
     code = (
         f"import sys; from tangent_train.cli.main import {command}\n"
@@ -357,7 +357,7 @@ def test_answers_before_anything_heavy_is_imported(
         "    print('heavy', len(heavy))"
     )
     done = run_python(tmp_path, "-c", code)
-    assert said in done.stdout + done.stderr
+    assert message in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
     assert "Traceback" not in done.stderr
 
@@ -438,7 +438,7 @@ def test_output_of_any_encoding(
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])
 @pytest.mark.parametrize("named", [True, False])
-def test_what_the_system_refuses_is_one_line(
+def test_errors_of_the_system_are_one_line(
     number: int, named: bool, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def render(_: object) -> None:
@@ -490,14 +490,14 @@ def test_a_pipe_that_is_closed_early_and_tab_completion(tmp_path: Path) -> None:
     train = f"{sys.executable} -m tangent_train.cli.main train"
     typed = "tangent-train data=folder_"
     completion = f"COMP_LINE='{typed}' COMP_POINT={len(typed)} {train} -sc query=bash"
-    for command, told in (
+    for command, beginning in (
         (f"{train} --help | head -n 1", "Train a network"),
         (completion, "data=folder_photos"),
     ):
         done = subprocess.run(
             command, shell=True, check=True, cwd=tmp_path, capture_output=True, text=True
         )
-        assert done.stdout.startswith(told)
+        assert done.stdout.startswith(beginning)
         assert not done.stderr
 
 

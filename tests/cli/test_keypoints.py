@@ -44,7 +44,9 @@ def pairs_in(folder: Path) -> list[str]:
     return list(dict.fromkeys(row["pair"] for row in results(folder)["rows"]))
 
 
-def test_two_panoramas(run: Run, panoramas: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_two_panoramas_are_a_pair(
+    run: Run, panoramas: Path, tmp_path: Path, capsys: Capture
+) -> None:
     pair = (f"left={panoramas}/a.png", f"right={panoramas}/b.png")
     run(*pair, "base_level=[0]", "level=5", "output=out (1)")
     output = tmp_path / "out (1)"
@@ -121,7 +123,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     run("input=in", *SMALL, "output=out")
     assert "1 of 2 pairs are done already" in capsys.readouterr().out
     assert pairs_in(tmp_path / "out") == ["a – b", "b – c/d"]
-    # Of nothing but broken pairs there are no results.
+    # Broken pairs have no results.
     assert cv2.imwrite(str(tmp_path / "square.png"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(SystemExit, match="1 of 1 pairs could not be used"):
         run("left=in/a.png", "right=square.png", *SMALL, "output=none")

@@ -84,7 +84,7 @@ def test_the_nearest_setting_is_named(command: str, overrides: list[str], messag
         "${mine[0]}",
     ],
 )
-def test_what_the_config_refers_to_is_read(reference: str) -> None:
+def test_settings_that_the_config_refers_to_are_read(reference: str) -> None:
     _check("train", "+mine={deep: 1}", f"name='{reference}'")
     with pytest.raises(SettingError, match=r"^mine: "):
         _check("train", "+mine=1", "name='${yours}'")
@@ -115,7 +115,7 @@ hydra: {run: {dir: "${folder}"}}
 
 
 def test_an_experiment_of_ones_own(rooms: str, tmp_path: Path, run: Run) -> None:
-    """Its settings may refer to others of its own; a misspelt one stops before any work."""
+    """Its settings may refer to others of its own; a misspelled one stops before any work."""
     (tmp_path / "own" / "experiment").mkdir(parents=True)
     file = tmp_path / "own" / "experiment" / "mine.yaml"
     settings = [s for s in tiny_runs.SETTINGS if not s.startswith(("experiment=", "trainer.max_"))]

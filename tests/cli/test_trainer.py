@@ -125,8 +125,8 @@ def test_loggers_and_plugins_of_the_user_are_used(
     assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO), "that of every run too"
     assert [logger.save_dir for logger in trainer.loggers] == ["here"]
     assert any(isinstance(one, RichModelSummary) for one in trainer.callbacks)
-    (mine,) = (one for one in trainer.callbacks if isinstance(one, Named))
-    assert mine.given == (None, None), "a callback's own nulls stay"
+    (callback,) = (one for one in trainer.callbacks if isinstance(one, Named))
+    assert callback.given == (None, None), "a callback's own nulls stay"
 
 
 @pytest.mark.parametrize(

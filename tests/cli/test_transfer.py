@@ -108,7 +108,7 @@ def test_a_folder_of_other_settings_or_files_is_refused(runs: PretendedRuns) -> 
     (OF_SEED_0 / "S-FT-1" / "thesis.tex").touch()
     with pytest.raises(REFUSED, match="S-FT-1: found files that tangent-transfer did not write"):
         run_transfer()
-    assert len(runs.started) == before, "said before anything is run"
+    assert len(runs.started) == before, "refused before anything is run"
 
 
 def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedRuns) -> None:
@@ -123,7 +123,7 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
 
 
-def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
+def test_a_network_without_a_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
     network = write_checkpoint(tmp_path / "photo.ckpt")
     class_map = tmp_path / "map.json"
     class_map.write_text('{"classes": {"floor": ["dark"]}}')

@@ -79,12 +79,12 @@ def _evaluation(content: dict[str, Any], path: Path, *typed: str) -> Callable[[P
     typed = (f"checkpoint={path}", "data.root=rooms", *typed)
     stored = stored_run("evaluate", typed)
     assert isinstance(stored, StoredRun)
-    said = composed(stored.arguments)
+    composed_settings = composed(stored.arguments)
 
     def evaluated(path: Path) -> None:
         stored = stored_run("evaluate", typed)
         assert isinstance(stored, StoredRun)
-        settings, source = stored.settings(said)
+        settings, source = stored.settings(composed_settings)
         build(settings, source)
         build_from_config(settings["trainer"], "trainer", source, logger=False)
 

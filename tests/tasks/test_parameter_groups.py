@@ -55,12 +55,12 @@ def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
         (["encoder", "neck", "head"], "found the whole network"),
     ],
 )
-def test_what_cannot_be_frozen_is_refused(names: list[str], message: str) -> None:
+def test_impossible_frozen_parts_are_refused(names: list[str], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         shape_task(SmallNetwork(statistics=True), frozen=names)
 
 
-def test_what_was_loaded_takes_smaller_steps() -> None:
+def test_loaded_tensors_take_smaller_steps() -> None:
     moved = {}
     for factor in (1, 0.25):
         task = shape_task(backbone_lr_factor=factor)

@@ -203,7 +203,7 @@ def test_impossible_settings_are_refused(
         )
 
 
-def test_a_misspelt_monitor_is_refused_before_training() -> None:
+def test_a_misspelled_monitor_is_refused_before_training() -> None:
     rates = Rates(None)
     stopping = lightning.pytorch.callbacks.EarlyStopping("val/mio")
     trainer = quiet_trainer(callbacks=[rates, stopping], max_epochs=1, num_sanity_val_steps=1)

@@ -216,14 +216,14 @@ class FlatSurface {
     const index = layer === "truth" || layer === "error" ? truth : (prediction ?? truth);
     const visible = !this.hidden.has(index);
     const { rgb } = this.classes[index];
-    const grey = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
+    const gray = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
     if (layer === "overlay") {
       return visible && index ? under.map((c, k) => c + opacity * (rgb[k] - c)) : under;
     }
-    if (!visible) return Array(3).fill(0.4 * grey);
+    if (!visible) return Array(3).fill(0.4 * gray);
     if (layer !== "error") return rgb;
     if (!truth) return [110, 110, 110];
-    return truth === prediction ? Array(3).fill(191.25 + 0.25 * grey) : [214, 39, 40];
+    return truth === prediction ? Array(3).fill(191.25 + 0.25 * gray) : [214, 39, 40];
   }
 
   classAt(kind, { u, v }) {

@@ -1,5 +1,5 @@
 #version 300 es
-// One pixel of the viewer: where it looks, what is there, and in which colours that is shown.
+// One pixel of the viewer: where it looks, what is there, and in which colors that is shown.
 // Positions in an image are u to the right and v down, 0 to 1; longitude 0 is u = 1/2, the north
 // pole v = 0.
 precision highp float;
@@ -16,7 +16,7 @@ const vec2 OFFSETS[4] =
     vec2[](vec2(-0.125, -0.375), vec2(0.375, -0.125), vec2(0.125, 0.375), vec2(-0.375, 0.125));
 
 uniform sampler2D uInput, uTruth, uPrediction;
-uniform sampler2D uClasses;   // a colour per class; alpha 0: hidden
+uniform sampler2D uClasses;   // a color per class; alpha 0: hidden
 uniform vec2 uCanvas;         // pixels
 uniform vec2 uCenter;         // u, v in the middle of the canvas
 uniform float uReach;         // tangent plane, stereographic plane or u at half the longer side
@@ -85,12 +85,12 @@ vec3 shown(vec3 photo, vec2 uv) {
   int index = byTruth ? truth : prediction;
   vec4 entry = texelFetch(uClasses, ivec2(index, 0), 0);
   bool visible = entry.a > 0.5;
-  float grey = dot(photo, vec3(0.299, 0.587, 0.114));
+  float gray = dot(photo, vec3(0.299, 0.587, 0.114));
   if (uLayer == OVERLAY) return visible && index > 0 ? mix(photo, entry.rgb, uOpacity) : photo;
-  if (!visible) return vec3(0.4 * grey);
+  if (!visible) return vec3(0.4 * gray);
   if (uLayer != ERROR) return entry.rgb;
   if (truth == 0) return UNLABELLED;
-  return truth == prediction ? vec3(0.75 + 0.25 * grey) : WRONG;
+  return truth == prediction ? vec3(0.75 + 0.25 * gray) : WRONG;
 }
 
 void main() {

@@ -99,13 +99,13 @@ def test_poses_of_a_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     # A panorama's pose in the files: x forward, y left, z up; cameras: x right, y down, z forward.
     panorama_from_camera = np.array([[0, 0, 1.0], [-1.0, 0, 0], [0, -1.0, 0]])
     true = [pose.world_from_camera @ panorama_from_camera.T for pose in poses.values()]
-    turned: list[NDArray[np.float64]] = [np.array(e["world_from_panorama"]) for e in entries]
+    rotations: list[NDArray[np.float64]] = [np.array(e["world_from_panorama"]) for e in entries]
     lengths = []
     for k in (1, 2):
-        assert np.linalg.det(turned[k]) == pytest.approx(1)
-        relative, expected = turned[0].T @ turned[k], true[0].T @ true[k]
+        assert np.linalg.det(rotations[k]) == pytest.approx(1)
+        relative, expected = rotations[0].T @ rotations[k], true[0].T @ true[k]
         assert rotation_angle_deg(relative, expected) < 0.5
-        shift = np.subtract(entries[k]["location"], entries[0]["location"]) @ turned[0]
+        shift = np.subtract(entries[k]["location"], entries[0]["location"]) @ rotations[0]
         first, other = (list(poses.values())[i].location for i in (0, k))
         expected_shift = (other - first) @ true[0]
         assert angle_deg(shift, expected_shift) < 0.5

@@ -22,8 +22,8 @@ class Faulty(nn.Module):
     """A small network without batch statistics that does something wrong in one forward pass.
 
     Args:
-        at: Which forward pass while training, from 0.
-        wrong: What happens to its scores then.
+        at: Number of the forward pass in training, from 0.
+        wrong: Function that changes the scores of that pass.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
 
 
 def small_data(root: Path, **settings: Any) -> Stanford2D3DS:
-    """Colours of panoramas of 32×64."""
+    """Colors of panoramas of 32×64."""
     representation = TangentRepresentation(base_level=0, level=4)
     return Stanford2D3DS(root, representation, inputs=["rgb"], panoramas_per_step=1, **settings)
 

@@ -1,4 +1,4 @@
-"""Workers of a loader that die or fail: what is said, and what to do."""
+"""Workers of a loader that die or fail: the message and its remedy."""
 
 from __future__ import annotations
 

@@ -27,7 +27,7 @@ DRAWN = """() => new Promise((done, failed) => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """The Chromium of the system, or a skip that says there is none."""
+    """Start the system's Chromium; skip the test without it."""
     program = next(filter(None, map(shutil.which, PROGRAMS)), None)
     if program is None:
         pytest.skip(f"no browser: none of {', '.join(PROGRAMS)} is on the path")
@@ -42,8 +42,8 @@ class OpenReport:
     """A report in the browser.
 
     Attributes:
-        page: Of the browser.
-        problems: Errors, warnings and requests since it was opened.
+        page: Page of the browser.
+        problems: Errors, warnings and requests since the report was opened.
     """
 
     page: Page
@@ -121,10 +121,10 @@ def opened(browser: Browser, path: Path) -> Iterator[OpenReport]:
     window.set_default_timeout(20_000)
     report = OpenReport(window.new_page())
 
-    def heard(message: ConsoleMessage) -> None:
+    def store_message(message: ConsoleMessage) -> None:
         report.problems.append(f"{message.type}: {message.text}")
 
-    report.page.on("console", heard)
+    report.page.on("console", store_message)
     report.page.on("pageerror", lambda error: report.problems.append(str(error)))
     report.page.on("request", lambda request: report.problems.append(request.url[:200]))
     report.page.goto(path.as_uri())

@@ -27,11 +27,11 @@ COLORS = class_colors(len(NAMES)).astype(np.int64)
 START_DEG, PLANET_DEG = 95.0, 250.0
 TOLERANCE = 6  # of 255: JPEG and interpolation
 EDGE = 8  # pixels at the rounded corners of the canvas
-WRONG, UNLABELLED = (214, 39, 40), (110, 110, 110)
+WRONG, UNLABELED = (214, 39, 40), (110, 110, 110)
 
 
 def colors_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A colour for every direction, smooth over the whole sphere, no two directions alike."""
+    """A color for every direction, smooth over the whole sphere, no two directions alike."""
     return 127.5 + 100 * directions
 
 
@@ -62,7 +62,7 @@ def photo() -> EncodedImage:
 
 
 def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
-    """All colours equal within the tolerance, but for a share of the pixels."""
+    """All colors equal within the tolerance, but for a share of the pixels."""
     assert shown.shape == expected.shape
     if shown.ndim == 3:
         shown, expected = (image[EDGE:-EDGE, EDGE:-EDGE] for image in (shown, expected))
@@ -87,7 +87,7 @@ def view_of(
     x = (np.arange(width) + 0.5 - width / 2) / half
     y = (height / 2 - np.arange(height) - 0.5) / half
     right, up = np.meshgrid(x, y)
-    radius, turn = np.hypot(right, up), np.arctan2(up, right)
+    radius, direction = np.hypot(right, up), np.arctan2(up, right)
     edge = np.radians(width_deg) / 2
     angle = (
         np.arctan(radius * np.tan(edge))
@@ -95,7 +95,8 @@ def view_of(
         else 2 * np.arctan(radius * np.tan(edge / 2))
     )
     local = np.stack(
-        [np.cos(angle), np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn)], axis=-1
+        [np.cos(angle), np.sin(angle) * np.cos(direction), np.sin(angle) * np.sin(direction)],
+        axis=-1,
     )
     lon, lat = np.radians(lon_deg), np.radians(lat_deg)
     tilt = np.array([[np.cos(lat), 0, -np.sin(lat)], [0, 1, 0], [np.sin(lat), 0, np.cos(lat)]])
@@ -144,8 +145,8 @@ def test_the_first_picture_is_the_overlay_ahead(report: OpenReport) -> None:
 
 def test_seam_and_poles_are_interpolated_like_the_rest(browser: Browser, tmp_path: Path) -> None:
     """Pixels of 15°: what is wrong with half a pixel at a border shows."""
-    grey = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)
-    image = encode_image("coarse", grey.repeat(3, axis=2), 1)
+    gray = np.random.default_rng(0).integers(0, 256, (12, 24, 1), np.uint8)
+    image = encode_image("coarse", gray.repeat(3, axis=2), 1)
     pixels: Any = cv2.imdecode(np.frombuffer(image.input, np.uint8), cv2.IMREAD_COLOR)
     write_report(tmp_path / "report.html", "t", images=[image], class_names=NAMES[:1])
     with opened(browser, tmp_path / "report.html") as report:
@@ -180,8 +181,8 @@ def test_the_little_planet_and_the_flat_map(report: OpenReport) -> None:
     close(fitted, expected)
 
 
-def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
-    report.drag(130, 40)  # several octants, errors and the unlabelled disc
+def test_layers_show_the_colors_of_their_classes(report: OpenReport) -> None:
+    report.drag(130, 40)  # several octants, errors and the unlabeled disc
     step = math.degrees(step_rad(report))
     longitude, latitude = -130 * step, 40 * step
     view = view_of(report, longitude, latitude, START_DEG)
@@ -190,9 +191,9 @@ def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
     assert len(np.unique(truth)) >= 4
     assert np.mean(truth == 0) > 0.02
     assert np.mean((prediction != truth) & (truth > 0)) > 0.02
-    grey = (photo @ [0.299, 0.587, 0.114])[..., None]
-    error = np.where((truth == prediction)[..., None], 191.25 + 0.25 * grey, WRONG)
-    error = np.where((truth == 0)[..., None], UNLABELLED, error)
+    gray = (photo @ [0.299, 0.587, 0.114])[..., None]
+    error = np.where((truth == prediction)[..., None], 191.25 + 0.25 * gray, WRONG)
+    error = np.where((truth == 0)[..., None], UNLABELED, error)
     expected = {
         "truth": COLORS[truth],
         "prediction": COLORS[prediction],
@@ -205,7 +206,7 @@ def test_layers_show_the_colours_of_their_classes(report: OpenReport) -> None:
         close(report.pixels(), colors, but=0.03)
     assert not report.page.locator(".errors").is_visible()
     report.layer("error")
-    assert report.text(".errors").split() == ["right", "wrong", "unlabelled"]
+    assert report.text(".errors").split() == ["right", "wrong", "unlabeled"]
 
 
 def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
