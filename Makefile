@@ -29,7 +29,7 @@ demo: install
 		echo "Going on with the interrupted demo …"; \
 		$(BIN)/tangent-train resume=$(DEMO) || { $(AGAIN); }; \
 	else \
-		echo "Rendering rooms, training and evaluating (5 to 14 minutes of CPU time) …"; \
+		echo "Rendering rooms, training and evaluating (4 to 14 minutes of CPU time) …"; \
 		$(BIN)/tangent-train experiment=rooms/demo hydra.run.dir=$(DEMO) || { $(AGAIN); }; \
 	fi
 
@@ -49,7 +49,8 @@ lint: install
 	$(BIN)/lint-imports
 
 docs: install
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --clean
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict --clean
+	@echo "The site is in site/: open site/index.html. With the search: $(BIN)/python -m http.server -d site"
 
 # NETWORK was written by tangent-import; repeated, both commands go on where they were interrupted.
 real: install

@@ -1,12 +1,12 @@
-"""Measure, compare with the baseline, or write it.
+"""Measure speed and memory, compare with the baseline, or write a new baseline.
 
-python -m benchmarks                        all that `make bench` measures
-python -m benchmarks images labels          some of it
+python -m benchmarks                        all benchmarks (make bench)
+python -m benchmarks images labels          some of them
 python -m benchmarks compare                measure, then compare with the baseline
-python -m benchmarks compare results.json   compare what was measured
-python -m benchmarks baseline results.json  make it the baseline, better of several runs
-python -m benchmarks gpu                    all that is measured on a GPU, see docs/results/gpu.md
-python -m benchmarks gpu render step        some of it
+python -m benchmarks compare results.json   compare an earlier run with the baseline
+python -m benchmarks baseline results.json  write the baseline, preferably from several runs
+python -m benchmarks gpu                    all benchmarks of a GPU, see docs/results/gpu.md
+python -m benchmarks gpu render step        some of them
 """
 
 from __future__ import annotations
@@ -30,27 +30,27 @@ from tangent_train.results.tables import Table as TextTable
 
 MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels")}
 MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
-"""Modules of the rows; each has a function of the same name."""
+"""Module of each benchmark; it has a function of the same name."""
 
 ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("render", "step", "predict", "fed")}
-"""Likewise, of ``gpu``."""
+"""Module of each benchmark of ``gpu``."""
 
 BASELINE = Path(__file__).with_name("baseline.json")
 _NOISE = 1.1
-"""The load of a machine may change a quotient that much."""
+"""Factor by which the load of a machine may change a quotient."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Do what the command line says.
+    """Run the command line.
 
     Args:
-        arguments: By default the process's.
+        arguments: Arguments of the command line, by default those of the process.
     """
     parser = argparse.ArgumentParser(
         "python -m benchmarks", None, __doc__, formatter_class=argparse.RawTextHelpFormatter
     )
     parser.add_argument("names", nargs="*", help=f"compare, baseline, or {', '.join(MEASURED)}")
-    parser.add_argument("--quick", action="store_true", help="small: the figures mean nothing")
+    parser.add_argument("--quick", action="store_true", help="toy sizes, to test the code")
     parser.add_argument("--output", type=Path, default=Path("runs/bench"), help="folder")
     options = parser.parse_args(arguments)
     command, names = "", options.names
@@ -70,15 +70,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
-    """Measure, print and write ``results.json``, whose path is returned.
+    """Measure, print and write ``results.json``.
 
-    Written after every table: what is stopped keeps what it has. What fails is listed, and the
-    others go on.
+    The file is written after each table, so an interrupted run keeps its results. Benchmarks that
+    fail are listed at the end; the others continue.
 
     Args:
-        modules: Of the rows, by name.
-        output: Folder.
-        quick: Toy size.
+        modules: Modules of the benchmarks, by name.
+        output: Folder of the file.
+        quick: True for toy sizes.
+
+    Returns:
+        Path of the file.
     """
     start = time.perf_counter()
     tables: list[Table] = []
@@ -108,25 +111,25 @@ def run(modules: Mapping[str, str], output: Path, *, quick: bool) -> Path:
 
 
 def show(table: Table) -> None:
-    """Print a table with its goals."""
+    """Print a table and its goals."""
     rows = []
     for row in table.rows:
         ratios = table.ratios(row.name)
         spread = f"{min(ratios):.3g} to {max(ratios):.3g}"
         quotient = f"{table.ratio(row.name):.3g}×"
         rows.append((row.name, f"{row.median:.4g} {table.unit}", quotient, spread))
-    TextTable(table.name, ("", "median", "of the first", "rounds"), rows).print()
+    TextTable(table.name, ("", "median", "of the first row", "rounds"), rows).print()
     for goal in table.goals:
         bound = f"at {'least' if goal.least else 'most'} {goal.bound:.3g}"
         print(f"{'met' if goal.met else 'MISSED'}: {goal.what} {goal.found:.3g} ({bound})")
 
 
 def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:
-    """This project's rows over the first of their table: median, least and most."""
+    """Return this project's rows divided by the first row of their table: median and range."""
     found = {}
     for table in tables:
         for row in table.rows[1:]:
-            if row.ours:
+            if row.is_ours:
                 values, name = table.ratios(row.name), f"{table.name}: {row.name}"
                 median = statistics.median(values)
                 found[name] = {"median": median, "low": min(values), "high": max(values)}
@@ -134,21 +137,22 @@ def quotients(tables: Sequence[Table]) -> dict[str, dict[str, float]]:
 
 
 def read(path: Path) -> dict[str, Any]:
-    """The content of a ``results.json`` of full size."""
+    """Read a ``results.json``; exit if it was written with ``--quick``."""
     content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
     if content["quick"]:
-        sys.exit(f"{path}: found a run with --quick; expected one of full size")
+        sys.exit(f"{path}: found a run with --quick; expected a run of full size")
     return content
 
 
 def compare(content: Mapping[str, Any]) -> None:
-    """Print how quotients changed; exit with 1 if something is slower beyond noise.
+    """Print the changes of quotients; exit with 1 if one is slower beyond noise.
 
-    That is, all its rounds are above all of the baseline's, and its median is a tenth above.
+    A quotient is slower if all its rounds are above all rounds of the baseline, and its median is
+    more than a tenth above the baseline's.
     """
     baseline = json.loads(BASELINE.read_text(encoding="utf-8"))
     if content["cores"] not in baseline["cores"]:
-        print(f"The baseline is of {baseline['cores']} cores, this of {content['cores']}.")
+        print(f"Cores of the baseline: {baseline['cores']}; of this run: {content['cores']}.")
     slower = 0
     for name, now in content["quotients"].items():
         then, verdict = baseline["quotients"].get(name), "same"
@@ -163,7 +167,7 @@ def compare(content: Mapping[str, Any]) -> None:
 
 
 def write_baseline(runs: Sequence[Mapping[str, Any]]) -> None:
-    """Write the median of several runs' medians, and the widest interval."""
+    """Write the median of several runs' medians, and their widest interval, as the baseline."""
     picked: dict[str, Any] = {"median": statistics.median_low, "low": min, "high": max}
     rows = {}
     for name in dict.fromkeys(name for one in runs for name in one["quotients"]):

@@ -1,4 +1,4 @@
-"""Rendering tangent images, compared with bare `cv2.remap` and another library."""
+"""Time rendering of tangent images, compared with bare `cv2.remap` and another library."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.measuring import Goal, Table, Way, measure
+from benchmarks.measuring import Alternative, Goal, Table, measure
 from tangent_train.geometry import (
     TangentGrid,
     equirect_directions,
@@ -20,17 +20,17 @@ from tangent_train.geometry import (
 )
 from tangent_train.rendering import equirect_to_tangent
 
-BARE = "bare cv2.remap, maps ready-made"
+BARE = "bare cv2.remap, maps precomputed"
 ALL = "equirect_to_tangent"
 SOME = "equirect_to_tangent, 4 images"
 LIBRARY = "pyequilib"
 
 _LARGE = 9
-"""From this level on the library renders a fifth of the images, which is multiplied."""
+"""From this level on the library renders a fifth of the images, and its time is multiplied by 5."""
 
 
 def images(quick: bool) -> Iterator[Table]:
-    """One for each level and dtype."""
+    """Yield a table for each level and dtype."""
     for dtype in (np.dtype(np.uint8), np.dtype(np.float32)):
         for level in (6,) if quick else (7, 8, 9, 10):
             yield _table(level, dtype, rounds=2 if quick else 11)
@@ -47,19 +47,19 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
 
     def bare() -> list[Any]:
         mode = {"interpolation": cv2.INTER_LINEAR, "borderMode": cv2.BORDER_WRAP}
-        return [cv2.remap(panorama, places, None, **mode) for places in maps]
+        return [cv2.remap(panorama, positions, None, **mode) for positions in maps]
 
     step = 5 if level >= _LARGE else 1
     faces, render = range(0, grid.num_images, step), _pyequilib(panorama, grid)
     _check_same_views(equirect_to_tangent(panorama, grid, faces), list(map(render, faces)))
     four = [3, 20, 41, 77]
-    ways = [
-        Way(BARE, bare),
-        Way(ALL, lambda: equirect_to_tangent(panorama, grid), ours=True),
-        Way(SOME, lambda: equirect_to_tangent(panorama, grid, four), ours=True),
-        Way(LIBRARY, lambda: list(map(render, faces)), scale=step, rounds=3),
+    alternatives = [
+        Alternative(BARE, bare),
+        Alternative(ALL, lambda: equirect_to_tangent(panorama, grid), is_ours=True),
+        Alternative(SOME, lambda: equirect_to_tangent(panorama, grid, four), is_ours=True),
+        Alternative(LIBRARY, lambda: list(map(render, faces)), scale=step, rounds=3),
     ]
-    table = Table(f"images: level {level}, {dtype}", measure(ways, rounds))
+    table = Table(f"images: level {level}, {dtype}", measure(alternatives, rounds))
     table.goals = [
         Goal("all images, of bare cv2.remap's time", table.ratio(ALL), 1.25),
         Goal("4 images, of the time of all 80", table.ratio(SOME, ALL), 1 / 12),
@@ -69,17 +69,16 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
 
 
 def _striped_panorama(shape: tuple[int, int]) -> NDArray[np.float32]:
-    """Waves of 16 pixels along all axes, RGB from 28 to 228: half a pixel off is seen."""
+    """Return waves of 16 pixels along all axes, RGB from 28 to 228, which reveal small shifts."""
     waves = np.sin(equirect_directions(shape) * (shape[1] / 16))
     return (128 + 100 * waves).astype(np.float32)
 
 
 def _pyequilib(panorama: NDArray[Any], grid: TangentGrid) -> Callable[[int], NDArray[Any]]:
-    """That library, made to render this project's tangent images.
+    """Return a function that renders this project's tangent images with pyequilib.
 
-    Its conventions, in ours (centres of pixels are integers, yaw to the right, pitch up): the
-    principal point is half the side, so one pixel less than ours is rendered; its panorama begins
-    one row and one column further, so it gets a rolled one.
+    Its conventions differ: the principal point is half the side, so its images are one pixel
+    smaller; its panorama starts one row and one column later, so it gets a rolled panorama.
     """
     from equilib import Equi2Pers
 
@@ -97,19 +96,19 @@ def _pyequilib(panorama: NDArray[Any], grid: TangentGrid) -> Callable[[int], NDA
     return render
 
 
-def _check_same_views(ours: NDArray[Any], theirs: Sequence[NDArray[Any]]) -> None:
+def _check_same_views(images: NDArray[Any], others: Sequence[NDArray[Any]]) -> None:
     """Refuse a comparison of different views.
 
     Args:
-        ours: ``(n, d, d, C)`` tangent images of a `_striped_panorama`.
-        theirs: The same, up to a pixel smaller.
+        images: ``(n, d, d, C)`` tangent images of a `_striped_panorama`.
+        others: The library's images, up to a pixel smaller.
 
     Raises:
-        RuntimeError: More than three pixels in a hundred differ by more than rounding; at the
-            seam and the poles the library does not join the panorama.
+        RuntimeError: More than 3 % of the pixels differ by more than rounding. (The library does
+            not interpolate across the seam and the poles.)
     """
-    for image, other in zip(ours, theirs, strict=True):
+    for image, other in zip(images, others, strict=True):
         height, width = other.shape[:2]
         difference = np.abs(image[:height, :width].astype(np.float64) - other).max(axis=-1)
         if min(height, width) < len(image) - 1 or np.mean(difference <= 4) < 0.97:
-            raise RuntimeError(f"{LIBRARY} renders other views; the comparison is void")
+            raise RuntimeError(f"{LIBRARY} renders other views, which cannot be compared")

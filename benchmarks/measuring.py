@@ -1,7 +1,7 @@
-"""Alternatives measured in turn.
+"""Measure alternatives in turn.
 
-All alternatives of a table run one after the other, round after round, so that background load
-affects all of them; the result is the ratio to the first alternative within each round. Absolute
+All alternatives of a table run one after the other in each round, so that background load affects
+all of them. The result is the ratio to the first alternative within each round, because absolute
 times do not transfer to another machine.
 """
 
@@ -22,49 +22,49 @@ from typing import NamedTuple
 import torch
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
-"""Of the measurements that are meant for a GPU."""
+"""Device of the GPU benchmarks."""
 
 FAILURES: list[str] = []
-"""What was attempted and failed, and why."""
+"""Failed benchmarks with their errors."""
 
 _SHORTEST_S = 0.02
 """Shorter calls are repeated until they take that long."""
 
 
-class Way(NamedTuple):
-    """One way to do it.
+class Alternative(NamedTuple):
+    """An implementation that is measured.
 
     Attributes:
-        name: For people.
-        run: Does it.
-        ours: Whether it is this project's.
-        scale: Factor for its time, if it does only a part of the work, or several times as much.
-        rounds: Most rounds, of ways that take long.
+        name: Name of the row.
+        run: Runs the implementation once.
+        is_ours: True for an implementation of this project.
+        scale: Factor for its time, if it does a part or a multiple of the work.
+        rounds: Largest number of rounds, for slow alternatives.
     """
 
     name: str
     run: Callable[[], object]
-    ours: bool = False
+    is_ours: bool = False
     scale: float = 1.0
     rounds: int = 1000
 
 
 @dataclass
 class Row:
-    """Measurements of one way, a value per round in the unit of the table."""
+    """Measurements of an alternative: a value for each round, in the unit of the table."""
 
     name: str
     values: list[float]
-    ours: bool = False
+    is_ours: bool = False
 
     @property
     def median(self) -> float:
-        """Of all rounds."""
+        """Median of all rounds."""
         return statistics.median(self.values)
 
 
 class Goal(NamedTuple):
-    """A promise: what was found should be at most the bound, or at least it."""
+    """A goal for a figure: at most the bound, or at least the bound if `least` is set."""
 
     what: str
     found: float
@@ -73,19 +73,19 @@ class Goal(NamedTuple):
 
     @property
     def met(self) -> bool:
-        """Whether the promise is kept."""
+        """True if the figure meets the bound."""
         return self.found >= self.bound if self.least else self.found <= self.bound
 
 
 @dataclass
 class Table:
-    """Rows that are compared with the first of them.
+    """Rows that are compared with the first row.
 
     Attributes:
-        name: Short and unique: the baseline knows it by this.
+        name: Short, unique name, used in the baseline.
         rows: Measurements.
-        unit: Such as ``s`` or ``MiB``.
-        goals: Its promises.
+        unit: Unit of the values, such as ``s`` or ``MiB``.
+        goals: Goals for figures of the table.
     """
 
     name: str
@@ -94,7 +94,7 @@ class Table:
     goals: list[Goal] = field(default_factory=list)
 
     def ratios(self, name: str, to: str | None = None) -> list[float]:
-        """A row over another, by default the first: round by round where there are as many."""
+        """Divide a row by another, by default the first; round by round if their numbers agree."""
         rows = {row.name: row for row in self.rows}
         row, other = rows[name], self.rows[0] if to is None else rows[to]
         if len(row.values) == len(other.values):
@@ -102,38 +102,38 @@ class Table:
         return [a / other.median for a in row.values]
 
     def ratio(self, name: str, to: str | None = None) -> float:
-        """The median of `ratios`."""
+        """Return the median of `ratios`."""
         return statistics.median(self.ratios(name, to))
 
 
-def measure(ways: Sequence[Way], rounds: int) -> list[Row]:
-    """Seconds of all alternatives, run in turn, every other round in the opposite order.
+def measure(alternatives: Sequence[Alternative], rounds: int) -> list[Row]:
+    """Measure the seconds of alternatives, in turn; every other round in the opposite order.
 
     Args:
-        ways: Each is run twice before, which compiles and fills caches.
-        rounds: Measurements of each.
+        alternatives: Each runs twice first, to compile code and fill caches.
+        rounds: Number of measurements of each.
     """
 
-    def seconds(way: Way, repeats: int) -> float:
+    def seconds(alternative: Alternative, repeats: int) -> float:
         start = time.perf_counter()
         for _ in range(repeats):
-            way.run()
+            alternative.run()
         if DEVICE.type == "cuda":
             torch.cuda.synchronize()
         return (time.perf_counter() - start) / repeats
 
-    warm = [min(seconds(way, 1), seconds(way, 1)) for way in ways]
+    warm = [min(seconds(alternative, 1), seconds(alternative, 1)) for alternative in alternatives]
     repeats = [math.ceil(_SHORTEST_S / max(taken, 1e-6)) for taken in warm]
-    rows = [Row(way.name, [], way.ours) for way in ways]
+    rows = [Row(alternative.name, [], alternative.is_ours) for alternative in alternatives]
     for number in range(rounds):
-        for k in range(len(ways))[:: -1 if number % 2 else 1]:
-            if number < ways[k].rounds:
-                rows[k].values.append(seconds(ways[k], repeats[k]) * ways[k].scale)
+        for k in range(len(alternatives))[:: -1 if number % 2 else 1]:
+            if number < alternatives[k].rounds:
+                rows[k].values.append(seconds(alternatives[k], repeats[k]) * alternatives[k].scale)
     return rows
 
 
 def peak_mib(call: Callable[[], object], device: torch.device = DEVICE) -> float:
-    """Memory of a device that a call adds at most, in MiB; of the CPU, of this process."""
+    """Return the peak memory in MiB that a call adds on a device; for the CPU, in this process."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats()
         before = torch.cuda.memory_allocated()
@@ -146,14 +146,14 @@ def peak_mib(call: Callable[[], object], device: torch.device = DEVICE) -> float
 
 
 def _memory_kib(name: str) -> int:
-    """A figure of this process: ``VmRSS`` is what it holds, ``VmHWM`` what it held at most."""
+    """Return this process's current memory (``VmRSS``) or peak memory (``VmHWM``) in KiB."""
     status = Path("/proc/self/status").read_text()
     return int(re.findall(rf"^{name}:\s+(\d+) kB$", status, re.MULTILINE)[0])
 
 
 @contextmanager
 def attempted(name: str) -> Iterator[None]:
-    """What fails in here is listed, and what comes after it goes on."""
+    """Record an error in `FAILURES` instead of raising it, and free memory."""
     try:
         yield
     except Exception as error:

@@ -1,6 +1,6 @@
-"""The training loader, a training step and an evaluation, compared with minimal code.
+"""Time the training loader, a training step and an evaluation, compared with minimal code.
 
-All read a few synthetic rooms in Stanford2D3DS's format.
+The data are a few synthetic rooms in the format of Stanford2D3DS.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from omegaconf import OmegaConf
 from torch import nn
 from torch.nn import functional
 
-from benchmarks.measuring import Goal, Row, Table, Way, measure
+from benchmarks.measuring import Alternative, Goal, Row, Table, measure
 from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
@@ -36,7 +36,7 @@ _WARM_UP = 3
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Nothing of Lightning is printed."""
+    """Silence Lightning."""
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")
@@ -44,7 +44,7 @@ def quiet() -> Iterator[None]:
 
 
 def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tuple[Any, Any]:
-    """Data and task of an experiment on a few rooms, the data ready."""
+    """Build data module and task of an experiment on a few rooms, and prepare the data."""
     counts = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), 0) | {"1": rooms, "5a": 1}
     settings = [f"data.rooms.rooms.area_{area}={number}" for area, number in counts.items()]
     settings += [f"data.rooms.height={rows}", "data.rooms.supersample=1", f"data.root={root}"]
@@ -60,26 +60,26 @@ def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tup
 
 
 def loader(quick: bool) -> Iterator[Table]:
-    """Samples of 4 of 80 RGB-D images from the prepared store, beside decoding PNGs; one worker."""
+    """Load samples of 4 of 80 RGB-D images from the prepared store and from PNGs, with 1 worker."""
     level = 6 if quick else 10
     settings = [f"level={level}", "representation=tangent", "representation.base_level=1"]
     settings += ["representation.faces_per_panorama=4", "data.panoramas_per_step=1"]
     settings += ["data.num_workers=1", "data.in_memory=false"]
     with tempfile.TemporaryDirectory() as root, quiet():
-        ways = []
+        alternatives = []
         stores = {"PNG files": "null", "prepared store": f"{root}/store"}
         for name, store in stores.items():
             overrides = ["experiment=rooms/standard", *settings, f"data.store={store}"]
             data, _ = built(overrides, f"{root}/rooms", 2 ** (level + 1))
             epochs = 1 if store == "null" or quick else 20
-            ways.append(_loading(name, data, epochs, ours=store != "null"))
-        table = Table("loader: time", measure(ways, 2 if quick else 5))
+            alternatives.append(_loading(name, data, epochs, is_ours=store != "null"))
+        table = Table("loader: time", measure(alternatives, 2 if quick else 5))
     faster = 1 / table.ratio("prepared store")
     table.goals = [Goal("as fast as from PNG files", faster, 20, True)]
     yield table
 
 
-def _loading(name: str, data: Any, epochs: int, *, ours: bool) -> Way:
+def _loading(name: str, data: Any, epochs: int, *, is_ours: bool) -> Alternative:
     batches, epoch = data.train_dataloader(), count()
 
     def load() -> None:
@@ -88,18 +88,20 @@ def _loading(name: str, data: Any, epochs: int, *, ours: bool) -> Way:
             for _batch in batches:
                 pass
 
-    return Way(name, load, ours, 1 / (epochs * len(batches)))
+    return Alternative(name, load, is_ours, 1 / (epochs * len(batches)))
 
 
 def step(quick: bool) -> Iterator[Table]:
-    """A training step of ``rooms/standard`` beside one of a bare loop, with the same images.
+    """Time training steps of ``rooms/standard`` and of a bare loop, with the same images.
 
-    After each step of the one the other takes one, with a copy of the network and a loader of its
-    own; they end with the same weights, or the comparison is void.
+    Both take steps in turn. The bare loop has a copy of the network and its own loader. Afterwards
+    both networks must have the same weights.
     """
     small = ["level=5", "network=unet_small"] if quick else []
     settings = ["data.panoramas_per_step=3", "task.class_weights=none", "optimizer=adam"]
-    settings += ["representation.random_rotation=none"]  # no table of the one is used by the other
+    settings += [
+        "representation.random_rotation=none"
+    ]  # with rotations, they would share cached tables
     overrides = ["experiment=rooms/standard", *settings, "scheduler=constant", *small]
     with tempfile.TemporaryDirectory() as root, quiet():
         data, task = built(overrides, f"{root}/rooms", 64 if quick else 256, rooms=24)
@@ -114,14 +116,14 @@ def step(quick: bool) -> Iterator[Table]:
         )
         trainer.fit(task, datamodule=data)
     clock.check_same(task.network)
-    bare, ours = clock.bare_s[_WARM_UP:], clock.ours_s[_WARM_UP:]
-    table = Table("step: time", [Row("bare loop", bare), Row(OURS, ours, ours=True)])
+    bare, lightning_s = clock.bare_s[_WARM_UP:], clock.lightning_s[_WARM_UP:]
+    table = Table("step: time", [Row("bare loop", bare), Row(OURS, lightning_s, is_ours=True)])
     table.goals = [Goal("overhead, percent", 100 * (table.ratio(OURS) - 1), 3)]
     yield table
 
 
 class _StepClock(Callback):
-    """Takes a step of PyTorch's tutorials after each one of a training, and both times."""
+    """Runs a step of a bare loop after each training step, and times both."""
 
     def __init__(self, data: Any, task: Any) -> None:
         self._data = data
@@ -131,7 +133,7 @@ class _StepClock(Callback):
         self._optimizer: Any = None
         self._start = 0.0
         self.bare_s: list[float] = []
-        self.ours_s: list[float] = []
+        self.lightning_s: list[float] = []
 
     def _all_batches(self) -> Iterator[Any]:
         batches = self._data.train_dataloader()
@@ -140,15 +142,15 @@ class _StepClock(Callback):
             yield from batches
 
     def on_train_start(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Begin with the same learning rate."""
+        """Copy the learning rate."""
         rate = trainer.optimizers[0].param_groups[0]["lr"]
         self._optimizer = torch.optim.Adam(self._network.parameters(), rate)
         self._start = time.perf_counter()
 
     def on_train_batch_end(self, *_: Any) -> None:
-        """Take the other step."""
+        """Run a step of the bare loop."""
         now = time.perf_counter()
-        self.ours_s.append(now - self._start)
+        self.lightning_s.append(now - self._start)
         batch = next(self._batches)
         images = self._data.normalized(batch).flatten(0, 1)
         labels = batch.labels.flatten(0, 1).long() - 1
@@ -157,29 +159,29 @@ class _StepClock(Callback):
         loss = functional.cross_entropy(scores, labels, ignore_index=-1)
         torch.autograd.backward(loss)
         self._optimizer.step()
-        loss.item()  # as whoever watches a training does
+        loss.item()  # as for a progress bar
         self._start = time.perf_counter()
         self.bare_s.append(self._start - now)
 
     def check_same(self, network: nn.Module) -> None:
-        """Refuse a comparison of two trainings that are not the same.
+        """Refuse the comparison if the two trainings differ.
 
         Raises:
-            RuntimeError: The weights of the network differ by more than rounding.
+            RuntimeError: The weights of the networks differ by more than rounding.
         """
-        bare, ours = (
+        bare, trained = (
             torch.cat([weights.detach().double().flatten() for weights in one.parameters()])
             for one in (self._network, network)
         )
-        if not (bare - ours).norm() <= 1e-3 * bare.norm():
-            raise RuntimeError("the two trainings end with other weights; the comparison is void")
+        if not (bare - trained).norm() <= 1e-3 * bare.norm():
+            raise RuntimeError("the two trainings end with different weights")
 
 
 def evaluation(quick: bool) -> Iterator[Table]:
-    """All of an evaluation but the network, beside FCN-ResNet50 on a CPU.
+    """Time an evaluation without its network, compared with FCN-ResNet50 on a CPU.
 
-    The network is timed on 16 of the 80 images; all else is an evaluation with a network that costs
-    next to nothing: reading, rendering, labels, confusion matrix.
+    The network is timed on 16 of the 80 images. The rest (reading, rendering, labels, confusion
+    matrix) is an evaluation with a network that takes almost no time.
     """
     level = 6 if quick else 10
     overrides = ["experiment=paper/semseg_s10_b1_rgb", f"level={level}", "data=synthrooms"]
@@ -197,11 +199,13 @@ def evaluation(quick: bool) -> Iterator[Table]:
             with torch.inference_mode():
                 network(images)
 
-        ways = [
-            Way("the network", infer, scale=grid.num_images / 16),
-            Way("all else", lambda: trainer.test(task, data, verbose=False), True, 1 / panoramas),
+        alternatives = [
+            Alternative("the network", infer, scale=grid.num_images / 16),
+            Alternative(
+                "all else", lambda: trainer.test(task, data, verbose=False), True, 1 / panoramas
+            ),
         ]
-        table = Table("evaluation: time", measure(ways, 2 if quick else 3))
+        table = Table("evaluation: time", measure(alternatives, 2 if quick else 3))
     share = table.ratio("all else")
     table.goals = [Goal("outside the network, percent", 100 * share / (1 + share), 10)]
     yield table

@@ -1,7 +1,7 @@
 """Data sets as Lightning data modules, a folder each.
 
-`core` is what they share (the data modules of panoramas and of photos, samples, transforms, the
-prepared store, checks), `images` reads and writes image files.
+`core` holds the common parts (data modules of panoramas and photos, samples, transforms, the
+prepared store, checks); `images` reads and writes image files.
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
-    from datamodules.folder.labelled import FolderPanoramas as FolderPanoramas
-    from datamodules.folder.labelled import FolderPhotos as FolderPhotos
+    from datamodules.folder.labeled import FolderPanoramas as FolderPanoramas
+    from datamodules.folder.labeled import FolderPhotos as FolderPhotos
     from datamodules.modelnet40.datamodule import ModelNet40 as ModelNet40
     from datamodules.stanford2d3ds.pairs import StanfordPairs as StanfordPairs
     from datamodules.stanford2d3ds.panoramas import Stanford2D3DS as Stanford2D3DS
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _CLASSES = {
     "core.panorama_pairs": ("ImagePairs",),
-    "folder.labelled": ("FolderPanoramas", "FolderPhotos"),
+    "folder.labeled": ("FolderPanoramas", "FolderPhotos"),
     "modelnet40.datamodule": ("ModelNet40",),
     "stanford2d3ds.pairs": ("StanfordPairs",),
     "stanford2d3ds.panoramas": ("Stanford2D3DS", "Stanford2D3DSPerspective"),
@@ -59,7 +59,7 @@ def __dir__() -> list[str]:
 
 
 def __getattr__(name: str) -> Any:
-    # On demand: the processes that make rooms need neither torch nor lightning.
+    # On demand: the processes that generate rooms need neither torch nor lightning.
     if name in _MODULES:
         return getattr(import_module(_MODULES[name]), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -15,18 +15,18 @@ from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
 _TRIALS = list(product(("meta", "cpu"), (256, 224)))
-"""Devices and sides of the empty images: some networks depend on values, some fix their input."""
+"""Devices and sides of empty images to try: networks may depend on values, or have a fixed size."""
 
 _LISTED_DEPTH = 2
 
 
 def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
-    """Return channels C' of the features ``(B, C', h', w')`` that a submodule returns.
+    """Return the number of channels C' of the features ``(B, C', h', w')`` of a submodule.
 
     A copy of the network is run on an empty image, on torch's meta device where possible.
 
     Args:
-        network: Maps images ``(B, C, h, w)`` to anything.
+        network: Network of images ``(B, C, h, w)``.
         stage: Name of a submodule that is run once per image.
         in_channels: Channels C of the images.
 
@@ -62,10 +62,10 @@ def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
 
 @registered
 class AuxiliaryHead(nn.Module):
-    """Scores at an encoder stage beside those of the network, in training only.
+    """Adds scores at an encoder stage to those of the network, in training only.
 
-    A 1×1 convolution on the features of the stage. It trains deep layers that a network with
-    skip connections otherwise learns to use only late; evaluation and export are not affected.
+    A 1×1 convolution on the features of the stage. It trains deep layers, which a
+    network with skip connections otherwise starts to use late. Evaluation and export do not change.
 
     Args:
         network: Any module ``(B, C, h, w) -> scores``, a tensor or a mapping with one under
@@ -86,7 +86,7 @@ class AuxiliaryHead(nn.Module):
                 "network.network",
                 found=type(network).__name__,
                 expected="a network that takes nothing but images",
-                remedy="Put the auxiliary head inside: SphereContext of AuxiliaryHead.",
+                remedy="Put the auxiliary head inside: a SphereContext of an AuxiliaryHead.",
             )
         self.network = network
         self.auxiliary_head = nn.Conv2d(stage_channels(network, stage, in_channels), num_classes, 1)

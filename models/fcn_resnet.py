@@ -43,7 +43,7 @@ class FCNResNet(nn.Module):
             keeps the statistics of `weights`, and dropout is off.
 
     Raises:
-        SettingError: Another depth, fewer than three channels, or unknown `weights`.
+        SettingError: Other depth, fewer than three channels, or unknown `weights`.
         DataError: The weights cannot be downloaded or read, or do not fit.
     """
 
@@ -87,7 +87,7 @@ class FCNResNet(nn.Module):
 
 
 def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
-    """Return the tensors that `weights` names, under the names of the FCN."""
+    """Return the tensors named by `weights`, under their names in the FCN."""
     if weights in _PUBLISHED:
         tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
     elif Path(weights).is_file():
@@ -96,6 +96,6 @@ def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
         raise SettingError(
             "network.weights", found=weights, expected="null, coco, imagenet or an existing file"
         )
-    if "conv1.weight" in tensors:  # a ResNet classifier
+    if "conv1.weight" in tensors:  # state dict of a ResNet classifier
         tensors = {f"backbone.{name}": tensor for name, tensor in tensors.items()}
     return {name: t for name, t in tensors.items() if not name.startswith(_DROPPED)}

@@ -23,14 +23,14 @@ def _convolution(in_channels: int, out_channels: int, size: int) -> list[nn.Modu
 
 
 def _encoder(in_channels: int, out_channels: int) -> nn.Sequential:
-    """Make two convolutions; pooling follows where the skip connection branches off."""
+    """Return two convolutions; pooling follows after the skip connection branches off."""
     return nn.Sequential(
         *_convolution(in_channels, out_channels, 3), *_convolution(out_channels, out_channels, 3)
     )
 
 
 def _decoder(in_channels: int, neck: int, out_channels: int) -> nn.Sequential:
-    """Make two convolutions, twice the resolution, a 1×1 convolution."""
+    """Return two convolutions, an upsampling by 2, and a 1×1 convolution."""
     return nn.Sequential(
         *_convolution(in_channels, neck, 3),
         *_convolution(neck, neck, 3),

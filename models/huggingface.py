@@ -1,4 +1,4 @@
-"""Segmentation networks of transformers, made from plain settings."""
+"""Segmentation networks from transformers, built from plain settings."""
 
 from __future__ import annotations
 
@@ -21,23 +21,23 @@ _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
 _Section = Mapping[str, _Values | Mapping[str, _Values]]
 
 _MASK2FORMER = (384, 384)
-"""Rows and columns of Mask2Former's masks before they are added, for images of any size
+"""Rows and columns to which Mask2Former's masks are resized before they are added
 (``Mask2FormerImageProcessor.post_process_semantic_segmentation``)."""
 
 
 def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
     """Return the settings of transformers that describe a network and networks inside it.
 
-    These are the arguments that the class of the settings declares. Nothing else gets through, such
-    as code of a model's author, kernels, quantizers, other names for settings (``attribute_map``),
-    labels, or backbones on the hub. Backbones of timm are made by name without their weights.
+    Only arguments declared by the class of the settings are kept. Code of a model's author,
+    kernels, quantizers, alternative names (``attribute_map``), labels and backbones on the hub are
+    dropped. Backbones from timm are built by name without weights.
 
     Args:
         config: Content of a ``config.json``, or ``PreTrainedConfig.to_dict``.
-        kind: Class of the settings; None or `AutoConfig` for that of its ``model_type``.
+        kind: Class of the settings; None or `AutoConfig` to choose it by ``model_type``.
 
     Raises:
-        SettingError: There is no such class, or transformers is missing.
+        SettingError: transformers lacks the class, or is missing.
     """
     with of_extra("huggingface", "network"):
         import transformers
@@ -48,7 +48,7 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
             found, expected = name or "none", "a kind of network that transformers has"
             raise SettingError("network.config.model_type", found=found, expected=expected)
         kind = transformers.CONFIG_MAPPING[name]
-    # Those of every network are about labels, results, and how a file was written.
+    # Settings that all networks share are about labels, results, and how a file was written.
     of_all = signature(transformers.PreTrainedConfig).parameters.keys()
     declared = signature(kind).parameters.keys() - of_all
     names = {name.removeprefix("_") for name in declared}
@@ -76,21 +76,21 @@ def _patch_size(config: Any) -> int:
 
 @registered
 class HuggingFaceNetwork(nn.Module):
-    """Any network of transformers for semantic or universal segmentation, with random weights.
+    """Network from transformers for semantic or universal segmentation, with random weights.
 
     Args:
         config: `architecture` of the network, with ``model_type``.
-        num_classes: Scores K of a pixel.
-        bgr: True if the network takes images with blue first, e.g. MobileViT.
-        task: Tokens of "the task is semantic", which OneFormer takes besides images.
+        num_classes: Number of scores K of a pixel.
+        bgr: True if the network takes BGR images, e.g. MobileViT.
+        task: Tokens of "the task is semantic", an additional input of OneFormer.
 
     Attributes:
-        network: The network as transformers makes it.
-        is_universal: True if it gives masks with classes.
+        network: The network of transformers.
+        is_universal: True if the network returns masks with classes.
 
     Raises:
-        SettingError: There is no such network, `config` holds more than its `architecture`, or
-            transformers is missing.
+        SettingError: transformers lacks the network or is missing, or `config` holds more than its
+            `architecture`.
     """
 
     def __init__(
@@ -138,11 +138,11 @@ class HuggingFaceNetwork(nn.Module):
     ) -> Float[Tensor, "batch classes height width"]:
         """Return scores of every pixel of the images.
 
-        Of networks for universal segmentation, which give masks with classes, their logarithms: the
-        softmax of these is again the share of every class, and sums of classes are those of shares.
+        Networks for universal segmentation return masks with classes. Scores are the logarithms of
+        the share of each class, so that a softmax returns shares, also for sums of classes.
 
         Raises:
-            SettingError: The images are not divisible into the network's patches.
+            SettingError: The images cannot be divided into the network's patches.
         """
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)

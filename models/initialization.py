@@ -21,7 +21,7 @@ class Origins(NamedTuple):
         adapted: Changes of the tensors that were adapted, by name.
         fresh: Reasons why tensors kept their values, by name.
         unused: Names in the file that the network does not have.
-        share: Fraction of the network's numbers that are from the file.
+        share: Fraction of the network's parameters that come from the file.
     """
 
     loaded: tuple[str, ...]
@@ -53,22 +53,21 @@ def initialize(
 ) -> Origins:
     """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
 
-    Names are matched by `tensors_for`, also if one of the two networks is wrapped in another module
-    (`SphereContext`, `AuxiliaryHead`). Filters of the first convolution for input channels that are
-    not in the file start at zero (paper, supplement, "Level 10
-    parameters"), so RGB-D begins as RGB. Other tensors of another shape stay as they are: the last
-    layer, for another number of classes.
+    Names are matched by `tensors_for`, even if one of the networks is wrapped in another module
+    (`SphereContext`, `AuxiliaryHead`). Filters of the first convolution for input channels that the
+    file lacks start at zero (paper, supplement, "Level 10 parameters"), so RGB-D starts as RGB.
+    Other tensors with another shape keep their values, e.g. the last layer for other classes.
 
     Args:
-        network: Changed in place.
-        path: The file; only tensors and plain values are read.
+        network: Network, changed in place.
+        path: File; only tensors and plain values are read.
         channels: Names of the input channels of the file's network and of this network, by which
             filters of the first convolution are matched; by default by position.
-        of_other_classes: Names of tensors to leave as they are although they have the shape of
-            those in the file: their scores are of other classes.
+        of_other_classes: Names of tensors that keep their values although they have the shape of
+            those in the file, because their scores belong to other classes.
 
     Raises:
-        DataError: The file cannot be read, or nothing in it fits.
+        DataError: The file cannot be read, or none of its tensors fits.
     """
     path = Path(path)
     current = network.state_dict()

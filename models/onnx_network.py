@@ -20,27 +20,27 @@ _LABEL_MAP = 3
 """Dimensions of label maps."""
 
 _ERRORS_ONLY = 3
-"""The log level of onnxruntime: its warnings are about speed."""
+"""Log level of onnxruntime, whose warnings are about speed."""
 
 
 class OnnxNetwork(nn.Module):
     """Runs an ONNX file with onnxruntime, on as many threads as torch uses.
 
-    Its CUDA provider is used where torch and onnxruntime have CUDA (package onnxruntime-gpu); the
-    scores are on the device of the images in any case. It has no parameters and no gradients.
+    Its CUDA provider is used if torch and onnxruntime have CUDA (package onnxruntime-gpu). Scores
+    are on the device of the images. The network has no parameters and no gradients.
 
     Args:
-        path: The file; one input ``(B, C, h, w)`` or ``(B, h, w, 3)``, float32 or float16, and one
-            output: scores, channels first or last, or label maps, of any resolution.
+        path: ONNX file with one input ``(B, C, h, w)`` or ``(B, h, w, 3)``, float32 or float16,
+            and one output: scores (channels first or last) or label maps, of any resolution.
 
     Attributes:
-        path: The file.
+        path: ONNX file.
         metadata: Metadata of the file, text by key.
-        checksum: Checksum of its tensors.
-        image_size: The only rows and columns it takes; None where it takes others.
+        checksum: Checksum of the tensors.
+        image_size: Fixed rows and columns of images; None for a side of any length.
 
     Raises:
-        DataError: There is no such file, it is not a network of this kind, or it needs other files.
+        DataError: The file is missing, has other inputs or outputs, or needs other files.
         SettingError: onnxruntime is missing.
     """
 
@@ -55,18 +55,18 @@ class OnnxNetwork(nn.Module):
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
         options.log_severity_level = _ERRORS_ONLY
-        # Threads that wait for work by spinning take the cores from what is done with the scores.
+        # Spinning threads would take the cores from the work on the scores.
         options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         usable = ["CPUExecutionProvider", *["CUDAExecutionProvider"] * torch.cuda.is_available()]
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]
         try:
-            # Both read the file alike, whatever its name and its first bytes are.
+            # Both read the file equally, regardless of its name and first bytes.
             graph = onnx.load(path, format="protobuf", load_external_data=False)
             options.add_session_config_entry("session.load_model_format", "ONNX")
             self.checksum = graph_checksum(graph)
             if not any(tensor.data_location for tensor in _tensors(graph)):
                 self._session = onnxruntime.InferenceSession(path, options, providers=providers)
-        except Exception as error:  # whatever the parser of protocol buffers raises
+        except Exception as error:  # the parser of protocol buffers raises many kinds of errors
             found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
             raise DataError(path, found=found, expected="an ONNX file") from error
         if not hasattr(self, "_session"):
@@ -98,7 +98,7 @@ class OnnxNetwork(nn.Module):
         """Return scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
 
         Raises:
-            SettingError: The file was made for images of another shape, or gives something else.
+            SettingError: The file takes images of another shape, or returns another output.
         """
         array = images.movedim(1, -1) if self._channels_last else images
         array = array.detach().to("cpu", _TYPES[self._input.type])
@@ -119,7 +119,7 @@ class OnnxNetwork(nn.Module):
                 f"images for {self.path.name}",
                 found="×".join(map(str, images.shape)),
                 expected="×".join(map(str, self._input.shape)),
-                remedy=f"onnxruntime says: {str(error).partition(chr(10))[0]}",
+                remedy=f"Message of onnxruntime: {str(error).partition(chr(10))[0]}",
             ) from error
         size = (images.shape[2], images.shape[3])
         count = len(whole) - missing
@@ -127,7 +127,7 @@ class OnnxNetwork(nn.Module):
         if self._batch == 1 and (
             output.ndim == _LABEL_MAP - 1 or (output.ndim == _LABEL_MAP and len(output) != 1)
         ):
-            output = output[None]  # the file has no axis of images
+            output = output[None]  # the file has no batch axis
         fits = output.ndim > 0 and len(output) == len(whole)
         scores = _channels_first(output[:count], size, self._channels_last) if fits else None
         if scores is None:
@@ -146,19 +146,19 @@ class OnnxNetwork(nn.Module):
 
 
 def graph_checksum(graph: Any) -> str:
-    """Return the CRC-32 of all tensors in an ONNX graph, in their order."""
+    """Return the CRC-32 of all tensors in an ONNX graph, in order."""
     return crc32_of(tensor.SerializeToString(deterministic=True) for tensor in _tensors(graph))
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:
     """Return an output as ``(B, K, h, w)``, maps with K = 1; None for other shapes.
 
-    The axis of the classes is the one without which rows and columns have one stride.
+    The axis of the classes is found by the others: rows and columns have the same stride.
 
     Args:
-        returned: By the network.
+        returned: Output of the network.
         size: Rows and columns of the images.
-        last: True if the channels of the images are last; decides if both axes are possible.
+        last: True if the channels of the images are last; used if both axes are possible.
     """
     if returned.ndim == _LABEL_MAP:
         returned = returned[:, None]
@@ -173,7 +173,7 @@ def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tens
 
 
 def _tensors(message: Any) -> Iterator[Any]:
-    """Return all tensors in a message and in those inside it."""
+    """Return all tensors in a message, including nested messages."""
     for field, value in message.ListFields():
         if field.message_type is not None:
             for inner in value if hasattr(value, "__len__") else [value]:

@@ -18,26 +18,26 @@ from tangent_train.errors import DataError
 from tangent_train.files import load_plain
 
 _PREFIX = "network."
-"""Begins the names of the network's tensors in a checkpoint of this package."""
+"""Prefix of the network's tensors in checkpoints of this package."""
 
 _DEEPEST = 8
-"""Mappings inside each other that are searched in a file."""
+"""Depth to which nested mappings in a file are searched."""
 
 _COUNTER = "num_batches_tracked"
-"""A buffer of batch normalization that older files lack and nothing here uses."""
+"""Buffer of batch normalization that older files lack and this package does not use."""
 
 
 def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
-    """Return the tensors of a file by the names that a network has for them.
+    """Return the tensors of a file under the names that a network has for them.
 
-    They are the tensors of the mapping in the file (``state_dict``, ``model``, or all of it) and of
-    the prefix in it (``module.``, ``_orig_mod.``, ``model.net.``, …) with the most fitting names;
-    of several, those in ``state_dict``. Names are compared without ``network.``, and without the
-    commonest prefix of the network's names.
+    The mapping (``state_dict``, ``model``, or the whole file) and prefix (``module.``,
+    ``_orig_mod.``, ``model.net.``, …) with the most fitting names are used; of several equally good
+    ones, ``state_dict``. Names are compared without ``network.`` and without the most common prefix
+    of the network's names.
 
     Args:
-        network: The network.
-        path: See `read_tensors`.
+        network: Network that the tensors are for.
+        path: File, see `read_tensors`.
 
     Raises:
         DataError: The file cannot be read, or several mappings or prefixes (``student.``,
@@ -81,17 +81,17 @@ def _equal(one: Tensor | None, other: Tensor | None) -> bool:
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
-    """Read the mappings with tensors in a file, by place, e.g. ``state_dict``; the whole is "".
+    """Read the mappings with tensors in a file, by key, e.g. ``state_dict``; "" is the file.
 
-    Names of tensors in mappings inside them are joined by dots. Those of ``state_dict`` are the
-    ones under ``network.`` if there are any, as in checkpoints of this package.
+    Names in nested mappings are joined by dots. If ``state_dict`` has tensors under ``network.``,
+    as in checkpoints of this package, only these are returned.
 
     Args:
-        path: A file of `torch.save`, of which only tensors and plain values are unpickled, or a
+        path: File from `torch.save`, from which only tensors and plain values are unpickled, or a
             ``.safetensors`` file.
 
     Raises:
-        DataError: There is no such file, or it holds something else.
+        DataError: The file is missing, or has another content.
     """
     expected = "a state dict of tensors, or a checkpoint with one"
     if path.suffix == ".safetensors":
@@ -106,14 +106,14 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
     if not mappings:
         raise DataError(path, found="no named tensors", expected=expected)
     whole = mappings.get("state_dict", {})
-    ours = {name: tensor for name, tensor in whole.items() if name.startswith(_PREFIX)}
-    return mappings | ({"state_dict": ours} if ours else {})
+    prefixed = {name: tensor for name, tensor in whole.items() if name.startswith(_PREFIX)}
+    return mappings | ({"state_dict": prefixed} if prefixed else {})
 
 
 def _mappings(
     content: Mapping[Any, Any], seen: set[int], depth: int = 0
 ) -> dict[str, dict[str, Tensor]]:
-    """Return the mappings with tensors in a mapping, each once, itself as ""."""
+    """Return the mappings with tensors in a mapping, without duplicates; "" is itself."""
     seen.add(id(content))
     tensors: dict[str, Tensor] = {}
     inside: dict[str, dict[str, Tensor]] = {}
@@ -130,12 +130,12 @@ def _mappings(
 
 
 def _inner(name: str) -> str:
-    """Return a name without the attributes by which modules of this package hold a network."""
+    """Return a name without the attributes of this package's wrapper modules."""
     return ".".join(part for part in name.split(".") if part != "network")
 
 
 def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> list[tuple[str, int]]:
-    """Return prefixes before these ends with their numbers of names, the commonest first."""
+    """Return the prefixes of names with these ends and their counts, most common first."""
     counts: Counter[str] = Counter()
     for name in names:
         parts = name.split(".")
@@ -146,10 +146,10 @@ def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> list[tuple[st
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
-    """Return tensors that torchvision publishes, from the local cache or the internet.
+    """Return tensors published by torchvision, from the local cache or the internet.
 
     Raises:
-        DataError: They are not in the cache and cannot be fetched.
+        DataError: The tensors are not in the cache and cannot be fetched.
     """
     try:
         tensors = weights.get_state_dict(
@@ -169,13 +169,13 @@ def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
 def load_tensors(
     network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str | None = None
 ) -> None:
-    """Load a network's tensors; every one must be there and fit.
+    """Load all tensors of a network; a missing or unfitting tensor is an error.
 
     Args:
-        network: The network, changed in place.
-        tensors: Names and values.
-        source: Source of the tensors, for the message.
-        fresh: Prefix of the names of tensors that are not loaded; None where all are.
+        network: Network, changed in place.
+        tensors: Tensors by name.
+        source: Source of the tensors, for error messages.
+        fresh: Prefix of the names of tensors that are not loaded; None to load all.
 
     Raises:
         DataError: Tensors are missing, unexpected or of another shape.

@@ -26,7 +26,7 @@ class ShapeClassifier(nn.Module):
 
     Args:
         in_channels: Channels of an image.
-        num_classes: Classes.
+        num_classes: Number of classes.
         width: Channels after the first convolution.
         dropout: Dropout rate before the linear layer.
 

@@ -13,10 +13,10 @@ from tangent_train.errors import SettingError
 from tangent_train.registry import registered
 
 _KAPPAS = (0.1, 30.0)
-"""Initial concentrations: from heads that see the whole sphere to ones that see about 15°."""
+"""Initial concentrations, from heads that see the whole sphere to heads that see about 15°."""
 
 _ALIGNMENT = 8
-"""Memory-efficient kernels need head sizes that are multiples of this."""
+"""Memory-efficient kernels need head sizes that are multiples of this number."""
 
 
 @registered
@@ -24,19 +24,18 @@ class SphereAttention(nn.Module):
     """Multi-head attention between the tokens of all images of a sphere, for `SphereContext`.
 
     κ (dᵢ·dⱼ − 1) is added to the logits of a head, with the directions d of the two tokens and a
-    learned concentration κ per head. Directions enter in no other way: the result is invariant to
-    rotations of the sphere, and any subset of its images will do.
+    learned concentration κ per head. Directions are not used otherwise, so the result is
+    invariant to rotations of the sphere, and works with any subset of its images.
 
-    A token receives what it sees on the sphere minus what it would see in its own image: the
-    attention that other images get, times how their mean differs from that of its own. An image
-    alone, such as a photo, receives nothing and yields no gradient. The output layer starts at zero
-    and is trained only where a sphere has several images, so a network trained on photos computes
-    the same with it and without.
+    A token receives its attention over the sphere minus its attention over its own image. So a
+    single image, such as a photo, passes through unchanged and yields no gradient. The output layer
+    starts at zero and is trained only with several images of a sphere, so a network trained on
+    photos returns the same with and without this module.
 
     Args:
         channels: Channels C of the tokens.
-        heads: Attention heads.
-        width: Channels of queries, keys and values, of all heads together.
+        heads: Number of attention heads.
+        width: Channels of queries, keys and values, summed over the heads.
 
     Raises:
         SettingError: `width` is not a positive multiple of `heads`.
@@ -68,7 +67,7 @@ class SphereAttention(nn.Module):
         tokens: Float[Tensor, "spheres images channels rows columns"],
         directions: Float[Tensor, "spheres images 3 rows columns"],
     ) -> Float[Tensor, "spheres images channels rows columns"]:
-        """Return the residual to be added to every token.
+        """Return the residual for every token.
 
         Args:
             tokens: Features of the images of each sphere.
@@ -104,8 +103,8 @@ def angular_attention(
 ) -> Float[Tensor, "spheres heads tokens size"]:
     """Attend with logits ``q·k / √size + κ (dᵢ·dⱼ − 1)``, in single precision or better.
 
-    The −1 is common to all keys, and κ dᵢ·dⱼ is a dot product too: three more numbers in queries
-    and keys suffice, and no kernel has to hold tokens × tokens of memory.
+    The −1 is common to all keys, and κ dᵢ·dⱼ is also a dot product. So three more numbers in
+    queries and keys suffice, and no kernel needs tokens × tokens of memory.
 
     Args:
         queries: Queries of every head.
@@ -115,7 +114,7 @@ def angular_attention(
         kappa: Concentration of every head.
 
     Returns:
-        Weighted means of the values, in that precision: their differences stay exact.
+        Weighted means of the values, in that precision so that their differences are accurate.
     """
     with torch.autocast(queries.device.type, enabled=False):
         size, exact = queries.shape[-1], torch.promote_types(queries.dtype, torch.float32)
@@ -124,7 +123,7 @@ def angular_attention(
             [queries.to(exact) * size**-0.5, kappa.to(exact)[:, None, None] * directions], -1
         )
         key = torch.cat([keys.to(exact), directions], -1)
-        # Memory-efficient kernels want one size for all three.
+        # Memory-efficient kernels need one size for all three.
         further = -(size + 3) % _ALIGNMENT
         query, key = (functional.pad(part, (0, further)) for part in (query, key))
         value = functional.pad(values.to(exact), (0, further + 3))

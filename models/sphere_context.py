@@ -19,31 +19,30 @@ from tangent_train.registry import registered
 
 
 class _ReachedError(Exception):
-    """Ends a run of the network at the stage, whose features it carries."""
+    """Ends a forward pass of the network at the stage; carries the features."""
 
 
 @registered
 class SphereContext(nn.Module):
-    """Lets the images of a sphere exchange features inside a network for single images.
+    """Lets the images of a sphere exchange features inside a network of single images.
 
     A tangent image sees only its field of view (paper, supplement, "Limitations"). Here the
     features F at a stage become F + upsample(mixer(pool(F))): a few tokens per image are mixed with
-    those of all images of the sphere, by the directions they look along. Mixers start at zero, so
-    that adding one to a trained network does not change its result at first. Any subset
-    of the images of a sphere will do.
+    those of all images of the sphere, by viewing direction. Mixers start at zero, so that a trained
+    network returns the same at first. Any subset of the images of a sphere can be used.
 
     Args:
         network: Any module ``(B, C, h, w) -> scores``, a tensor or a mapping of tensors.
         stage: Name of a submodule, whose result is features ``(B, C', h', w')``: ``downs.3`` of a
             UNet, ``backbone.layer4`` of an FCN-ResNet.
-        mixer: Makes the mixer from ``channels=C'``: a module that maps tokens ``(S, n, C', t, t)``
-            and directions ``(S, n, 3, t, t)`` of n images on each of S spheres to what is added to
-            the tokens. `SphereAttention` or another.
+        mixer: Function that creates the mixer from ``channels=C'``, e.g. `SphereAttention`. A mixer
+            is a module that maps tokens ``(S, n, C', t, t)`` and directions ``(S, n, 3, t, t)`` of
+            n images on each of S spheres to the residual of the tokens.
         in_channels: Channels C of the images.
         tokens: Maximum rows and columns of tokens per image.
 
     Raises:
-        SettingError: No token, or no such stage (the message lists the stages).
+        SettingError: `tokens` is 0, or the stage is unknown (the message lists the stages).
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class SphereContext(nn.Module):
         self.mixer = mixer(channels=stage_channels(network, stage, in_channels))
         self.tokens = tokens
         self._at_stage: Callable[[Tensor], Tensor] | None = None
-        # First, so that an auxiliary head at the same stage sees features with their context.
+        # First, so that an auxiliary head at the same stage gets features with context.
         network.get_submodule(stage).register_forward_hook(self._on_features, prepend=True)
 
     def forward(
@@ -72,18 +71,18 @@ class SphereContext(nn.Module):
         """Return the network's result for images with context.
 
         Args:
-            images: Sphere by sphere, the same number of each.
-            rays: For every image the matrix that maps image coordinates (x, y, 1) to directions on
-                the sphere, of any length; x runs from −1 at the left edge of the image to 1 at the
-                right, y from −1 at the top to 1 at the bottom. For a mirrored image the first
-                column is negated. None for images without context, as photos.
-            images_per_chunk: Bounds memory: at most so many images are in the network at once, with
-                the same context and the same gradients. Each chunk is run up to the stage and then
-                as a whole, and both again in the backward pass: about twice the time. Batch
+            images: Images sphere by sphere, equally many of each.
+            rays: Matrix of each image that maps image coordinates (x, y, 1) to directions on the
+                sphere, of any length; x goes from −1 at the left edge to 1 at the right edge, y
+                from −1 at the top to 1 at the bottom. The first column of a mirrored image is
+                negated. None for images without context, e.g. photos.
+            images_per_chunk: Maximum number of images in the network at once, to limit memory; the
+                context and the gradients are the same. Each chunk runs up to the stage, then as a
+                whole, and both again in the backward pass, which takes about twice the time. Batch
                 normalization sees one chunk at a time. None for all images at once.
 
         Raises:
-            SettingError: The number of rays and that of images differ.
+            SettingError: The numbers of rays and images differ.
         """
         if rays is None:
             return self.network(images)
@@ -100,7 +99,7 @@ class SphereContext(nn.Module):
     def encode(
         self, images: Float[Tensor, "images channels height width"]
     ) -> Float[Tensor, "images features rows columns"]:
-        """Return the tokens of images: the first of the three steps that bound memory."""
+        """Return the tokens of images: step 1 of 3 of the variant with limited memory."""
         try:
             self._run(images, _stop)
         except _ReachedError as reached:
@@ -114,7 +113,7 @@ class SphereContext(nn.Module):
         rays: Float[Tensor, "spheres images_of_sphere 3 3"],
         tokens: Float[Tensor, "images features rows columns"],
     ) -> Float[Tensor, "images features rows columns"]:
-        """Return the residual of the tokens of all images of the spheres: the second step."""
+        """Return the residual of the tokens of all images of the spheres: step 2."""
         directions = token_directions(rays, tokens.shape[-2], tokens.shape[-1])
         context: Tensor = self.mixer(tokens.reshape(*rays.shape[:2], *tokens.shape[1:]), directions)
         return context.flatten(0, 1)
@@ -124,7 +123,7 @@ class SphereContext(nn.Module):
         images: Float[Tensor, "images channels height width"],
         context: Float[Tensor, "images features rows columns"],
     ) -> Any:
-        """Return the network's result for images with their part of the second step: the third."""
+        """Return the network's result for images with their residual: step 3."""
         return self._run(images, lambda features: _add(features, context))
 
     def _run(self, images: Tensor, at_stage: Callable[[Tensor], Tensor]) -> Any:
@@ -145,7 +144,7 @@ class SphereContext(nn.Module):
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
         """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.tensor_split(images, -(-len(images) // size))  # even ones
-        # Evaluation draws nothing.
+        # Evaluation uses no random numbers.
         first = int(torch.randint(2**62, ())) if self.training else 0
         seeds = range(first, first + len(chunks))
         tokens = [
@@ -188,7 +187,7 @@ def token_directions(
     """Return unit viewing directions of the token centers.
 
     Args:
-        rays: They map image coordinates to directions, see `SphereContext.forward`.
+        rays: Matrices from image coordinates to directions, see `SphereContext.forward`.
         rows: Rows of tokens.
         columns: Columns of tokens.
     """
@@ -197,7 +196,7 @@ def token_directions(
         for count in (rows, columns)
     )
     along_x, along_y, along_z = rays[..., None, None].unbind(3)
-    # Not a matrix product, which autocast would compute in half precision.
+    # Not as a matrix product, which autocast would compute in half precision.
     return functional.normalize(along_x * x + along_y * y[:, None] + along_z, dim=2)
 
 
@@ -213,11 +212,11 @@ def _stop(features: Tensor) -> Tensor:
 
 @contextmanager
 def _frozen_statistics(modules: Any) -> Iterator[None]:
-    """Normalize by the statistics of the batch; the running statistics stay the same."""
+    """Return a context that normalizes by batch statistics and keeps the running statistics."""
     norms = [m for m in modules if isinstance(m, _BatchNorm) and m.training]
     before = [(norm.momentum, norm.num_batches_tracked) for norm in norms]
     for norm in norms:
-        # The buffers stay in place: a gradient needs the same in all runs.
+        # The buffers stay in place: a gradient needs the same ones in all passes.
         norm.momentum, norm.num_batches_tracked = 0.0, None
     try:
         yield

@@ -1,4 +1,4 @@
-"""RGB networks for images with further channels."""
+"""Extending RGB networks to images with additional channels."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ _RGB = 3
 
 @registered
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
-    """Extend a network for RGB images to further channels, such as depth.
+    """Extend a network of RGB images to additional channels, such as depth.
 
-    The filters of the further channels start at zero (paper, supplement, "Level 10 parameters"):
-    at first, the network computes the same from RGB-D as from RGB.
+    The filters of additional channels start at zero (paper, supplement, "Level 10 parameters"), so
+    that the network first returns the same for RGB-D as for RGB.
 
     Args:
-        network: Any network; its first convolution must be the one that sees the image.
-        in_channels: Channels wanted; the first three are red, green and blue.
+        network: Network whose first convolution processes the image.
+        in_channels: Number of channels; the first three are red, green and blue.
 
     Returns:
         The network, changed in place.
 
     Raises:
-        SettingError: Fewer than three channels, or the first convolution does not take three.
+        SettingError: Fewer than three channels, or the first convolution takes another number.
     """
     if in_channels < _RGB:
         raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
@@ -39,7 +39,7 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
             f"first convolution of {type(network).__name__}",
             found=stem or "none",
             expected="one that takes the three channels of an RGB image",
-            remedy="Networks that only take those need data.inputs=[rgb].",
+            remedy="Networks of RGB images only need data.inputs=[rgb].",
         )
     if in_channels > _RGB:
         places = [*range(_RGB), *[None] * (in_channels - _RGB)]
@@ -49,11 +49,11 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
 
 
 def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
-    """Return filters for other input channels.
+    """Return filters for a selection of input channels.
 
     Args:
-        weight: ``(out, in, h, w)``.
-        places: For every channel wanted, its index in `weight`; None for zeros.
+        weight: ``(out, in, h, w)`` filters.
+        places: Index in `weight` of each new channel; None for zeros.
 
     Returns:
         ``(out, len(places), h, w)``.

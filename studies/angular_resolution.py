@@ -1,6 +1,6 @@
-"""Levels and their angular resolution: ``python -m studies.angular_resolution``.
+"""Angular resolution of levels: ``python -m studies.angular_resolution``.
 
-The paper's figure "icosahedral levels", and its comparison with perspective cameras.
+Reproduces the paper's figure "icosahedral levels" and its comparison with perspective cameras.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from studies.output import COLORS, Row, save
 from tangent_train.geometry import TangentGrid, equirect_shape, vertex_resolution
 
 PAPER_DEG = {0: 90.0, 1: 45.0, 5: 2.812, 7: 0.703, 8: 0.352, 10: 0.088}
-"""Degrees per pixel as the paper prints them, by level."""
+"""Degrees per pixel in the paper, by level."""
 
 CAMERAS = {
     "16² 45°": (16, 16, 45),
@@ -23,11 +23,11 @@ CAMERAS = {
     "1080p 60°": (1080, 1920, 60),
     "4K 60°": (2160, 3840, 60),
 }
-"""Rows, columns and horizontal field of view in degrees."""
+"""Rows, columns and horizontal field of view in degrees, by name of a camera."""
 
 
 def angular_resolution() -> list[Row]:
-    """Return panoramas of levels 0 to 10; below them cameras, at the level of that resolution."""
+    """Return rows for panoramas of levels 0 to 10, then for cameras with their equivalent level."""
     rows: list[Row] = []
     for level in range(11):
         height, width = equirect_shape(level)
@@ -43,7 +43,7 @@ def angular_resolution() -> list[Row]:
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Return degrees per pixel over the level."""
+    """Plot degrees per pixel over the level."""
     figure = Figure((8.5, 5), layout="constrained")
     axes = figure.subplots()
     levels = range(11)
@@ -52,7 +52,7 @@ def picture(rows: Sequence[Row]) -> Figure:
     tangent = [math.degrees(TangentGrid(1, level).pitch) for level in range(4, 11)]
     axes.semilogy(levels, panoramas, "o-", color=COLORS[0], label="panorama (ERP)")
     axes.semilogy(range(7), between, "s:", color=COLORS[6], label="between vertices (R_v)")
-    label = "centre of a tangent image, b = 1"
+    label = "center of a tangent image, b = 1"
     axes.semilogy(range(4, 11), tangent, "^--", color=COLORS[2], label=label)
     printed = list(PAPER_DEG.values())
     axes.semilogy(list(PAPER_DEG), printed, "D", color="none", mec="black", label="the paper")

@@ -1,7 +1,7 @@
-"""A classifier on distorted digits: ``python -m studies.distorted_digits [--mnist FOLDER]``.
+"""Accuracy on distorted digits: ``python -m studies.distorted_digits [--mnist FOLDER]``.
 
-The paper's figure "MNIST accuracy": trained on undistorted digits, tested on digits with pincushion
-distortion x' = x (1 + K1 r²), where half a side of the image is the unit of length.
+Reproduces the paper's figure "MNIST accuracy": a classifier is trained on undistorted digits and
+tested on digits with pincushion distortion x' = x (1 + K1 r²), in units of half the image's side.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from torch.nn import functional as F
 from studies.output import COLORS, Row, save
 
 K1 = [k / 20 for k in range(11)]
-"""The paper's range, 0 to 0.5."""
+"""Coefficients of the distortion in the paper's range, 0 to 0.5."""
 
 BODY = 20 / 28
-"""Side of the square that MNIST's digits fill, over that of the image."""
+"""Side of the square that contains MNIST's digits, relative to the image's side."""
 
 
 class Digits(NamedTuple):
-    """``(n, 1, 28, 28)`` images in [0, 1] and ``(n,)`` labels, to train and to test on."""
+    """Images ``(n, 1, 28, 28)`` in [0, 1] and labels ``(n,)`` for training and test."""
 
     train_images: Tensor
     train_labels: Tensor
@@ -35,7 +35,7 @@ class Digits(NamedTuple):
 
 
 def small_digits() -> Digits:
-    """Return scikit-learn's 1797 digits, enlarged from 8² to 20² pixels, framed as MNIST's."""
+    """Return scikit-learn's 1797 digits, enlarged from 8² to 20² pixels, with MNIST's borders."""
     from sklearn.datasets import load_digits
 
     bunch = load_digits()
@@ -55,7 +55,7 @@ def mnist(folder: str) -> Digits:
 
 
 def distort(images: Tensor, k1: float) -> Tensor:
-    """Return images ``(n, 1, s, s)`` behind a lens with coefficient K1 ≥ 0; black beyond edges."""
+    """Distort images ``(n, 1, s, s)`` with coefficient K1 ≥ 0; black beyond their edges."""
     points = pixel_centers(images)
     if k1 > 0:  # the real root of K1 r³ + r = r'
         q = (3 * k1) ** -0.5
@@ -65,29 +65,29 @@ def distort(images: Tensor, k1: float) -> Tensor:
 
 
 def enlarge(images: Tensor, k1: float) -> Tensor:
-    """Enlarge images as much as the lens does on average over the digits' square."""
+    """Enlarge images by the average enlargement of the distortion in the digits' square."""
     return sample(images, pixel_centers(images) / mean_enlargement(k1))
 
 
 def mean_enlargement(k1: float) -> float:
-    """Return mean of 1 + K1 r² over the square that digits fill."""
+    """Return the mean of 1 + K1 r² over the square that contains the digits."""
     return 1 + k1 * 2 / 3 * BODY**2
 
 
 def pixel_centers(images: Tensor) -> Tensor:
-    """Return ``(1, s, s, 2)`` float64, right and down; the edges of an image are at ±1."""
+    """Return ``(1, s, s, 2)`` float64 positions, right and down; edges of the image are at ±1."""
     identity = torch.eye(2, 3, dtype=torch.float64)[None]
     return F.affine_grid(identity, [1, 1, *images.shape[2:]], align_corners=False)
 
 
 def sample(images: Tensor, points: Tensor) -> Tensor:
-    """Return bilinear samples of images at points; black beyond their edges."""
+    """Return bilinear samples of images at points; points beyond the edges are black."""
     grid = points.to(images.dtype).expand(len(images), -1, -1, -1)
     return F.grid_sample(images, grid, align_corners=False)
 
 
 def normalized(images: Tensor) -> Tensor:
-    """Return less the mean of MNIST's pixels, over their standard deviation."""
+    """Normalize images by mean and standard deviation of MNIST's pixels."""
     return (images - 0.1307) / 0.3081
 
 
@@ -112,7 +112,7 @@ def train(images: Tensor, labels: Tensor, epochs: int, seed: int) -> nn.Module:
 
 
 def distorted_digits(digits: Digits, epochs: int, seeds: Sequence[int]) -> list[Row]:
-    """Return accuracy in percent, mean and sample standard deviation over the seeds."""
+    """Return accuracy in percent: mean and sample standard deviation over the seeds."""
     images = normalized(digits.train_images)
     networks = [train(images, digits.train_labels, epochs, seed) for seed in seeds]
     rows: list[Row] = []
@@ -129,7 +129,7 @@ def distorted_digits(digits: Digits, epochs: int, seeds: Sequence[int]) -> list[
 
 
 def picture(rows: Sequence[Row], digit: Tensor) -> Figure:
-    """Return A digit ``(1, 1, 28, 28)`` behind some lenses, and the accuracies."""
+    """Plot a digit ``(1, 1, 28, 28)`` with several distortions, and the accuracies."""
     figure = Figure((8, 6.2), layout="constrained")
     above, below = np.array(figure.subfigures(2, 1, height_ratios=(1, 2.8)))
     for axes, k1 in zip(above.subplots(1, 6), K1[::2], strict=True):

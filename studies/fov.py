@@ -1,4 +1,4 @@
-"""Fields of view of tangent images (the paper's table "FOV"): ``python -m studies.fov``."""
+"""Field of view of tangent images (the paper's table "FOV"): ``python -m studies.fov``."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from studies.output import COLORS, Row, save
 from tangent_train.geometry import TangentGrid
 
 PAPER_DEG = (73.1, 51.6, 31.5, 16.7, 8.4)
-"""The paper's table, by base level, at level 10."""
+"""Fields of view in the paper's table, by base level, at level 10."""
 
 
 def fov(level: int = 10) -> list[Row]:
@@ -32,7 +32,7 @@ def fov(level: int = 10) -> list[Row]:
 
 
 def picture() -> Figure:
-    """Return fields of view over the level of the panorama."""
+    """Plot fields of view over the level of the panorama."""
     figure = Figure((8, 4.4), layout="constrained")
     axes = figure.subplots()
     tables = {level: fov(level) for level in range(4, 11)}

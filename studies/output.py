@@ -1,4 +1,4 @@
-"""Output that all studies share: a table for the terminal, a CSV file and a picture."""
+"""Output of studies: a table in the terminal, a CSV file and a figure."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Row = dict[str, Any]
 """A line of a table: values by column name."""
 
 COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
-"""The palette of Okabe and Ito, which color-blind readers can tell apart."""
+"""The palette of Okabe and Ito, which color-blind readers can distinguish."""
 
 
 def save(
@@ -26,9 +26,9 @@ def save(
     Args:
         name: Name of the study.
         rows: Lines of the table, all with the same columns.
-        figure: The picture.
+        figure: Figure to save.
         folder: Output folder; created if missing.
-        digits: Significant digits of the printed table; the CSV file has all.
+        digits: Significant digits of the printed table; the CSV file contains all digits.
     """
     write_text(Path(folder) / f"{name}.csv", csv_text(list(rows[0]), rows))
     figure.savefig(Path(folder) / f"{name}.png", dpi=110)
@@ -36,7 +36,7 @@ def save(
 
 
 def markdown(rows: Sequence[Row], digits: int = 6) -> str:
-    """Return the table; floats with `digits` significant digits."""
+    """Return the table as Markdown, floats with `digits` significant digits."""
     header = list(rows[0])
     cells = [
         [f"{v:.{digits}g}" if isinstance(v, float) else str(v) for v in row.values()]

@@ -50,8 +50,8 @@ def distortion(grid: PinholeGrid | None, shape: tuple[int, int]) -> tuple[Array,
     """Return ``(H, W)`` angular distortion and area scale, at the pixels of a panorama.
 
     Args:
-        grid: Images, each within the region it owns; None for the ERP itself.
-        shape: ``(H, W)``.
+        grid: Geometry of the images, each within its owned region; None for the ERP itself.
+        shape: ``(H, W)`` of the panorama.
     """
     if grid is not None:
         return pinhole_distortion(angle_to_owner(grid, equirect_directions(shape)))
@@ -60,7 +60,7 @@ def distortion(grid: PinholeGrid | None, shape: tuple[int, int]) -> tuple[Array,
 
 
 def worst(grid: PinholeGrid | None) -> tuple[float, float]:
-    """Return greatest angular distortion in degrees and greatest area scale."""
+    """Return the greatest angular distortion in degrees and the greatest area scale."""
     if grid is None:
         return 180.0, np.inf
     corners = SphericalVoronoi(grid.centers_xyz).vertices
@@ -69,10 +69,10 @@ def worst(grid: PinholeGrid | None) -> tuple[float, float]:
 
 
 def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]:
-    """Return means over the sphere by solid angle, and extremes.
+    """Return distortions of each representation: means over the sphere by solid angle, extremes.
 
     Args:
-        shape: ``(H, W)`` of the panorama at whose pixels the means are sampled.
+        shape: ``(H, W)`` of a panorama whose pixels are the samples.
     """
     weights = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)
     rows: list[Row] = []
@@ -89,7 +89,7 @@ def representation_distortion(shape: tuple[int, int] = (512, 1024)) -> list[Row]
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Return maps over the sphere, and bars of the means."""
+    """Plot maps over the sphere, and bars of the means."""
     figure = Figure((11.5, 5.4), layout="constrained")
     upper, lower = np.array(figure.subfigures(2, 1))
     panels = upper.subplots(2, 5, subplot_kw={"xticks": [], "yticks": []})

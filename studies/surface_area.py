@@ -13,14 +13,14 @@ from studies.output import COLORS, Row, save
 from tangent_train.geometry import icosphere
 
 SPHERES = ("of its mean radius", "vertices on it", "around the mesh")
-"""The spheres to compare with: the paper does not say which of them it means."""
+"""Spheres for the comparison; the paper does not specify which it uses."""
 
 
 def surface_area(levels: int = 8) -> list[Row]:
-    """Return the area of the mesh after Loop subdivision over that of a sphere.
+    """Return the area of the mesh after Loop subdivision, divided by the area of a sphere.
 
     Args:
-        levels: The last level.
+        levels: Largest level.
     """
     rows: list[Row] = []
     for level in range(levels + 1):
@@ -36,13 +36,13 @@ def surface_area(levels: int = 8) -> list[Row]:
 
 
 def mesh_area(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> float:
-    """Return sum of the areas of triangles."""
+    """Return the sum of the areas of triangles."""
     a, b, c = vertices[faces.T]
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
 
 
 def picture(rows: Sequence[Row]) -> Figure:
-    """Return the ratios, and what they lack to 1."""
+    """Plot the ratios, and their differences from 1."""
     figure = Figure((9, 4.2), layout="constrained")
     ratio, missing = figure.subplots(1, 2)
     levels = [row["level"] for row in rows]

@@ -116,5 +116,5 @@ def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
             subject,
             found=f"a missing package ({error})",
             expected=f"the packages of the extra {extra}",
-            remedy=f"Run: pip install 'tangent-train[{extra}]'. {remedy}".rstrip(),
+            remedy=f"Run in the checkout: pip install -e '.[{extra}]'. {remedy}".rstrip(),
         ) from error

@@ -1,1 +1,1 @@
-"""What is measured on a GPU; at toy size on a CPU."""
+"""Benchmarks of a GPU; on a CPU they run at toy size."""

@@ -1,4 +1,4 @@
-"""Whether the loader keeps the GPU busy: a training from the prepared store, by workers."""
+"""Measure if the loader keeps the GPU busy in a training from the prepared store."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _WARM, _TIMED, _PROFILED = (8, 30, 10) if _ON_GPU else (1, 2, 1)
 
 
 def fed(quick: bool) -> Iterator[Table]:
-    """The paper's best row at level 10, in bf16: FCN-ResNet101 on 16 RGB-D images a step."""
+    """Train the paper's best network at level 10, FCN-ResNet101, in bf16 on 16 images per step."""
     level, rooms = (5, 4) if quick else (10, 32)
     settings = ["experiment=paper/semseg_s10_b1_rgbd", f"level={level}", "network.weights=null"]
     settings += ["task.images_per_chunk=null", "task.channels_last=true", "data.in_memory=false"]
@@ -59,10 +59,10 @@ def fed(quick: bool) -> Iterator[Table]:
 
 
 def _fit(task: Any, workers: int = 0, **given: Any) -> tuple[float, float]:
-    """Train for some steps as `tangent-train` does.
+    """Train for some steps like `tangent-train`.
 
     Returns:
-        Seconds of a step, and the percentage of the time in which the device worked.
+        Seconds per step, and the percentage of time in which the device was busy.
     """
     clock = _Clock()
     if "datamodule" in given:
@@ -86,7 +86,7 @@ def _fit(task: Any, workers: int = 0, **given: Any) -> tuple[float, float]:
 
 
 class _Clock(Callback):
-    """Times some steps after the first ones, then profiles some."""
+    """Times some steps after a warm-up, then profiles some."""
 
     def __init__(self) -> None:
         kind = ProfilerActivity.CUDA if _ON_GPU else ProfilerActivity.CPU
@@ -94,7 +94,7 @@ class _Clock(Callback):
         self._start = self.step_s = self.busy = 0.0
 
     def on_train_batch_end(self, trainer: lightning.Trainer, *_: Any) -> None:
-        """Begin or end at a step."""
+        """Start or stop a measurement after certain steps."""
         step = trainer.global_step
         if step not in (_WARM, _WARM + _TIMED, _WARM + _TIMED + _PROFILED):
             return
@@ -111,7 +111,7 @@ class _Clock(Callback):
 
 
 def _union_s(profiler: Any) -> float:
-    """Seconds in which at least one kernel or copy ran."""
+    """Return the seconds in which at least one kernel or copy ran."""
     events = [e for e in profiler.events() if e.device_type.name.lower() == DEVICE.type]
     events = [event for event in events if not getattr(event, "is_user_annotation", False)]
     start, end = np.array(sorted((e.time_range.start, e.time_range.end) for e in events)).T
@@ -120,7 +120,7 @@ def _union_s(profiler: Any) -> float:
 
 
 def _rendered(data: Any, count: int) -> Iterator[Any]:
-    """Batches that are rendered on the device from panoramas in pinned memory."""
+    """Yield batches rendered on the device from panoramas in pinned memory."""
     grid, panoramas = data.representation.grid, []
     for k in range(count):
         image = data.source("train").read(k)

@@ -1,4 +1,4 @@
-"""Labels of panoramas: a second's worth, the share outside the network, and a folder of frames."""
+"""Predict panoramas: time, its share outside the network, and a folder of video frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from benchmarks.labels import NUM_CLASSES
-from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, measure
+from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, measure
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
@@ -28,7 +28,7 @@ from tangent_train.registry import build_from_config
 
 
 def predict(quick: bool) -> Iterator[Table]:
-    """2048×1024 and 4096×2048, in bf16, then 200 frames by ``tangent-predict``."""
+    """Predict 2048×1024 and 4096×2048 in bf16, then 200 frames with ``tangent-predict``."""
     segformer = {"_target_": "models.HuggingFaceNetwork", "config": {"model_type": "segformer"}}
     fcn = {"_target_": "models.FCNResNet", "in_channels": 3, "depth": 101}
     networks: dict[str, dict[str, Any]] = {"SegFormer-B0": segformer, "FCN-ResNet101": fcn}
@@ -46,11 +46,11 @@ def predict(quick: bool) -> Iterator[Table]:
                 yield table
         _imported(networks["SegFormer-B0"], 7 if quick else 9, path)
         row = _folder(path, 7 if quick else 9, 2 if quick else 200)
-        yield Table("predict: of each frame", [row])
+        yield Table("predict: time per frame", [row])
 
 
 def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwork:
-    """An untrained network for the tangent images of a level, in a checkpoint."""
+    """Write a checkpoint with an untrained network for tangent images of a level."""
     settings |= {"num_classes": NUM_CLASSES}
     names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
     network, normalization = build_from_config(settings, "network"), Normalization.of("imagenet", 3)
@@ -59,7 +59,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
 
 
 def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
-    """The network alone, and `Predictor`, with everything on the device."""
+    """Time the network alone and `Predictor`, with all data on the device."""
     shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))
     per_forward = views_per_forward((grid.dim, grid.dim))
@@ -71,19 +71,23 @@ def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
         parts = view_scores(trained.network, views, grid.num_images, per_forward)
         return [part for _, part in parts]
 
-    def labelled(predictor: Predictor) -> None:
+    def labeled(predictor: Predictor) -> None:
         trained.labels(predictor.predict(image).labels())
 
-    ways = [Way("the network", lambda: scores(lambda part: random[: part.stop - part.start]))]
+    alternatives = [
+        Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))
+    ]
     for blend in ("feather", "nearest"):
         predictor = Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
-        ways.append(Way(f"Predictor, {blend}", partial(labelled, predictor), ours=True))
+        alternatives.append(
+            Alternative(f"Predictor, {blend}", partial(labeled, predictor), is_ours=True)
+        )
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
-        return measure(ways, rounds)
+        return measure(alternatives, rounds)
 
 
 def _folder(checkpoint: Path, level: int, count: int) -> Row:
-    """All of the command, its start too; float32, as the command computes."""
+    """Time the whole command in float32, including its start."""
     folder, frames = checkpoint.parent, checkpoint.with_name("frames")
     frames.mkdir()
     noise = np.random.default_rng(0).integers(0, 256, (16, 32, 3), np.uint8)

@@ -1,4 +1,4 @@
-"""A training step in several precisions, eager and compiled."""
+"""Time a training step in several precisions, eager and compiled."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from torch import nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from benchmarks.labels import NUM_CLASSES
-from benchmarks.measuring import DEVICE, Goal, Row, Table, Way, attempted, measure
+from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, attempted, measure
 from models import FCNResNet, HuggingFaceNetwork, UNet
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 
 PEAK_FLOPS = 989e12
-"""Dense bf16 operations a second of an H100 or H200 SXM (NVIDIA's data sheets)."""
+"""Dense bf16 operations per second of an H100 or H200 SXM (NVIDIA's data sheets)."""
 
 
 _MODES: dict[str, dict[str, Any]] = {
@@ -28,11 +28,11 @@ _MODES: dict[str, dict[str, Any]] = {
     "the same, compiled": {"half": True, "compiled": {}},
     "the same, CUDA graphs": {"half": True, "compiled": {"mode": "reduce-overhead"}},
 }
-"""Arguments of `_step` by name."""
+"""Arguments of `_step`, by name of the row."""
 
 
 def step(quick: bool) -> Iterator[Table]:
-    """FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of ``rooms/standard``."""
+    """Time steps of FCN-ResNet101 (paper, level 10), SegFormer-B0, and the UNet of rooms."""
     side, count = (32, 2) if quick else (512, 16)
     widths = (4, 8, 8) if quick else (16, 32, 64, 128, 256, 256)
     fcn = FCNResNet(4, NUM_CLASSES, depth=101, frozen_statistics=True)
@@ -46,8 +46,8 @@ def step(quick: bool) -> Iterator[Table]:
         rows: list[Row] = []
         for mode, settings in _MODES.items():
             with attempted(f"{name}, {mode}"):
-                taken = Way(mode, _step(network, size, **settings), ours=True)
-                rows += measure([taken], 1 if quick else 5)
+                alternative = Alternative(mode, _step(network, size, **settings), is_ours=True)
+                rows += measure([alternative], 1 if quick else 5)
         table = Table(f"step: {name}, {size[0]} images of {size[-1]}²", rows)
         if name == "FCN-ResNet101":
             best = min(rows, key=lambda row: row.median)
@@ -71,7 +71,7 @@ def _step(
     half: bool = False,
     compiled: dict[str, Any] | None = None,
 ) -> Callable[[], object]:
-    """A step of the task, without its loader; `compiled` are arguments of `torch.compile`."""
+    """Return a training step without a loader; `compiled` are arguments of `torch.compile`."""
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = tf32
     names = ("unknown", *map(str, range(NUM_CLASSES)))
     on_gpu = DEVICE.type == "cuda"

@@ -1,4 +1,4 @@
-"""How often the classes occur: their weights in the loss, and doubts about labels."""
+"""Class frequencies: weights of the classes in the loss, and warnings about unlikely labels."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ _MOST_NAMED = 10
 
 
 def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
-    """Weights of the classes.
+    """Return the weights of the classes in the loss.
 
-    With r the share of a class among the pixels that have one: `log` is ``1 / ln(1.02 + r)``
+    With r the share of a class among the labeled pixels: `log` is ``1 / ln(1.02 + r)``
     (released code of the paper), `sqrt` is ``1 / √r``, scaled to a mean of 1; `none` is 1.
 
     Args:
-        counts: ``(K,)`` pixels of every class.
+        counts: ``(K,)`` number of pixels of every class.
         kind: Kind of weighting.
 
     Returns:
-        ``(K,)`` float32; but for `none`, 0 for classes never seen.
+        ``(K,)`` float32; 0 for classes without pixels, except with `none`.
     """
     if kind == "none":
         return torch.ones(len(counts))
@@ -44,12 +44,12 @@ def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
 
 
 def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[str]) -> list[str]:
-    """Warn of labels and classes that may not belong together.
+    """Return warnings about labels that may belong to other classes.
 
     Args:
         split: Name of the split.
-        counts: ``(K+1,)`` pixels of every label, some of them above 0.
-        class_names: ``(K+1,)`` names; the first is that of unknown pixels.
+        counts: ``(K+1,)`` number of pixels of every label, at least one above 0.
+        class_names: ``(K+1,)`` names; the first is the name of unknown pixels.
     """
     doubts = []
     unknown = counts[0] / counts.sum()

@@ -29,7 +29,7 @@ from datamodules.core.panoramas import (
     Panorama,
     PanoramaReading,
     PhotoReading,
-    Turn,
+    TestRotation,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -57,15 +57,15 @@ from tangent_train.threads import in_threads
 class ImageDataModule(SplitDataModule[ImageFiles]):
     """Labeled panoramas or photos of one data set.
 
-    A data set says which images it has (`find_images`) and its `class_names`, the unknown one (0)
-    first.
+    A subclass defines the images (`find_images`) and the `class_names`; the first name is that of
+    unknown pixels (label 0).
 
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
 
     Attributes:
-        normalizations: The default ones, without and with depth.
+        normalizations: Default normalizations, without and with depth.
 
     Raises:
         SettingError: A setting is invalid.
@@ -91,10 +91,10 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def find_images(
         self, problems: Problems
     ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
-        """Return the reader of the data set and the files of all splits, not yet opened.
+        """Return the reader of the data set and the files of each split, not yet opened.
 
         Args:
-            problems: Problems of the folders are added.
+            problems: Collects problems of the folders.
 
         Raises:
             DataError: The data set as a whole cannot be used.
@@ -106,7 +106,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
     @abstractmethod
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
-        """Make sure, without decoding them, that files are whole and fit the settings."""
+        """Check, without decoding, that the files are complete and fit the settings."""
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `LabeledData`."""
@@ -161,7 +161,7 @@ class PanoramaDataModule(ImageDataModule):
         upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
             test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
             the image.
-        max_tilt_deg: Maximum tilt that `auto` estimates: some degrees more than the panoramas have.
+        max_tilt_deg: Largest tilt that `auto` considers, a few degrees above that of the data.
 
     Attributes:
         erp_height: Rows of the panoramas read.
@@ -175,7 +175,7 @@ class PanoramaDataModule(ImageDataModule):
 
     panoramas_per_step: int = 4
     mask: Mask = None
-    test_rotation: Turn = None
+    test_rotation: TestRotation = None
     upright: Upright = None
     max_tilt_deg: float = 60.0
 
@@ -205,14 +205,14 @@ class PanoramaDataModule(ImageDataModule):
         return PanoramaReading(reader, len(self.class_names), shape)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
-        """See `ImageDataModule`; there must be a mask, too."""
+        """See `ImageDataModule`; also checks that the panorama has a mask."""
         check_headers(files, reader, problems, self.erp_height)
         if self._masks.of_each:
             with problems.noted(files.name):
                 self._masks.check(files.name)
 
     def transforms(self, split: Split) -> Sequence[Transform[Panorama, Any]]:
-        """See `LabeledData`: masked, rotated, then aligned with gravity."""
+        """See `LabeledData`: mask, rotation, then alignment with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         rotated = None
         if self.mask is not None:
@@ -230,24 +230,24 @@ class PanoramaDataModule(ImageDataModule):
         return transforms
 
     def panoramas(self, split: Split) -> LabeledImages:
-        """Return the whole panoramas of a split as arrays: masked and rotated if set."""
+        """Return the whole panoramas of a split as arrays, masked and rotated as set."""
         return self.images(split)
 
     def estimate_up(self, judge: PanoramaJudge) -> None:
         """Let a network help to estimate the up directions of the test panoramas.
 
-        They are estimated when the loader of the test split is made: the network is on its device
-        then. Without ``upright=auto`` nothing changes.
+        They are estimated when the loader of the test split is created, because the network is on
+        its device by then. Without ``upright=auto`` nothing changes.
 
         Args:
-            judge: Log-likelihoods of up directions, see `gravity.estimate_up`.
+            judge: Returns log-likelihoods of up directions, see `gravity.estimate_up`.
         """
         if self.upright == "auto":
             self._judge = judge
             self._readers.pop("test", None)
 
     def test_dataloader(self) -> DataLoader[Any]:
-        """Batches for the test; a network estimates up directions first, in this process."""
+        """Return the test batches; a network first estimates the up directions, in this process."""
         source = self.source("test")
         if self._judge is not None:
             read = (source.read(index) for index in range(len(source)))
@@ -296,7 +296,7 @@ class PhotoDataModule(ImageDataModule):
         return self.images(split)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
-        """See `ImageDataModule`; crops must fit into the photo, too."""
+        """See `ImageDataModule`; also checks that the crops fit into the photo."""
         size = check_headers(files, reader, problems)
         if size is None:
             return
@@ -310,5 +310,5 @@ class PhotoDataModule(ImageDataModule):
                     files.rgb,
                     found=error.found,
                     expected=f"all of a crop of {representation.fov_deg:g}°",
-                    remedy="Lower representation.fov_deg, or leave the photo out.",
+                    remedy="Lower representation.fov_deg, or remove the photo.",
                 ) from error

@@ -1,4 +1,4 @@
-"""The items of a data set: checked for broken ones, read from files or a store."""
+"""Index of the items of a data set: finds broken items, reads items from files or a store."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.threads import in_threads
 
 Split = Literal["train", "val", "test"]
-"""A part of a data set."""
+"""A split of a data set."""
 
 SPLITS: tuple[Split, ...] = ("train", "val", "test")
-"""All parts, in their order."""
+"""All splits, in order."""
 
 SAMPLED = 32
 """Maximum number of images that `DatasetIndex.read_some` decodes."""
@@ -41,7 +41,7 @@ class Item(Protocol):
 
     @property
     def parts(self) -> Mapping[str, Path]:
-        """Its files by content."""
+        """Files of the item by content."""
         ...
 
 
@@ -59,11 +59,11 @@ class DatasetIndex(Generic[_Item]):
     Attributes:
         noun: Name of the items, in the plural.
         splits: Files of the images or shapes of each split.
-        read: Reads one from its files; may have methods `labels`, and `parts` for functions that
-            decode the files of a part.
+        read: Function that reads an item from its files; may have methods `labels` and `parts`
+            (functions that decode the files of one part).
         kind: Named tuple of arrays that `read` returns.
         store: Prepared store, if any.
-        in_parallel: The results of some work on each, as they come.
+        in_parallel: Function that applies a function to each item and yields results as they come.
     """
 
     noun: str
@@ -74,18 +74,18 @@ class DatasetIndex(Generic[_Item]):
     in_parallel: Callable[[Callable[[_Item], Any], Sequence[_Item]], Generator[Any]] = in_threads
 
     def of(self, splits: Sequence[Split] = SPLITS) -> list[_Item]:
-        """Items of some splits."""
+        """Return the items of the given splits."""
         return [item for split in splits for item in self.splits[split]]
 
     def check(self, problems: Problems, label_counts: dict[str, NDArray[np.int64]]) -> int:
-        """Decode every file by itself and note what is broken; nothing is written.
+        """Decode every file separately and note broken ones; write nothing.
 
         Args:
-            problems: Known problems; new ones and warnings are added.
-            label_counts: The pixels of each label are added by image; shapes have none.
+            problems: Known problems; collects new problems and warnings.
+            label_counts: Collects the number of pixels of each label by image; unused for shapes.
 
         Returns:
-            How many images or shapes were read.
+            Number of images or shapes read.
         """
         items = problems.without(self.of())
         read: Any = self.read
@@ -95,12 +95,12 @@ class DatasetIndex(Generic[_Item]):
         return len(items)
 
     def read_all(self, items: Sequence[_Item], problems: Problems, *, whole: bool) -> None:
-        """Read items once, into the store if there is one; note what is broken.
+        """Read items once, into the store if there is one; note broken items.
 
         Args:
             items: Items of the index.
             problems: Known problems; new ones are added.
-            whole: True to check the content of the store too; samples check it on first use.
+            whole: True to check the content of the store now, not when samples first use it.
         """
         items, store = problems.without(items), self.store
         if store is None:
@@ -114,7 +114,7 @@ class DatasetIndex(Generic[_Item]):
             self._note(problems, make, missing, f"Preparing {self.noun}", before)
 
     def read_some(self, seed: int, problems: Problems) -> None:
-        """Decode some images from all over the data set, for a second or two; note what is broken.
+        """Decode a random sample of images, for a second or two; note broken images.
 
         Args:
             seed: Seed of the choice.
@@ -130,19 +130,19 @@ class DatasetIndex(Generic[_Item]):
                 return
 
     def without(self, problems: Problems) -> DatasetIndex[_Item]:
-        """The same without what is broken."""
+        """Return a copy of the index without broken items."""
         splits = {split: problems.without(items) for split, items in self.splits.items()}
         return replace(self, splits=splits)
 
     def _note(
         self, problems: Problems, reads: _Reads, items: Sequence[_Item], what: str, before: int = 0
     ) -> None:
-        """Read items in parallel, note what is broken, and show the progress."""
+        """Read items in parallel, note broken items, and show progress."""
         with closing(self._read(problems, reads, items)) as done:
             show_progress(done, what, self.noun, before + len(items), before)
 
     def _read(self, problems: Problems, reads: _Reads, items: Sequence[_Item]) -> Generator[None]:
-        """Read items in parallel and note what is broken; yield after each."""
+        """Read items in parallel and note broken items; yield after each."""
         with closing(self.in_parallel(partial(_errors, reads), items)) as results:
             for item, errors in results:
                 for error in errors:
@@ -152,7 +152,7 @@ class DatasetIndex(Generic[_Item]):
 
 
 def _errors(reads: _Reads, item: Item) -> tuple[Item, list[Exception]]:
-    """Errors of reading one item; runs in worker processes too."""
+    """Return the errors of reading one item; runs in worker processes too."""
     errors: list[Exception] = []
     for part, read in reads.items():
         if part == _WHOLE or part in item.parts:
@@ -168,22 +168,22 @@ def _store_item(read: Callable[[Any], Any], store: Store, item: Item) -> None:
 
 
 def _arrays(read: Callable[[Any], Any], item: Item) -> dict[str, Any]:
-    """The arrays of a named tuple that are there."""
+    """Return the arrays of a named tuple that are not None."""
     return {name: array for name, array in read(item)._asdict().items() if array is not None}
 
 
-# What can be sorted: names, or tuples of them and numbers.
+# Sortable keys: names, or tuples of names and numbers.
 _Group = TypeVar("_Group", bound="str | tuple[Any, ...]")
 
 
 def draw_groups(
     groups: Iterable[_Group], fraction: float, seed: int | Sequence[int]
 ) -> set[_Group]:
-    """Draw some of the groups, the same for the same seed, in whatever order they come.
+    """Draw some of the groups; the draw depends on the seed, not on the order of the groups.
 
     Args:
-        groups: All there are; those that come several times count once.
-        fraction: Share of them to draw: at least one, never all, so none of a single one.
+        groups: All groups; repeated groups count once.
+        fraction: Share of the groups to draw: at least one group and at most all but one.
         seed: Seed of the draw.
 
     >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))

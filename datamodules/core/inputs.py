@@ -29,17 +29,17 @@ _COLORS = ("red", "green", "blue")
 _BYTE = 255
 
 _SHAPES = 6
-"""Channels of spheres of shapes, which are no colors."""
+"""Channels of spheres of shapes, which are not colors."""
 
 MAX_DEPTH_M = 4.0
-"""Depth is clipped to this (released code of the paper)."""
+"""Maximum depth in meters; larger depth is clipped (released code of the paper)."""
 
 
 @dataclass(frozen=True)
 class Normalization:
     """Mean and standard deviation of the channels R, G, B (of 0 to 1) and perhaps depth (meters).
 
-    Depth counts clipped to `MAX_DEPTH_M` and 0 where missing. Spheres of shapes have six channels,
+    Depth is clipped to `MAX_DEPTH_M` and is 0 where missing. Spheres of shapes have six channels,
     see `mesh_spheres`.
 
     Attributes:
@@ -47,7 +47,7 @@ class Normalization:
         std: As many numbers, greater than 0.
 
     Raises:
-        SettingError: Other numbers.
+        SettingError: The counts differ, or a number is out of range.
     """
 
     mean: Sequence[float]
@@ -72,16 +72,16 @@ class Normalization:
 
     @classmethod
     def of(cls, given: Any, channels: int, setting: str = "normalization") -> Self:
-        """The one that a setting names or describes.
+        """Return the normalization that a setting names or describes.
 
         Args:
             given: ``imagenet``, ``unit`` (0 to 1) or ``symmetric`` (-1 to 1) of RGB, a mapping with
                 ``mean`` and ``std``, or the normalization itself.
             channels: Required number of channels.
-            setting: For the message.
+            setting: Name of the setting, for error messages.
 
         Raises:
-            SettingError: It is something else, has other channels, or is of RGB from 0 to 255.
+            SettingError: It is not a normalization, has other channels, or is meant for 0 to 255.
         """
         if isinstance(given, str):
             given = _NAMED.get(given, given)
@@ -111,7 +111,7 @@ class Normalization:
 
 
 def _check_colors(given: Normalization, setting: str) -> None:
-    """Refuse numbers of RGB that are not of images from 0 to 1."""
+    """Refuse RGB numbers that are not meant for images from 0 to 1."""
     mean, std = given.mean[:3], given.std[:3]
     if min(mean) >= 0 and max(*mean, *std) <= 1:
         return
@@ -131,7 +131,7 @@ _NAMED = {
     "unit": Normalization((0, 0, 0), (1, 1, 1)),
     "symmetric": Normalization((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 }
-"""Of RGB from 0 to 1: torchvision's, none, and to -1 … 1."""
+"""Named normalizations of RGB from 0 to 1: torchvision's, none, and to -1 … 1."""
 
 RGB_NORMALIZATION = Normalization(
     mean=(0.5490, 0.5306, 0.4779),
@@ -147,7 +147,7 @@ RGBD_NORMALIZATION = Normalization(
 
 
 def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
-    """The channels of an image of these inputs by name, colors apart.
+    """Return the channel names of inputs; `rgb` gives three.
 
     >>> channel_names(["rgb", "depth"])
     ('red', 'green', 'blue', 'depth')
@@ -156,10 +156,10 @@ def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
 
 
 def ordered_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
-    """Names of inputs in the order of their channels.
+    """Return the names of inputs in the order of their channels.
 
     Raises:
-        SettingError: There are other names, or no `rgb`.
+        SettingError: An unknown name, or `rgb` is missing.
     """
     ordered = tuple(name for name in INPUTS if name in inputs)
     known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
@@ -187,7 +187,7 @@ def normalize(
         ``(..., C, h, w)`` float32, on the same device.
 
     Raises:
-        SettingError: The normalization is one of other channels.
+        SettingError: The normalization has other channels.
     """
     parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
     measured = 3 + ("depth" in parts)
@@ -212,7 +212,7 @@ def normalize_channels(
 
     Args:
         images: ``(..., C, h, w)`` float32.
-        units: Stored value for 1, of each channel.
+        units: Stored value that stands for 1, for each channel.
         normalization: Normalization of C channels.
 
     Returns:
@@ -221,7 +221,7 @@ def normalize_channels(
     # One multiplication and one addition per value.
     scale = zip(units, normalization.mean, normalization.std, strict=True)
     values = [value for unit, mean, std in scale for value in (1 / (unit * std), mean / std)]
-    # Filled in on the device: copying them to a GPU would wait for all work before.
+    # Filled in on the device: a copy from the host would wait for all queued GPU work.
     filled = torch.stack([images.new_full((), value) for value in values])
     factor, offset = filled.view(-1, 2).T[..., None, None]
     return images.mul_(factor).sub_(offset)

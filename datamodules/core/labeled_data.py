@@ -43,8 +43,7 @@ class LabeledData(ABC, Generic[_Item]):
 
     Args:
         root: Folder of the data set.
-        representation: Representation of the images; by default the one of
-            `default_representation`.
+        representation: Representation of the images; by default `default_representation`.
         level: Level of the default representation.
         validation_fraction: Share of the training data that is held out for validation; 0 for no
             validation.
@@ -58,10 +57,10 @@ class LabeledData(ABC, Generic[_Item]):
         skip_broken: Read all items first and leave out broken ones, instead of refusing the data.
 
     Attributes:
-        class_names: Name of every label; the first of pixel classes is unknown, not a class.
-        labels: Labels that its items have, see `datamodules.core.labels`.
+        class_names: Name of every label; for pixel labels the first is unknown, not a class.
+        labels: Kind of labels of the items, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
-        label_counts: After `check`, ``(K+1,)`` pixels of each label by split, as files have them.
+        label_counts: After `check`, ``(K+1,)`` pixels of each label in the files, by split.
 
     Raises:
         SettingError: A setting is invalid.
@@ -98,25 +97,25 @@ class LabeledData(ABC, Generic[_Item]):
         self._index: DatasetIndex[_Item] | None = None
         self._readers: dict[Split, SplitReader[_Item, Any]] = {}
 
-    # --- what a kind of data defines ---------------------------------------------------------
+    # --- defined by subclasses ---------------------------------------------------------------
 
     @abstractmethod
     def default_representation(self) -> Any:
-        """Representation of `level`, without a setting for it."""
+        """Return the representation used without a setting for it, at `level`."""
 
     @abstractmethod
     def find(self, problems: Problems) -> DatasetIndex[_Item]:
         """Find the items of all splits and check them without decoding.
 
         Args:
-            problems: Problems are added; the index contains broken items nevertheless.
+            problems: Collects problems; the index also contains broken items.
 
         Raises:
             DataError: The data set as a whole cannot be used.
         """
 
     def transforms(self, split: Split) -> Sequence[Transform[Any, _Item]]:
-        """Return changes to every item of a split, in their order."""
+        """Return the transforms of every item of a split, in order."""
         del split
         return ()
 
@@ -124,12 +123,12 @@ class LabeledData(ABC, Generic[_Item]):
     def dataset(self, split: Split) -> Dataset[Any]:
         """Return the samples of a split as a map-style data set of PyTorch.
 
-        A sample of ``"train"`` consists of views drawn at random, one of ``"val"`` and ``"test"``
-        of all views. A key is an index, or an epoch and an index: other epochs draw other views,
-        an index alone those of epoch 0.
+        A sample of ``"train"`` holds randomly drawn views, a sample of ``"val"`` or ``"test"`` all
+        views. A key is an index, or an epoch and an index: each epoch draws other views; an index
+        alone means epoch 0.
 
         Args:
-            split: The split.
+            split: Name of the split.
         """
 
     @property
@@ -147,10 +146,10 @@ class LabeledData(ABC, Generic[_Item]):
     # --- settings ------------------------------------------------------------------------------
 
     def require(self, setting: str, fine: bool, expected: str, remedy: str = "") -> None:
-        """Refuse the value of a setting ``data.<setting>`` that is not fine.
+        """Refuse an invalid value of a setting ``data.<setting>``.
 
         Raises:
-            SettingError: It is not.
+            SettingError: The value is invalid.
         """
         if not fine:
             found = getattr(self, setting)
@@ -158,14 +157,14 @@ class LabeledData(ABC, Generic[_Item]):
             raise SettingError(f"data.{setting}", found=found, expected=expected, remedy=remedy)
 
     def require_representation(self, attribute: str, choice: str) -> None:
-        """Refuse a representation of another kind of images.
+        """Refuse a representation that is made for another kind of images.
 
         Args:
-            attribute: Attribute of all representations of the right kind.
-            choice: One of them, for the message.
+            attribute: Attribute that all suitable representations have.
+            choice: Name of a suitable representation, for the error message.
 
         Raises:
-            SettingError: It is of another kind.
+            SettingError: The representation is not suitable.
         """
         if not hasattr(self.representation, attribute):
             found, expected = type(self.representation).__name__, f"one for {self.noun}"
@@ -173,10 +172,10 @@ class LabeledData(ABC, Generic[_Item]):
             raise SettingError("representation", found=found, expected=expected, remedy=remedy)
 
     def check_classes(self) -> None:
-        """Check that the data set names its classes, in names that checkpoints can hold.
+        """Check the names of the classes: present, and without control characters.
 
         Raises:
-            SettingError: It does not.
+            SettingError: A name is missing or invalid.
         """
         names = getattr(self, "class_names", ())
         setting = f"class_names of {type(self).__name__}"
@@ -205,7 +204,7 @@ class LabeledData(ABC, Generic[_Item]):
         return self._index
 
     def check(self) -> tuple[Problems, int]:
-        """Read the whole data set, and count its labels; nothing is generated or written.
+        """Read the whole data set and count its labels; generate and write nothing.
 
         Returns:
             All problems, and the number of images or shapes read.
@@ -222,23 +221,23 @@ class LabeledData(ABC, Generic[_Item]):
         return problems, count
 
     def prepare_part(self, part: Callable[[Sequence[_Item]], Sequence[_Item]]) -> int:
-        """Complete a part of the store, as on one of several machines.
+        """Complete a part of the store, e.g. on one of several machines.
 
         Args:
-            part: Chooses from all items, which are listed the same way on every machine.
+            part: Selects some of all items, which have the same order on every machine.
 
         Returns:
-            The number of its items that are in the store.
+            Number of items of this part that are in the store.
 
         Raises:
-            DataError: Something in it is broken.
+            DataError: An item of the part is broken.
             SettingError: There is no store.
         """
         self.make_files()
         problems = Problems()
         index = self._find_checked(problems)
         if index.store is None:
-            expected = "a folder: files of the store are all that can be prepared in parts"
+            expected = "a folder: only a store can be prepared in parts"
             raise SettingError("data.store", found="none, with shard=", expected=expected)
         if not self.skip_broken:
             problems.refuse(self.root, REMEDY)
@@ -249,7 +248,7 @@ class LabeledData(ABC, Generic[_Item]):
         return len(problems.without(items))
 
     def _find_all(self, problems: Problems) -> DatasetIndex[_Item]:
-        """Index of all items, with the checks that hold for every data set."""
+        """Return the index of all items, checked as every data set is."""
         self.check_classes()
         index = self.find(problems)
         if not index.of() and not problems.items:
@@ -258,7 +257,7 @@ class LabeledData(ABC, Generic[_Item]):
         return index
 
     def _find_checked(self, problems: Problems) -> DatasetIndex[_Item]:
-        """Index of all items, broken ones too; refuse a data set that cannot be used at all."""
+        """Return the index of all items, including broken ones; refuse an unusable data set."""
         index: Any = None
         with problems.noted():
             index = self._find_all(problems)
@@ -267,11 +266,11 @@ class LabeledData(ABC, Generic[_Item]):
         return index
 
     def _find_usable(self, *, sample: bool = False, whole: bool = True) -> DatasetIndex[_Item]:
-        """Index of the usable items; refuse broken ones, unless they are left out.
+        """Return the index of usable items; refuse broken items unless `skip_broken`.
 
         Args:
             sample: True to decode some images.
-            whole: True to check the content of the store where everything is read.
+            whole: True to check the content of the store too, where everything is read.
         """
         problems = Problems()
         index = self._find_checked(problems)
@@ -302,11 +301,11 @@ class LabeledData(ABC, Generic[_Item]):
 
     @property
     def num_classes(self) -> int:
-        """Classes K: the scores of a network."""
+        """Number of classes K, which is the number of scores of a network."""
         return len(self.class_names) - (self.labels == PIXEL_CLASSES)
 
     def source(self, split: Split) -> SplitReader[_Item, Any]:
-        """Return the reader of a split; with `in_memory`, everything is read now."""
+        """Return the source of a split; with `in_memory`, read everything now."""
         if split not in self._readers:
             if split not in self.index().splits:
                 raise SettingError("split", found=split, expected=", ".join(self.index().splits))
@@ -319,10 +318,10 @@ class LabeledData(ABC, Generic[_Item]):
     def class_weights(self, kind: ClassWeights) -> Tensor:
         """Return weights of the classes in the loss, from the labels of the training split.
 
-        Print a warning where labels seem to belong to other classes.
+        Print a warning if labels seem to belong to other classes.
 
         Args:
-            kind: See `class_weights.class_weights`.
+            kind: Kind of weighting, see `class_weights.class_weights`.
         """
         counts = np.zeros(len(self.class_names), np.int64)
         if kind != "none":
@@ -336,5 +335,5 @@ class LabeledData(ABC, Generic[_Item]):
 
 @rank_zero_only
 def print_on_rank_zero(text: str) -> None:
-    """Print text as it is, in the first process."""
+    """Print text unchanged, only in the first process."""
     print_text(text)

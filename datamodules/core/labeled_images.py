@@ -1,4 +1,4 @@
-"""Whole panoramas and photos as arrays, for code of your own."""
+"""Whole panoramas and photos as arrays, for user code."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ class LabeledImage(NamedTuple):
     Attributes:
         name: Unique short name; ``/`` between groups.
         rgb: ``(H, W, 3)`` uint8.
-        labels: ``(H, W)`` uint8 places in the class names of the data set, 0 where unknown.
+        labels: ``(H, W)`` uint8 indices into the class names of the data set, 0 where unknown.
         distance_m: ``(H, W)`` float32 meters from the center of the camera, NaN where missing; None
             without depth among the inputs of the data set.
-        pose: Pose; None if the data set has none. In the axes of a photo, x is its optical axis, y
+        pose: Pose; None if unknown. In a photo's axes, x is the optical axis, y
             points to the right and z up in the image.
         camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
 

@@ -1,4 +1,4 @@
-"""Kinds of labels: what a data set gives and a task needs."""
+"""Kinds of labels, provided by data sets and required by tasks."""
 
 PIXEL_CLASSES = "pixel_classes"
 """A class index for every pixel; 0 is unknown, which is not a class of the network."""

@@ -23,32 +23,32 @@ def sample_rng(seed: Seed, epoch: int, index: int) -> np.random.Generator:
     Args:
         seed: Seed of the run.
         epoch: Epoch, from 0.
-        index: Place of the sample in its data set.
+        index: Index of the sample in its data set.
     """
     # A spawn key, not a longer seed: NumPy pads short seeds with zeros, so [1, 2] is [1, 2, 0].
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(epoch, index)))
 
 
 def sample_key(key: int | tuple[int, int], length: int) -> tuple[int, int]:
-    """Return epoch and index of a sample: an index alone is of epoch 0.
+    """Return epoch and index of a sample; an index alone means epoch 0.
 
     Args:
-        key: An index of a data set, which may count from its end; or an epoch and an index.
+        key: Index of a data set, negative from its end; or an epoch and an index.
         length: Number of samples.
 
     Raises:
-        IndexError: There are fewer samples.
+        IndexError: The index is out of range.
     """
     epoch, index = key if isinstance(key, tuple) else (0, key)
     return epoch, range(length)[index]
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Yields (epoch, index) in a new random order every epoch.
+    """Yield (epoch, index) in a new random order every epoch.
 
-    Every process gets the same number of samples, as gradients are exchanged at every step: the
-    last few of the epoch's order, fewer than there are processes, are dropped, different ones every
-    epoch.
+    Every process gets the same number of samples, because gradients are exchanged at every step.
+    Up to ``world_size - 1`` samples at the end of an epoch's order are dropped, different ones in
+    every epoch.
 
     Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: create
     the trainer with ``use_distributed_sampler=False``.
@@ -56,13 +56,13 @@ class EpochSampler(Sampler[tuple[int, int]]):
     Args:
         length: Number of samples in the data set.
         seed: Seed of the order.
-        rank: This process.
+        rank: Rank of this process.
         world_size: Number of processes.
         start: An epoch and the number of its samples that this process has consumed: a resumed run
             continues after them. The length stays that of a whole epoch.
 
     Raises:
-        SettingError: No samples, or fewer than processes.
+        SettingError: No samples, or fewer samples than processes.
     """
 
     def __init__(
@@ -79,7 +79,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         self._rank = rank
         self._world_size = world_size
         self._start = start
-        # Workers of a resumed run start to fetch before Lightning sets the epoch.
+        # Workers of a resumed run start fetching before Lightning sets the epoch.
         self._epoch = start[0]
 
     def set_epoch(self, epoch: int) -> None:
@@ -100,13 +100,13 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
 
 class ResumedOrder(SequentialSampler):
-    """The order of the data set, which in the first epoch begins after some samples.
+    """Order of the data set; the first epoch skips samples that a resumed run has consumed.
 
     Lightning keeps it with ``overfit_batches``.
 
     Args:
         dataset: The data set.
-        consumed: Number of these samples.
+        consumed: Number of samples to skip.
     """
 
     def __init__(self, dataset: Sized, consumed: int) -> None:
@@ -119,9 +119,9 @@ class ResumedOrder(SequentialSampler):
 
 
 def share_of_process(dataset: Dataset[Any]) -> Dataset[Any]:
-    """Return the samples of this process: of n processes, process r gets every n-th one from r on.
+    """Return the samples of this process: process r of n gets samples r, r + n, r + 2n and so on.
 
-    Each sample is in one share.
+    Each sample belongs to exactly one process.
 
     Raises:
         SettingError: No samples, or fewer than processes.
@@ -145,7 +145,7 @@ def _check_length(length: int, world_size: int) -> None:
 
 
 _FEWER = (
-    "Memory may be too small for as many: use fewer (0 works in the process itself), a lower "
+    "Memory may be too small for that many: use fewer (0 works in the process itself), a lower "
     "level, or a store (data.store=…, data.in_memory=false); or enlarge /dev/shm (docker run "
     "--shm-size=8g)."
 )
@@ -163,8 +163,8 @@ def make_loader(
 
     Args:
         dataset: Samples.
-        batch_size: Samples of a batch.
-        num_workers: Worker processes.
+        batch_size: Number of samples in a batch.
+        num_workers: Number of worker processes.
         seed: Seed of the loader's own random numbers.
         sampler: Order of the samples; by default that of the data set.
     """
@@ -172,7 +172,7 @@ def make_loader(
         dataset,
         batch_size=batch_size,
         sampler=sampler,
-        # Its own: the loader draws seeds for its workers, which would shift those of dropout.
+        # A separate generator: the loader draws seeds for its workers, which would shift dropout's.
         generator=torch.Generator().manual_seed(seed),
         num_workers=num_workers,
         persistent_workers=num_workers > 0,
@@ -186,11 +186,11 @@ def explained(error: Exception, num_workers: int) -> Exception:
 
     Args:
         error: The error.
-        num_workers: Worker processes of the loader.
+        num_workers: Number of worker processes of the loader.
 
     Returns:
-        The error of a worker as raised there; a remedy if a worker was killed; or the
-        same error.
+        The error as the worker raised it; an error with a remedy if a worker was killed;
+        otherwise the same error.
     """
     text = str(error)
     died = isinstance(error, RuntimeError) and text.startswith("DataLoader worker (pid")
@@ -210,7 +210,7 @@ def explained(error: Exception, num_workers: int) -> Exception:
 
 
 def this_process() -> tuple[int, int]:
-    """Rank and number of processes of this run."""
+    """Return the rank of this process and the number of processes of the run."""
     distributed = torch.distributed
     if distributed.is_available() and distributed.is_initialized():
         return distributed.get_rank(), distributed.get_world_size()

@@ -15,25 +15,25 @@ from tangent_train.files import parse_json, write_text
 def claim_folder(
     root: Path, manifest: str, generator: str, version: int, settings: Mapping[str, Any]
 ) -> None:
-    """Make sure that a folder is ours to write to, and mark it.
+    """Check that a folder may be written to, and mark it as generated.
 
     Args:
-        root: Folder of the data set: new, empty, or of the same settings.
-        manifest: Name of the file in it that marks it and holds the settings.
+        root: Folder of the data set: new, empty, or generated with the same settings.
+        manifest: Name of the file that marks the folder and holds the settings.
         generator: Name of the generator.
-        version: Its version; another version generates other files from the same settings.
-        settings: Its settings, plain values.
+        version: Version of the generator; other versions generate other files.
+        settings: Settings of the generator, plain values.
 
     Raises:
-        DataError: The folder holds other files, or data of other settings. Nothing is written.
+        DataError: The folder holds other files, or data of other settings; nothing is written.
     """
     about = {"generator": generator, "version": version}
     wanted, found = {**about, **settings}, dict[str, Any]()
     path = root / manifest
-    # Before the manifest: whoever makes the same at the same time writes that first.
+    # Before reading the manifest: a concurrent process writes it first.
     foreign = sorted(p.name for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
     if path.exists():
-        with suppress(ValueError, TypeError, KeyError):  # it is no manifest then
+        with suppress(ValueError, TypeError, KeyError):  # not a manifest
             content = parse_json(path.read_bytes())
             found = {key: content[key] for key in about} | content["settings"]
         if found != wanted:
@@ -42,7 +42,7 @@ def claim_folder(
                 path,
                 found=", ".join(f"{key}={found.get(key)}" for key in other),
                 expected=", ".join(f"{key}={wanted[key]}" for key in other),
-                remedy="Name another folder, or remove this one to make it anew.",
+                remedy="Name another folder, or delete this one to generate it again.",
             )
         return
     if foreign or (root.exists() and not root.is_dir()):

@@ -1,4 +1,4 @@
-"""Pairs of panoramas of one place, with depth and pose if known."""
+"""Pairs of panoramas of the same place, with depth and pose if known."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ class PairedPanorama(NamedTuple):
     """One panorama of a pair.
 
     Attributes:
-        name: Unique in the data set: the same panorama in another pair has the same name.
+        name: Unique name; a panorama has the same name in every pair.
         rgb: ``(H, W, 3)`` uint8.
-        file: The image it was read from.
+        file: Image file.
         distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
     """
@@ -44,9 +44,9 @@ class PanoramaPair(NamedTuple):
 
     Attributes:
         name: Unique among the pairs.
-        split: Its split, if given.
-        left: One of them.
-        right: The other.
+        split: Split of the pair, if given.
+        left: First panorama.
+        right: Second panorama.
     """
 
     name: str
@@ -56,15 +56,15 @@ class PanoramaPair(NamedTuple):
 
 
 class PublishedPair(NamedTuple):
-    """A pair of the paper, and its published scores.
+    """A pair of the paper with its published scores.
 
     Attributes:
         number: 0 to 59.
         split: ``easy`` or ``hard``.
-        left: Camera, abbreviated, and room: ``0f65e09_hallway_7``.
-        right: The same.
+        left: Abbreviated camera and room of the first panorama, e.g. ``0f65e09_hallway_7``.
+        right: Abbreviated camera and room of the second panorama.
         fov_overlap: Overlap of the fields of view, 0 to 1.
-        scores: PMR, MS and P, shares, by representation: ``ERP``, ``L0``, ``L1``, ``L2``.
+        scores: PMR, MS and P from 0 to 1, by representation: ``ERP``, ``L0``, ``L1``, ``L2``.
     """
 
     number: int
@@ -76,10 +76,10 @@ class PublishedPair(NamedTuple):
 
 
 class PanoramaPairs(ABC):
-    """Pairs to read one by one.
+    """Pairs of panoramas, read one at a time.
 
     Attributes:
-        published: The paper's scores by the name of a pair, for the paper's pairs.
+        published: The paper's scores by name of the pair, for the paper's pairs.
     """
 
     published: Mapping[str, PublishedPair] = MappingProxyType({})
@@ -90,11 +90,11 @@ class PanoramaPairs(ABC):
     @property
     @abstractmethod
     def pairs(self) -> Sequence[tuple[str, Any, Any]]:
-        """Unique names of the pairs, each with the files of its two panoramas."""
+        """Return the files of the two panoramas of each pair, by unique name of the pair."""
 
     @abstractmethod
     def image(self, files: Any) -> Path:
-        """The image of a panorama of `pairs`."""
+        """Return the image file of a panorama of `pairs`."""
 
     @abstractmethod
     def panorama(self, files: Any) -> PairedPanorama:
@@ -106,12 +106,12 @@ class PanoramaPairs(ABC):
 
     @property
     def names(self) -> list[str]:
-        """Names of the pairs, in their order."""
+        """Names of the pairs, in order."""
         return [name for name, _, _ in self.pairs]
 
     @property
     def files(self) -> list[Path]:
-        """The images of all panoramas, each once."""
+        """Image files of all panoramas, without duplicates."""
         sides = (side for _, *both in self.pairs for side in both)
         return list(dict.fromkeys(map(self.image, sides)))
 
@@ -127,11 +127,11 @@ class PanoramaPairs(ABC):
 
 
 def paired_shape(path: Path, rgb: NDArray[np.uint8], erp_height: int | None) -> tuple[int, int]:
-    """Rows and columns to downsample a panorama to: `erp_height`, or those of its image.
+    """Return the rows and columns to read a panorama at: `erp_height`, or those of its image.
 
     Raises:
-        DataError: It is no panorama.
-        SettingError: It has fewer rows.
+        DataError: The image is not a panorama.
+        SettingError: The image has fewer rows than `erp_height`.
     """
     size = (rgb.shape[0], rgb.shape[1])
     check_panorama_size(path, size, erp_height or 1)
@@ -142,15 +142,15 @@ class ImagePairs(PanoramaPairs):
     """Pairs of panoramas that are image files, without depth and pose.
 
     Args:
-        left: One panorama; together with `right`.
-        right: The other.
-        input: Instead: a folder of panoramas, or a pattern, see `image_paths`.
-        pairing: Of `input`: `consecutive`, each with the next in the order of the paths; or `all`,
-            each with each.
+        left: First panorama; requires `right`.
+        right: Second panorama.
+        input: Folder of panoramas, or a pattern, instead of `left` and `right`; see `image_paths`.
+        pairing: Pairs of `input`: `consecutive` (each panorama with the next in the order of the
+            paths) or `all` (every combination).
 
     Raises:
-        SettingError: Settings do not fit together.
-        DataError: There are no two panoramas.
+        SettingError: The settings exclude each other.
+        DataError: There are fewer than two panoramas.
     """
 
     def __init__(
@@ -188,7 +188,7 @@ class ImagePairs(PanoramaPairs):
 
     @property
     def pairs(self) -> list[tuple[str, int, int]]:
-        """The names of both files, and their places among the paths."""
+        """See `PanoramaPairs`; names of both files, with their indices in the paths."""
         return self._pairs
 
     def image(self, files: int) -> Path:
@@ -196,7 +196,7 @@ class ImagePairs(PanoramaPairs):
         return self._paths[files]
 
     def panorama(self, files: int) -> PairedPanorama:
-        """See `PanoramaPairs`; of one that is a part of the sphere the rest is black."""
+        """See `PanoramaPairs`; a partial panorama is black elsewhere."""
         path = self._paths[files]
         rgb = read_rgb(path)
         size = (rgb.shape[0], rgb.shape[1])

@@ -1,7 +1,7 @@
 """Panoramas and photos of any data set: their files, decoding, sizes and unknown pixels.
 
-Everything about one panorama (RGB, depth, labels) is brought to the size a run reads with **one**
-pixel grid: the outer edges of source and target agree, so target row i covers source rows
+RGB, depth and labels of a panorama are resized to the size that a run reads on **one** pixel
+grid: the outer edges of source and target agree, so target row i covers source rows
 ``i · H / h`` to ``(i + 1) · H / h``. RGB is averaged over that area; labels and depth are taken
 from the source pixel at its center.
 """
@@ -38,13 +38,13 @@ if TYPE_CHECKING:
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
 Unknown = Literal["labels", "any_black", "all_black"]
-"""Pixels that count as unknown besides unlabeled ones; see `mask_black`."""
+"""Pixels that are unknown in addition to unlabeled pixels; see `mask_black`."""
 
-Turn = float | Literal["so3"] | None
-"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or none."""
+TestRotation = float | Literal["so3"] | None
+"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or null."""
 
 STEPS_PER_M = 512
-"""Depth is in steps of 1/512 m, as in the files of Stanford2D3DS."""
+"""Steps of depth per meter, as in the files of Stanford2D3DS."""
 
 
 _MOST_STEPS = np.iinfo(np.uint16).max
@@ -55,9 +55,9 @@ class ImageFiles(NamedTuple):
 
     Attributes:
         name: Unique short name; ``/`` between groups.
-        rgb: Colors.
-        labels: Classes.
-        depth: Depth, where it is an input.
+        rgb: Color image.
+        labels: File of class labels.
+        depth: Depth image, if depth is an input.
         camera: File with the camera matrix, for photos with one file each.
     """
 
@@ -69,7 +69,7 @@ class ImageFiles(NamedTuple):
 
     @property
     def parts(self) -> dict[str, Path]:
-        """All files by content."""
+        """Files of the image by content."""
         return {part: path for part, path in self._asdict().items() if part != "name" and path}
 
 
@@ -80,56 +80,56 @@ class ImageReader(ABC):
     def settings(self) -> Mapping[str, str]:
         """Everything that affects labels and depth besides the files, such as a class table.
 
-        Each choice has a prepared store of its own; by default there is nothing to choose.
+        Each combination has a separate prepared store; by default there are no settings.
         """
         return {}
 
     @abstractmethod
     def size(self, part: str, path: Path) -> tuple[int, int] | None:
-        """Rows and columns from the header of a file, which must have the data set's format.
+        """Return rows and columns from the header of a file in the data set's format.
 
         Args:
             part: ``rgb``, ``labels`` or ``depth``.
-            path: The file; it has to be whole.
+            path: File, which must be complete.
 
         Returns:
-            None for labels that have no pixels of their own, but are drawn at any size.
+            None for labels that are not stored as pixels, but drawn at any size.
 
         Raises:
-            DataError: It is not.
+            DataError: The file is broken or has another format.
         """
 
     @abstractmethod
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colors, ``(H, W, 3)``."""
+        """Return the colors, ``(H, W, 3)`` uint8."""
 
     @abstractmethod
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes, 0 where unknown.
+        """Return the labels, 0 where unknown.
 
         Args:
             files: Files of the image.
-            shape: ``(h, w)`` of the result, see `resize_nearest`; by default that of the file.
+            shape: ``(h, w)`` of the result, see `resize_nearest`; by default the size of the file.
 
         Raises:
-            DataError: The file is broken, or holds a value without a class.
+            DataError: The file is broken, or contains a value that is not a class.
         """
 
     def label_warning(self, files: ImageFiles) -> str:
-        """Return a finding about labels that can be used; empty without one."""
+        """Return a warning about usable labels, or an empty string."""
         del files
         return ""
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth of photos."""
+        """Return depth ``(H, W)`` in steps of 1/512 m, 0 where missing; z-depth for photos."""
         raise NotImplementedError(files.name)
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """``(3, 3)`` K of a photo for integer pixel centers, without skew."""
+        """Return ``(3, 3)`` K of a photo for integer pixel centers, without skew."""
         raise NotImplementedError(files.name)
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
-        """Pose in a world of meters, see `LabeledImage`; None if it is unknown."""
+        """Return the pose in meters, see `LabeledImage`; None if unknown."""
         del files
         return None
 
@@ -138,7 +138,7 @@ class PngReader(ImageReader):
     """Decoder of the PNG files of a release.
 
     Attributes:
-        formats: Bits per channel and kinds of colors (`PngHeader.color`) by part.
+        formats: Bits per channel and allowed color types (`PngHeader.color`), by part.
     """
 
     formats: Mapping[str, tuple[int, Sequence[str]]]
@@ -149,7 +149,7 @@ class PngReader(ImageReader):
         return header.height, header.width
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colors; alpha is dropped."""
+        """Return the colors without alpha."""
         return read_rgb(files.rgb)
 
 
@@ -158,8 +158,8 @@ class Panorama(NamedTuple):
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` uint16 distance from the center in steps of 1/512 m, 0 where missing; or
-            None. See `steps_to_meters`.
+        depth: ``(H, W)`` uint16 distance from the center in steps of 1/512 m, 0 where missing; None
+            if not read. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
         up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
 
@@ -172,13 +172,13 @@ class Panorama(NamedTuple):
     up: NDArray[np.float64] | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
-        """The sampler of its views: the representation, aligned with gravity."""
+        """Return the sampler of its views: the representation, aligned with gravity."""
         if self.up is None:
             return representation
         return representation.with_rotation(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> NDArray[np.uint8]:
-        """All labels: predictions are rendered back to the panorama."""
+        """Return the labels that predictions on the panorama are compared with: all of them."""
         del representation
         return self.labels
 
@@ -191,7 +191,7 @@ def resize_area(image: NDArray[np.uint8], shape: tuple[int, int]) -> NDArray[np.
 def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_Pixel]:
     """Downsample ``(H, W[, C])`` to ``shape``: the pixel at the center of each target pixel.
 
-    Where that is a corner of four pixels (even ratios) it is the lower right one.
+    Where the center is a corner of four pixels (even ratios), the lower right pixel is taken.
     """
     resized: Any = resize(image, shape, "nearest")
     return resized
@@ -200,8 +200,8 @@ def resize_nearest(image: NDArray[_Pixel], shape: tuple[int, int]) -> NDArray[_P
 def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
     """Downsample raw depth ``(H, W)``, 0 where missing, without mixing values.
 
-    As `resize_nearest`, but where that pixel is missing, the valid pixel nearest to the center,
-    of those in the area of the target pixel, is taken instead.
+    Like `resize_nearest`, but where the center pixel is missing, the nearest valid pixel within
+    the area of the target pixel is taken.
     """
     small = resize_nearest(depth, shape)
     holes = np.nonzero(small == 0)
@@ -227,14 +227,14 @@ def mask_black(
 ) -> NDArray[np.uint8]:
     """Make black pixels unknown.
 
-    The released code of the paper does `any_black`, in training and in evaluation alike, on the
-    pixels of the file before they are resized; so do we, at the pixels the labels are taken from.
+    The paper's released code applies `any_black` in training and evaluation, before resizing. This
+    function does the same at the pixels that the labels are taken from.
 
     Args:
         labels: ``(H, W)``.
         rgb: ``(H, W, 3)`` at the same pixels.
-        unknown: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0,
-            `all_black` where all are.
+        unknown: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0;
+            `all_black` where all channels are 0.
 
     Returns:
         ``(H, W)`` labels.
@@ -246,13 +246,13 @@ def mask_black(
 
 
 def steps_to_meters(steps: NDArray[np.uint16]) -> NDArray[np.float32]:
-    """Depth in meters, float32, NaN where missing, of depth in steps of 1/512 m."""
+    """Convert depth in steps of 1/512 m to meters, float32, NaN where missing."""
     meters = steps.astype(np.float32) / np.float32(STEPS_PER_M)
     return np.where(steps == 0, np.float32(np.nan), meters)
 
 
 def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Depth in steps of 1/512 m, rounded, at most 65535 (128 m), of depth in meters.
+    """Convert depth in meters to steps of 1/512 m, rounded, at most 65535 (128 m).
 
     Depth below half a step is rounded up to one step: 0 means missing.
 
@@ -268,11 +268,11 @@ class Photo(NamedTuple):
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` uint16 distance from the center of projection in steps of 1/512 m, 0 where
-            missing: the same meaning as in panoramas; or None. See `distance_from_z_depth`.
+        depth: ``(H, W)`` uint16 distance from the center of projection, as in panoramas, in steps
+            of 1/512 m, 0 where missing; None if not read. See `distance_from_z_depth`.
         labels: ``(H, W)`` uint8, 0 where unknown.
         camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
-        up: Unknown.
+        up: None; the up direction of a photo is unknown.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -284,12 +284,12 @@ class Photo(NamedTuple):
     up: None = None
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
-        """The sampler of its crops, which depend on its camera."""
+        """Return the sampler of its crops, which depend on its camera."""
         height, width = self.labels.shape
         return representation.of_camera(self.camera_matrix, (height, width))
 
     def target(self, representation: PerspectiveRepresentation) -> NDArray[np.uint8]:
-        """``(n, d, d)`` labels of the crops, each place of the photo in one of them only."""
+        """Return ``(n, d, d)`` labels of the crops; every pixel of the photo is in one crop."""
         (crops,) = self.sampler(representation).view_sets()
         return np.where(crops.owned(), crops.render(self.labels, "nearest"), np.uint8(0))
 
@@ -297,7 +297,7 @@ class Photo(NamedTuple):
 def distance_from_z_depth(
     z_depth: NDArray[np.uint16], camera_matrix: NDArray[np.float64]
 ) -> NDArray[np.uint16]:
-    """Distance from the center of projection, as in panoramas, from z-depth.
+    """Convert z-depth to the distance from the center of projection, as in panoramas.
 
     Args:
         z_depth: ``(H, W)`` depth along the optical axis in any unit, 0 where missing.
@@ -311,7 +311,7 @@ def distance_from_z_depth(
 
 
 def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.float64]:
-    """Distance per z-depth of all pixels of an image of some rows and columns, ``(H, W)``."""
+    """Return the ratio of distance to z-depth for every pixel of an image, ``(H, W)``."""
     # A ray (x, y, 1) is √(1 + x² + y²) long.
     y_squared, x_squared = (
         ((np.arange(count) - camera_matrix[axis, 2]) / camera_matrix[axis, axis]) ** 2
@@ -327,9 +327,9 @@ class _Reading:
 
     Attributes:
         reader: Reader of the data set.
-        num_classes: K + 1, the unknown class included.
-        shape: Rows and columns of the result; None for those of the files.
-        kind: Kind of the images.
+        num_classes: K + 1, including the unknown class.
+        shape: Rows and columns of the result; None for the size of the files.
+        kind: Named tuple that is returned, `Panorama` or `Photo`.
     """
 
     reader: ImageReader
@@ -344,7 +344,7 @@ class _Reading:
 
     @property
     def layout(self) -> Layout:
-        """The arrays of an image, as a store holds them."""
+        """Arrays of an image in a store."""
         height, width = self.shape or ("H", "W")
         return {
             "rgb": Declared("uint8", (height, width, 3)),
@@ -353,7 +353,7 @@ class _Reading:
         }
 
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Its labels alone, none beyond the classes."""
+        """Return only the labels, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
@@ -367,11 +367,11 @@ class _Reading:
     def parts(
         self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str]
     ) -> dict[str, Callable[[ImageFiles], object]]:
-        """Return functions that decode the file of a part, by part.
+        """Return functions that decode one file of an image, by part.
 
         Args:
-            label_counts: The pixels of each label are added under the name of the image.
-            warnings: Warnings of labels are added.
+            label_counts: Collects the number of pixels of each label by name of the image.
+            warnings: Collects warnings about labels.
         """
 
         def count_labels(files: ImageFiles) -> None:
@@ -386,12 +386,12 @@ class _Reading:
 
 
 class PanoramaReading(_Reading):
-    """Reads panoramas at one size."""
+    """Reads panoramas, all at the same size."""
 
     kind = Panorama
 
     def __call__(self, files: ImageFiles) -> Panorama:
-        """One panorama."""
+        """Read one panorama."""
         shape: Any = self.shape
         depth = None if files.depth is None else resize_depth(self.reader.depth(files), shape)
         return Panorama(resize_area(self.reader.rgb(files), shape), depth, self.labels(files))
@@ -408,7 +408,7 @@ class PhotoReading(_Reading):
         return {**super().layout, "camera_matrix": Declared("float64", (3, 3))}
 
     def __call__(self, files: ImageFiles) -> Photo:
-        """One photo."""
+        """Read one photo."""
         camera_matrix = self.reader.camera(files)
         depth = None
         if files.depth is not None:
@@ -419,16 +419,16 @@ class PhotoReading(_Reading):
 def check_headers(
     files: ImageFiles, reader: ImageReader, problems: Problems, erp_height: int | None = None
 ) -> tuple[int, int] | None:
-    """Check that all files of an image are there, whole and of one size; nothing is decoded.
+    """Check, without decoding, that the files of an image are complete and have one size.
 
     Args:
         files: Files of the image.
         reader: Reader of the data set.
-        problems: Problems are added under the image's name.
+        problems: Collects problems under the image's name.
         erp_height: Required rows of a panorama; None for photos.
 
     Returns:
-        Rows and columns; None where the colors cannot be used.
+        Rows and columns; None if the color image cannot be used.
     """
     size: tuple[int, int] | None = None
     for part in ("rgb", "labels", "depth"):
@@ -446,7 +446,7 @@ def check_headers(
             elif size not in (None, found):
                 remedy = "Export or copy both at one size."
                 if found[::-1] == size:
-                    remedy = "Export it as the image is displayed, turned as its EXIF data say."
+                    remedy = "Export it as the image is displayed, rotated as its EXIF data say."
                 raise DataError(
                     path,
                     found=width_height(found),

@@ -1,4 +1,4 @@
-"""Problems of a data set, all of them collected."""
+"""Problems of a data set, collected instead of raised one by one."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Problem(NamedTuple):
         file: File or folder.
         finding: The problem.
         remedy: The remedy; may be empty.
-        item: Name of the image or shape that cannot be used; None if none of the data set can.
-        error: The error that says all this.
+        item: Name of the unusable image or shape; None if the whole data set is unusable.
+        error: Error with the same content.
     """
 
     file: str
@@ -38,10 +38,10 @@ class Problem(NamedTuple):
 
 
 class Problems:
-    """Collects problems; several threads may do so at once.
+    """Collects problems; safe to use from several threads.
 
     Attributes:
-        warnings: Findings about files that can be used.
+        warnings: Warnings about usable files.
     """
 
     def __init__(self) -> None:
@@ -50,11 +50,11 @@ class Problems:
 
     @contextmanager
     def noted(self, item: str | None = None, file: Path | None = None) -> Iterator[None]:
-        """A block after whose errors the check continues.
+        """Return a context whose errors are noted, so that the check continues.
 
         Args:
             item: Name of the unusable item; None for the whole data set.
-            file: The broken file, if the error does not name it first.
+            file: Broken file, if the error does not name it first.
 
         Raises:
             NoRoomError: The disk is full.
@@ -86,22 +86,22 @@ class Problems:
         self._noted += others._noted
 
     def listed(self) -> list[Problem]:
-        """All problems, each once, sorted by file."""
+        """Problems without duplicates, sorted by file."""
         once = {(problem.file, problem.finding): problem for problem in self._noted}
         return [once[key] for key in sorted(once)]
 
     @property
     def fatal(self) -> bool:
-        """True if one of them concerns the whole data set."""
+        """True if a problem concerns the whole data set."""
         return any(problem.item is None for problem in self._noted)
 
     @property
     def items(self) -> set[str]:
-        """Names of the images or shapes that cannot be used."""
+        """Names of unusable images or shapes."""
         return {p.item for p in self._noted if p.item is not None}
 
     def without(self, items: Iterable[_Item]) -> list[_Item]:
-        """Usable images or shapes."""
+        """Return the usable images or shapes."""
         broken = self.items
         return [item for item in items if item.name not in broken]
 
@@ -109,12 +109,12 @@ class Problems:
         """Raise the noted problems, if any.
 
         Args:
-            root: The data set.
-            remedy: Further remedy for a list of problems.
+            root: Folder of the data set.
+            remedy: Additional remedy for a list of problems.
 
         Raises:
-            DataError: One problem, or a list of all.
-            SettingError: A setting suits none of the images.
+            DataError: Lists all problems, or is the only one.
+            SettingError: A setting fits none of the images.
         """
         listed = self.listed()
         if not listed:

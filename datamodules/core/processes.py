@@ -1,4 +1,4 @@
-"""Work in several processes: results as they complete; an interrupt finishes the begun pieces."""
+"""Work in several processes; after an interrupt, started work is finished."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ def in_processes(
     workers: int | None = None,
     least: int = 1,
 ) -> Generator[_Result]:
-    """``work(*piece)`` of all pieces, in the order in which they are done.
+    """Yield ``work(*piece)`` for all pieces, in the order of completion.
 
-    After an interrupt the pieces begun are finished, no others.
+    After an interrupt, started pieces are finished and no others are started.
 
     Args:
         work: A function of a module.
-        pieces: Arguments of the function, for each piece of work.
-        workers: Number of processes, by default one per CPU core; 0 and 1 work in this one.
-        least: Pieces per process that justify starting it.
+        pieces: Arguments of the function for each piece of work.
+        workers: Number of processes, by default one per CPU core; 0 and 1 mean this process.
+        least: Smallest number of pieces that justifies starting a process.
     """
     cores = os.cpu_count() or 1
     processes = min(cores if workers is None else workers, -(-len(pieces) // least))
@@ -59,7 +59,7 @@ def in_processes(
 
 @contextmanager
 def _one_thread_each() -> Iterator[None]:
-    """Limit processes started inside to one linear algebra thread each."""
+    """Limit child processes started in this context to one linear algebra thread each."""
     before = {name: os.environ.get(name) for name in _THREADS}
     os.environ.update(dict.fromkeys(_THREADS, "1"))
     try:
@@ -73,13 +73,13 @@ def _one_thread_each() -> Iterator[None]:
 
 
 def _prepare_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what is still done
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
     cv2.setNumThreads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """End this worker with its parent: it would wait for work forever if the parent was killed."""
+    """End this worker when its parent ends; otherwise it would wait for work forever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])

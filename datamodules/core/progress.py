@@ -1,4 +1,4 @@
-"""Progress of work on files: bars on a terminal, a line a minute elsewhere."""
+"""Progress of work on files: a bar on a terminal, a line per minute elsewhere."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ _EVERY_S = 60.0
 
 
 class PlainLines:
-    """Lines of progress where the output is no terminal: at most one a minute."""
+    """Lines of progress for output that is not a terminal: at most one per minute."""
 
     def __init__(self) -> None:
         self._last = time.monotonic()
 
     def print(self, line: str, *, at_once: bool = False) -> None:
-        """Print a line, if it is time for one.
+        """Print a line if the last one is a minute old.
 
         Args:
-            line: Without its end.
+            line: Text without line end.
             at_once: True to print it in any case.
         """
         console = get_console()
@@ -41,7 +41,7 @@ class PlainLines:
 
 
 class _Progress(Progress):
-    """A bar, or lines, of one task."""
+    """Progress of one task, as a bar or as lines."""
 
     def __init__(self, *columns: Any, **settings: Any) -> None:
         self._lines = PlainLines()
@@ -59,13 +59,13 @@ class _Progress(Progress):
         each_s = (time.monotonic() - self._begun) / done
         rate = _rate(each_s, task.fields["unit"])
         super().update(task_id, rate=rate)
-        # rich's own estimate is of the last 30 seconds, in which nothing may have been finished.
+        # rich estimates from the last 30 seconds, in which possibly no piece was finished.
         left = timedelta(seconds=round(each_s * (total - task.completed)))
         self._lines.print(f"{text}, {rate}, {left} left")
 
 
 def _rate(each_s: float, unit: str) -> str:
-    """How many pieces are done in a second, a minute or an hour.
+    """Return the number of pieces per second, minute or hour.
 
     >>> _rate(0.5, " rooms"), _rate(45, ""), _rate(5000, "")
     ('2.0 rooms/s', '1.3/min', '0.7/h')
@@ -76,7 +76,7 @@ def _rate(each_s: float, unit: str) -> str:
 
 
 def progress_bar() -> Progress:
-    """A bar for a task with `unit`, `before` (pieces that were done before) and an empty `rate`."""
+    """Return a bar for a task with `unit`, `before` (pieces done earlier) and an empty `rate`."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -94,14 +94,14 @@ def show_progress(
     total: int,
     before: int = 0,
 ) -> None:
-    """Consume finished pieces of work and show the progress, unless all were done before.
+    """Consume finished pieces of work and show progress, unless all were done earlier.
 
     Args:
-        done: Yields something whenever a piece is done.
+        done: Iterator that yields once per finished piece.
         description: Description of the work.
-        unit: Pieces, in the plural.
+        unit: Name of the pieces, in the plural.
         total: Number of pieces.
-        before: Pieces that were done before.
+        before: Number of pieces done earlier.
     """
     if before == total:
         return

@@ -1,4 +1,4 @@
-"""Reading the images or shapes of one split: from files, a store or memory."""
+"""Reading the images or shapes of one split from files, a store or memory."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _Item = TypeVar("_Item", bound=Item)
 _Image = TypeVar("_Image")
 
 Transform = Callable[[_Image, int, _Item], _Image]
-"""Changes an image, given its place in the split and its files."""
+"""Function that changes an image, given its index in the split and its files."""
 
 
 class SplitReader(Generic[_Item, _Image]):
-    """The images of one split, by number.
+    """Reader of the images of one split, by index.
 
     Args:
-        index: All images; arrays of its store are memory-mapped, not copied.
-        split: The split.
-        transforms: Changes to every image, in their order.
+        index: Index of all images; arrays of its store are memory-mapped, not copied.
+        split: Name of the split.
+        transforms: Transforms of every image, in order.
 
     Attributes:
         items: Files of each image.
-        transforms: Changes to every image, in their order.
+        transforms: Transforms of every image, in order.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class SplitReader(Generic[_Item, _Image]):
         return self.items[index].name
 
     def read(self, index: int) -> _Image:
-        """One image; its arrays may be shared or read-only.
+        """Read one image; its arrays may be shared or read-only.
 
         Raises:
             DataError: A file is broken, or its prepared version is missing or out of date.
@@ -67,7 +67,7 @@ class SplitReader(Generic[_Item, _Image]):
         return image
 
     def labels(self, index: int) -> NDArray[np.uint8]:
-        """The labels of one image, cheaper than the whole image."""
+        """Read the labels of one image, which is faster than the whole image."""
         decode: Any = self._decode
         is_decoded = self._kept or self.transforms or self._store is not None
         image: Any = self.read(index) if is_decoded else None
@@ -77,21 +77,21 @@ class SplitReader(Generic[_Item, _Image]):
     def keep_in_memory(self, root: object) -> None:
         """Read all images now and keep them in memory.
 
-        Done before the loader's workers start, which then share the memory (on systems that fork);
-        every process of a distributed run keeps its own.
+        Call this before the loader's workers start: where processes fork, they share the memory.
+        Every process of a distributed run keeps a copy.
 
         Args:
-            root: The data set, for messages.
+            root: Folder of the data set, for error messages.
 
         Raises:
-            DataError: Some are broken; all of these are named.
+            DataError: Lists all broken images.
         """
         problems = Problems()
 
         def keep(index: int) -> Any:
             with problems.noted(self.name(index)):
                 image: Any = self.read(index)
-                # Copies: arrays that are views of a file would keep it open.
+                # Copies, because arrays that are views of a file keep it open.
                 return image._make(None if a is None else np.array(a) for a in image)
 
         kept = list(in_threads(keep, range(len(self))))
@@ -100,7 +100,7 @@ class SplitReader(Generic[_Item, _Image]):
 
     def _stored(self, store: Store, item: _Item) -> _Image:
         arrays = store.read(item.name, item.parts)
-        # Prepared with depth, they also serve runs without.
+        # A store prepared with depth also serves runs without depth.
         read = {key: a for key, a in arrays.items() if key != "depth" or "depth" in item.parts}
         image: _Image = self._kind(**{**dict.fromkeys(self._kind._fields), **read})
         return image

@@ -23,21 +23,21 @@ from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 Inputs = Sequence[Tensor]
-"""RGB, perhaps depth and elevation as they were rendered, see `TrainingSample`."""
+"""Rendered RGB, optionally depth and elevation, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):
-    """One panorama or photo seen through P images; collated, each has a leading batch dimension.
+    """P views of one panorama or photo; collating adds a leading batch dimension.
 
     Attributes:
-        images: From the loader as rendered, to save bytes: RGB ``(P, h, w, 3)`` uint8, optionally
-            depth ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32. On the device
-            `normalize` makes them ``(P, C, h, w)`` float32.
+        images: As rendered, to save bytes: RGB ``(P, h, w, 3)`` uint8, optionally depth
+            ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32. `normalize` converts them to
+            ``(P, C, h, w)`` float32 on the device.
         labels: ``(P, h, w)`` uint8, 0 where unknown.
         rays: ``(P, 3, 3)`` float32 viewing rays, see `world_rays`; or ``(0, 3, 3)``.
-        index: Place in its split.
+        index: Index in its split.
     """
 
     images: _Images
@@ -47,14 +47,14 @@ class TrainingSample(NamedTuple, Generic[_Images]):
 
 
 class EvaluationSample(NamedTuple, Generic[_Images]):
-    """One whole panorama or photo; collated, each has a leading batch dimension.
+    """One whole panorama or photo; collating adds a leading batch dimension.
 
     Attributes:
-        images: Images of all view sets, one set after the other, as in `TrainingSample`.
-        target: uint8 labels, 0 where unknown: ``(H, W)`` of the panorama itself; ``(N, h, w)`` of
-            the crops of a photo.
+        images: Views of all view sets, one set after the other, as in `TrainingSample`.
+        target: uint8 labels, 0 where unknown: ``(H, W)`` of a panorama; ``(N, h, w)`` of the
+            crops of a photo.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
-        index: Place in its split.
+        index: Index in its split.
     """
 
     images: _Images
@@ -99,7 +99,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
 
 @dataclass(frozen=True)
 class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
-    """Whole images, by index or (epoch, index); the epoch changes nothing.
+    """Whole images, by index or (epoch, index); the epoch is ignored.
 
     Attributes:
         source: The images.
@@ -129,7 +129,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
     """Render the inputs of a network, before `normalize`.
 
     Args:
-        image: A `Panorama` or `Photo`; its `depth` is needed if that is an input.
+        image: A `Panorama` or `Photo`, with `depth` if depth is an input.
         views: Views of the image.
         inputs: See `Input`.
 
@@ -140,7 +140,8 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
     rendered = [_tensor(views.render(image.rgb, "bilinear"))]
     if "depth" in inputs and image.depth is not None:
         steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
-        rendered.append(torch.from_numpy(steps.view(np.int16)))  # torch hardly knows uint16
+        # torch has few operations on uint16.
+        rendered.append(torch.from_numpy(steps.view(np.int16)))
     if "elevation" in inputs:
         shape = (image.rgb.shape[0], image.rgb.shape[1])
         up = image.up
@@ -150,7 +151,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
 
 
 def world_rays(views: Views, up: NDArray[np.float64] | None) -> NDArray[np.float32]:
-    """Viewing rays in a world whose zenith is z, see `Views.rays`.
+    """Return viewing rays in a world whose zenith is z, see `Views.rays`.
 
     Args:
         views: Views of a panorama.
@@ -168,7 +169,7 @@ def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:
-    # What is rendered may be the panorama itself, shared or a read-only file: that is copied.
+    # The rendered array may be the panorama itself, shared or a read-only file: copy it.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)
 
 
@@ -176,20 +177,20 @@ _HUE_SHARE = 0.1
 
 
 def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Tensor:
-    """Change brightness, contrast, saturation and, a little, hue of all images alike.
+    """Change brightness, contrast, saturation and (slightly) hue, equally for all images.
 
     Args:
         rgb: ``(n, h, w, 3)`` uint8, views of one panorama or photo.
         strength: 0 to 1. The factors of the first three are uniform in 1 ± strength, hue is
             rotated by up to strength / 10 of the circle either way.
-        rng: Generator of four numbers.
+        rng: Random generator; four numbers are drawn.
 
     Returns:
         ``(n, h, w, 3)`` uint8.
     """
     brightness, contrast, saturation = rng.uniform(1 - strength, 1 + strength, 3)
     hue = rng.uniform(-1, 1) * strength * _HUE_SHARE
-    # One high image: contrast is about the mean of all, or neighbors would part at their seams.
+    # As one tall image: with one mean for all, neighboring views keep equal colors at seams.
     image = rgb.flatten(0, 1).movedim(-1, 0)
     image = functional.adjust_brightness(image, brightness)
     image = functional.adjust_contrast(image, contrast)

@@ -33,11 +33,11 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
     Create the trainer with ``use_distributed_sampler=False``, see `EpochSampler`.
 
     Args:
-        num_workers: Worker processes of a loader; the samples are the same for any number.
+        num_workers: Number of worker processes of a loader; samples do not depend on it.
 
     Attributes:
-        try_step: Refuses a training step of some items, before these are decoded; None before a
-            task is known.
+        try_step: Function that refuses an impossible training step before data are decoded; None
+            before the task is known.
 
     Raises:
         SettingError: A setting is invalid.
@@ -62,7 +62,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         return f"{self.noun}_per_step"
 
     def evaluation_size(self) -> int:
-        """Samples of a batch in validation and test."""
+        """Number of samples in a batch of validation and test."""
         return 1
 
     # --- preparation ---------------------------------------------------------------------------
@@ -73,7 +73,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         An evaluation prepares the test split only.
 
         Raises:
-            DataError: Something is broken.
+            DataError: An item is broken.
         """
         self.make_files()
         stage = None if self.trainer is None else self.trainer.state.fn
@@ -92,24 +92,24 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
             problems.refuse(self.root, REMEDY)
 
     def setup(self, stage: str | None = None) -> None:
-        """Find and check the items, once: processes of one run take the index of the first.
+        """Find and check the items once; other processes of the run take the index of the first.
 
         Args:
-            stage: Ignored: the test data are checked before training too.
+            stage: Ignored, because the test data are checked before training too.
 
         Raises:
             DataError: Something is broken; the message names all problems.
             SettingError: A setting does not suit the data.
         """
         if self.trainer is not None:
-            # Only the first has run `prepare_data`: the others do not read everything again.
+            # Only the first process has run `prepare_data`; others need not read everything again.
             self._index = self.trainer.strategy.broadcast(self._index)
         self.index()
 
     # --- loaders -------------------------------------------------------------------------------
 
     def train_dataloader(self) -> DataLoader[Any]:
-        """Batches for training; with ``overfit_batches`` the same views in every epoch."""
+        """Return the training batches; with ``overfit_batches``, the same views in every epoch."""
         if getattr(self.trainer, "overfit_batches", 0):
             share: Any = share_of_process(self.dataset("train"))
             return self._loader(share, self.per_step, ResumedOrder(share, self._start[1]))
@@ -117,8 +117,8 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         count = len(self.source("train"))
         if left_out := count % world_size:
             rank_zero_warn(
-                f"{left_out} of {count} training {self.noun}, others every time, are left "
-                f"out of each epoch: {world_size} processes take as many each.",
+                f"{left_out} of {count} training {self.noun}, different ones each time, are left "
+                f"out of each epoch: {world_size} processes take equally many.",
                 category=UserWarning,
             )
         seed = self.seed, self.sampling_seed
@@ -126,11 +126,11 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         return self._loader(self.dataset("train"), self.per_step, sampler)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
-        """Batches for validation; no loader when there is no validation split."""
+        """Return the validation batches; no loader without a validation split."""
         return self._evaluation_loader("val") if len(self.source("val")) else []
 
     def test_dataloader(self) -> DataLoader[Any]:
-        """Batches for the test."""
+        """Return the test batches."""
         return self._evaluation_loader("test")
 
     def _evaluation_loader(self, split: Split) -> DataLoader[Any]:
@@ -142,14 +142,14 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         return make_loader(dataset, batch_size, self.num_workers, self.seed, sampler)
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """Normalize the images of a batch, on the device they are on now.
+        """Normalize the images of a batch on their current device.
 
         Args:
             batch: A collated sample of a loader.
             dataloader_idx: Ignored.
 
         Returns:
-            The same with float32 images, channels first.
+            The batch with float32 images, channels first.
         """
         images = self.normalized(batch)
         if self.trainer is not None:  # which converted the batch when it had no float images yet
@@ -159,7 +159,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
     # --- resuming ------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, int]:
-        """Training position: the epoch, and its finished batches."""
+        """Return the training position: the epoch and its finished batches."""
         trainer = self.trainer
         if trainer is None:
             return {}
@@ -175,10 +175,10 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         }
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Let the next training loader continue there, with the same order and views.
+        """Make the next training loader continue at this position, with the same order and views.
 
         Raises:
-            SettingError: Other processes or batches would divide the epoch differently.
+            SettingError: Another number of processes or batch size divides the epoch differently.
         """
         processes = 1 if self.trainer is None else self.trainer.world_size
         now = processes, self.per_step
@@ -187,7 +187,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
             raise SettingError(
                 f"trainer.devices and data.{self._per_step}",
                 found=f"{now[0]} processes of {now[1]} {self.noun}",
-                expected=f"{before[0]} of {before[1]}, as before",
+                expected=f"{before[0]} of {before[1]}, as in the interrupted run",
                 remedy="Within an epoch, resume as the run was started.",
             )
         self._start = state_dict["epoch"], state_dict["batches"] * self.per_step

@@ -1,11 +1,11 @@
-"""The prepared store: data decoded once and then memory-mapped by every sample.
+"""Prepared store: data decoded once, then memory-mapped by every sample.
 
 A store is a folder of ``.npy`` files, one for each panorama, photo or shape. A file holds one
 record whose fields are the arrays (``numpy.load`` reads it), followed by one line of JSON: name,
-size and time of the files it was made from, and a checksum of everything before. It counts as out
-of date when the files change.
+size and time of the source files, and a checksum of everything before. It is out of date when the
+source files change.
 
-Memory-mapped: rendering a tangent image touches only the pages it needs, shared by all processes.
+Memory-mapped: rendering a tangent image reads only the pages it needs, shared by all processes.
 docs/how-to/prepared_store.md compares this with other formats.
 """
 
@@ -34,9 +34,9 @@ class Declared(NamedTuple):
     """An array of every item of a store.
 
     Attributes:
-        dtype: Name of its type.
-        shape: Its sides; named ones have any length, which arrays of one item share.
-        most: Its largest value; None if any is allowed.
+        dtype: Name of the type.
+        shape: Sides; a named side has the same length in all arrays of an item.
+        most: Largest allowed value; None for no limit.
     """
 
     dtype: str
@@ -44,17 +44,17 @@ class Declared(NamedTuple):
     most: int | None = None
 
     def __str__(self) -> str:
-        """As messages show it."""
+        """Format for messages."""
         most = "" if self.most is None else f" up to {self.most}"
         return f"{self.dtype} ({', '.join(map(str, self.shape))}){most}"
 
     def allows(self, array: NDArray[Any], lengths: dict[int | str, int], *, values: bool) -> bool:
-        """True if an array of an item is as declared.
+        """Return True if an array of an item is as declared.
 
         Args:
             array: The array.
-            lengths: Sides of the item so far; those of the array are added.
-            values: True to compare its values with the largest.
+            lengths: Lengths of named sides so far; those of the array are added.
+            values: True to check the largest value too.
         """
         if array.dtype != self.dtype or array.ndim != len(self.shape):
             return False
@@ -64,15 +64,15 @@ class Declared(NamedTuple):
 
 
 Layout = Mapping[str, Declared]
-"""Arrays by name; an item has all but perhaps ``depth``."""
+"""Declared arrays by name; only ``depth`` is optional."""
 
 
 class Store:
     """A folder of prepared arrays.
 
     Args:
-        folder: The folder; created on the first write.
-        layout: The arrays that items may have.
+        folder: Folder, created on the first write.
+        layout: Declared arrays of an item.
     """
 
     def __init__(self, folder: Path, layout: Layout) -> None:
@@ -84,13 +84,13 @@ class Store:
     def of(
         cls, folder: Path | None, name: str, settings: Mapping[str, str], layout: Layout
     ) -> Store | None:
-        """Store of one choice of settings, in its own subfolder.
+        """Return the store for some settings, in a separate subfolder.
 
         Args:
-            folder: Folder of the stores of all choices; None for no store.
+            folder: Folder of the stores for all settings; None for no store.
             name: Prefix of the subfolder's name.
             settings: Settings that affect the arrays besides the files.
-            layout: The arrays that items may have.
+            layout: Declared arrays of an item.
         """
         if folder is None:
             return None
@@ -98,7 +98,7 @@ class Store:
         return cls(folder / f"{name}_{digest[:8]}", layout)
 
     def path(self, name: str) -> Path:
-        """The file of one item."""
+        """Return the file of one item."""
         return self.folder / f"{name}.npy"
 
     def make(
@@ -109,13 +109,13 @@ class Store:
         Args:
             name: Name of the item, with ``/`` between folders.
             files: Source files of the item, by part.
-            read: Decodes them to named arrays.
+            read: Function that decodes the files to named arrays.
 
         Raises:
             DataError: A file is broken.
             NoRoomError: The disk is full.
         """
-        # Asked before the files are read: a change meanwhile is noticed later.
+        # Taken before the files are read, so that a change meanwhile is noticed later.
         made_from = _stamps(files)
         arrays = read()
         record = np.empty((), [(key, a.dtype, a.shape) for key, a in arrays.items()])
@@ -130,18 +130,18 @@ class Store:
     def read(
         self, name: str, files: Mapping[str, Path], *, whole: bool = True
     ) -> dict[str, NDArray[Any]]:
-        """The arrays of one item, read-only views of its file.
+        """Return the arrays of one item, as read-only views of its file.
 
-        Types and shapes, and the source files, are checked every time; all bytes against the
-        checksum, and the largest values, the first time only.
+        Types, shapes and source files are checked every time; the checksum and the largest values
+        only the first time.
 
         Args:
             name: Name of the item.
-            files: Required source files; it may have more.
+            files: Required source files; the stored item may have more.
             whole: True to check the content too.
 
         Raises:
-            DataError: It is missing, damaged, out of date, or has other arrays than declared.
+            DataError: The file is missing, damaged, out of date, or differs from the declaration.
         """
         path = self.path(name)
         try:
@@ -157,7 +157,7 @@ class Store:
             found |= content["made_from"]
         except FileNotFoundError as error:
             raise _unusable(path, "no such file", "a file of the prepared store") from error
-        except Exception as error:  # NumPy has many ways to say that a file is damaged
+        except Exception as error:  # NumPy raises many kinds of errors for damaged files
             what = f"a damaged file ({type(error).__name__}: {error})"
             raise _unusable(path, what, "a whole one") from error
         if total not in (None, written):
@@ -172,7 +172,7 @@ class Store:
     def _check_layout(
         self, path: Path, arrays: Mapping[str, NDArray[Any]], files: Container[str], *, values: bool
     ) -> None:
-        """Refuse arrays that are not the declared ones."""
+        """Refuse arrays that differ from the declaration."""
         required = {key for key in self._layout if key != "depth" or key in files}
         lengths: dict[int | str, int] = {}
         if required <= arrays.keys() <= self._layout.keys() and all(
@@ -184,7 +184,7 @@ class Store:
         raise _unusable(path, ", ".join(found), ", ".join(expected))
 
     def is_current(self, name: str, files: Mapping[str, Path], *, whole: bool) -> bool:
-        """True if `read` finds nothing wrong with the file of an item."""
+        """Return True if `read` accepts the file of an item."""
         try:
             self.read(name, files, whole=whole)
         except (DataError, OSError):
@@ -193,13 +193,13 @@ class Store:
 
 
 def _checksum(path: Path, size: int | None = None) -> int:
-    """CRC-32 of the first bytes of a file, or of all."""
+    """Return the CRC-32 of the first bytes of a file, or of all bytes."""
     content: Any = np.memmap(path, mode="r", shape=size)
     return zlib.crc32(content)
 
 
 def _stamps(files: Mapping[str, Path]) -> dict[str, str]:
-    """Size and time of every file, which identify its version."""
+    """Return size and time of each file, which identify its version."""
     stamps = {}
     for part, path in files.items():
         status = path.stat()

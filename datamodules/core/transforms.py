@@ -1,4 +1,4 @@
-"""Changes to panoramas after they are read: masked, rotated, then aligned with gravity."""
+"""Transforms of panoramas after reading: mask, rotation, alignment with gravity."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from tangent_train.rendering.upright.gravity import estimate_up
 from tangent_train.rendering.upright.manhattan import MOST_ROWS
 
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
-"""Log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
+"""Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
 
 def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-    """The panorama with labels that are unknown where it does not count; a `Transform`.
+    """Make the labels of masked pixels unknown; a `Transform`.
 
     Args:
-        masks: Where panoramas count.
-        panorama: Panorama, whose colors and depth stay.
+        masks: Masks of the panoramas.
+        panorama: Panorama; colors and depth stay unchanged.
         index: Ignored.
         files: Files of the panorama.
     """
@@ -38,30 +38,30 @@ def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> P
 
 
 class PosedUp:
-    """Panoramas with the up direction of their GPano tags; None without tags."""
+    """Sets the up direction of panoramas from their GPano tags; None without tags."""
 
     def __init__(self) -> None:
         self._ups: dict[int, NDArray[np.float64] | None] = {}
 
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """The panorama with `up`."""
+        """Return the panorama with `up`."""
         if index not in self._ups:
             self._ups[index] = read_up(files.rgb)
         return panorama._replace(up=self._ups[index])
 
 
 class EstimatedUp:
-    """Panoramas with an estimated up direction if it is unknown.
+    """Sets the up direction of panoramas, estimated where it is unknown.
 
-    Views are aligned with gravity; pixels and labels stay in place. For a panorama of fewer rows
-    than estimates use, the file is read again.
+    Views are aligned with gravity; pixels and labels stay in place. If the panorama has fewer rows
+    than the estimate needs, its file is read again.
 
     Args:
         max_tilt_deg: Maximum tilt, see `estimate_up`.
-        rgb: Reads the colors of a file.
-        rotated: Rotates the panoramas, if they are.
-        judge: Log-likelihoods that directions of a panorama are up, see `estimate_up`; it stays in
-            its process.
+        rgb: Function that reads the colors of a file.
+        rotated: Rotation of the panoramas, if any.
+        judge: Function that returns log-likelihoods of up directions, see `estimate_up`; it is not
+            passed to other processes.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class EstimatedUp:
         self._ups: dict[int, NDArray[np.float64] | None] = {}
 
     def __call__(self, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
-        """The panorama with `up`; None if it cannot be estimated."""
+        """Return the panorama with `up`; None if it cannot be estimated."""
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
@@ -100,10 +100,10 @@ class EstimatedUp:
 
 
 class RotatedPanoramas:
-    """Panoramas as seen by a tilted camera.
+    """Rotates panoramas, as seen by a tilted camera.
 
-    Labels rotate with the image, so the score is that of the rotated panorama. The same panorama is
-    rotated the same way in every run with the same seed.
+    Labels rotate with the image, so scores are those of the rotated panorama. With the same seed,
+    a panorama is rotated equally in every run.
 
     Args:
         rotation: Tilt in degrees about a random horizontal axis, after a random rotation about the
@@ -118,7 +118,7 @@ class RotatedPanoramas:
         self._known = known
 
     def rotation(self, index: int) -> NDArray[np.float64]:
-        """The rotation of one panorama, ``(3, 3)``: what was seen at d is now seen at R d."""
+        """Return the rotation R of one panorama, ``(3, 3)``: direction d moves to R d."""
         rng = sample_rng(self._seed, 0, index)
         if self._rotation == "so3":
             return random_rotation(rng)
@@ -128,7 +128,7 @@ class RotatedPanoramas:
         return tilt @ rotation_about((0, 0, 1), yaw)
 
     def __call__(self, panorama: Panorama, index: int, files: Any = None) -> Panorama:
-        """One rotated panorama: RGB bilinear, depth and labels nearest."""
+        """Return the rotated panorama: RGB bilinear, depth and labels nearest."""
         del files
         rgb, depth, labels, before = panorama
         rotation = self.rotation(index)

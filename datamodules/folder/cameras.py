@@ -22,7 +22,7 @@ from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
 
-_MOST_FOV_DEG = 170  # more in a K that is given in other units, as shares of the photo's width
+_MOST_FOV_DEG = 170  # above: K in other units, e.g. shares of the photo's width
 _LEAST_FOCAL = 0.5 / math.tan(math.radians(_MOST_FOV_DEG) / 2)
 _KEYS = ("fx", "fy", "cx", "cy")
 _EXPECTED = (
@@ -37,13 +37,12 @@ _EXAMPLE = (
 
 @dataclass(frozen=True)
 class FolderCameras:
-    """The cameras of photos in one folder.
+    """Cameras of the photos in one folder.
 
     Attributes:
-        path: ``cameras.json``, there or not.
-        given: Content of the file by the name of an image or a folder; ``.`` for all.
-        fov_deg: Horizontal field of view of the photos that it does not name; None for that of
-            their EXIF data.
+        path: Path of ``cameras.json``, which may be missing.
+        given: Content of the file by name of an image or folder; ``.`` for all images.
+        fov_deg: Horizontal field of view of all other photos; None to read it from EXIF data.
     """
 
     path: Path
@@ -52,22 +51,22 @@ class FolderCameras:
 
     @property
     def fingerprint(self) -> str:
-        """Changes when photos may get other cameras."""
+        """Text that changes when the cameras of photos may change."""
         content = json.dumps([self.given, self.fov_deg], sort_keys=True)
         return hashlib.sha256(content.encode()).hexdigest()[:16]
 
     def check_names(self, images: Sequence[ImageFiles], problems: Problems) -> None:
-        """Note the cameras of no image.
+        """Note cameras that belong to no image.
 
         Args:
-            images: All of the data set.
-            problems: They are added.
+            images: All images of the data set.
+            problems: Collects problems.
         """
         known = {place for files in images for place in _places(files)}
         for place in self.given.keys() - known:
             error = DataError(
                 self.path,
-                found=f"{place!r}, of which there is no image or folder",
+                found=f"{place!r}, which is not an image or folder",
                 expected=_EXAMPLE,
             )
             problems.add(error, f"{self.path.name}: {place}")
@@ -79,13 +78,13 @@ class FolderCameras:
             files: Files of the photo.
 
         Returns:
-            ``(3, 3)`` K of the photo as displayed, its EXIF orientation applied, for integer pixel
-            centers: the entry of ``cameras.json`` for the photo or the nearest folder that it is
-            in; or of `fov_deg`, or of its EXIF data, with the principal point in the middle.
+            ``(3, 3)`` K of the photo as displayed (EXIF orientation applied) for integer pixel
+            centers, from the entry of ``cameras.json`` for the photo or its nearest folder;
+            otherwise from `fov_deg` or EXIF data, with the principal point in the middle.
 
         Raises:
-            DataError: Nothing gives its camera, the entry is no camera matrix of such a photo, or
-                the photo cannot be read.
+            DataError: The camera is unknown, the entry does not fit the photo, or the photo cannot
+                be read.
         """
         height, width = size = read_image_size(files.rgb)
         place = next((place for place in _places(files) if place in self.given), None)
@@ -100,8 +99,7 @@ class FolderCameras:
                 found=f"fx = {fx:g}, fy = {fy:g}, cx = {x:g}, cy = {y:g} for {files.name}",
                 expected=f"pixels of the photo as displayed, {width} across and {height} down: a "
                 f"principal point inside, a field of view below {_MOST_FOV_DEG}°",
-                remedy="Scale K where the photo was resized, turn it where EXIF data turn the "
-                "photo.",
+                remedy="Scale K if the photo was resized; rotate it if EXIF data rotate the photo.",
             )
         return matrix
 
@@ -134,20 +132,20 @@ class FolderCameras:
 
 
 def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
-    """Read a ``cameras.json``; the cameras in it are read with their photos.
+    """Read a ``cameras.json``; each camera is checked when its photo is read.
 
-    It holds K by the name of an image, as ``kitchen/door``, or of a folder, for all images in it
-    that no longer name stands for; ``.`` or nothing is the name of the whole folder::
+    It holds K by name of an image, e.g. ``kitchen/door``, or of a folder, for all its images that
+    have no closer entry; ``.`` or an empty name stands for all images::
 
         {"kitchen/door": [[1400, 0, 959.5], [0, 1400, 539.5], [0, 0, 1]],
          "hall": {"fx": 1380, "fy": 1380, "cx": 959.5, "cy": 539.5}}
 
     Args:
-        path: The file, which may be missing.
+        path: File, which may be missing.
         fov_deg: Horizontal field of view of all other photos, see `FolderCameras`.
 
     Raises:
-        DataError: It cannot be read, or does not hold such names.
+        DataError: The file cannot be read, or has another content.
     """
     content = read_json(path, _EXAMPLE) if os.path.lexists(path) else {}
     if not isinstance(content, dict):
@@ -159,6 +157,6 @@ def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
 
 
 def _places(files: ImageFiles) -> list[str]:
-    """Name of an image and of the folders that it is in, from the nearest to ``.``."""
+    """Return the name of an image and its folders, from the nearest to ``.``."""
     name = PurePosixPath(files.name)
     return [place.as_posix() for place in (name, *name.parents)]

@@ -20,13 +20,13 @@ from tangent_train.registry import is_class_name
 UNKNOWN_NAME = "unknown"
 """Name of label 0, pixels without a class."""
 
-_MOST_CLASSES = 255  # labels are uint8, and 0 is taken
+_MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
 _MOST_VALUE = 65535
 _UNKNOWN_VALUES = (255, 65535)
 _MOST_SHOWN = 8
 _COLOR = re.compile(r"#[0-9a-fA-F]{6}")
 _EXPECTED = (
-    'a list of class names, ["wall", "floor"], or an object with the values or colours of each '
+    'a list of class names, ["wall", "floor"], or an object with the values or colors of each '
     'class, {"wall": 1, "floor": [2, 3]} or {"wall": "#ff0000"}'
 )
 
@@ -36,9 +36,9 @@ class FolderClasses:
     """Mapping from values or colors of label images to classes.
 
     Attributes:
-        names: K names; the label of a class is its place here plus one.
-        codes: ``(n,)`` int32, in rising order: values, or colors as R · 65536 + G · 256 + B.
-        labels: ``(n,)`` uint8, the class of each.
+        names: K names; the label of a class is its index plus one.
+        codes: ``(n,)`` int32, ascending: values, or colors as R · 65536 + G · 256 + B.
+        labels: ``(n,)`` uint8 label of each code.
         in_colors: True if the codes are colors.
         length: Length of the list of names; None if the classes have values or colors.
     """
@@ -51,23 +51,23 @@ class FolderClasses:
 
     @property
     def fingerprint(self) -> str:
-        """Changes when pixels would get other labels."""
+        """Text that changes when the labels of pixels may change."""
         parts = [self.codes.tobytes(), self.labels.tobytes(), bytes([self.in_colors])]
         return hashlib.sha256(b"".join(parts)).hexdigest()[:16]
 
     def decode(self, stored: NDArray[np.integer], path: object = "labels") -> NDArray[np.uint8]:
-        """Return labels of the pixels of a label image; 0 where they have no class.
+        """Return the labels of a label image, 0 for pixels without a class.
 
         Args:
             stored: ``(H, W)`` values, or ``(H, W, 3)`` uint8 colors.
-            path: File of the pixels, for messages.
+            path: File of the label image, for error messages.
 
         Returns:
             ``(H, W)``.
 
         Raises:
-            DataError: A value is past the end of the list that names the classes, and does not mark
-                unknown pixels (255, and 65535 of 16 bits).
+            DataError: A value is past the end of the list of classes, and is not a value for
+                unknown pixels (255, and 65535 with 16 bits).
 
         >>> codes, labels = np.array([7], np.int32), np.array([1], np.uint8)
         >>> classes = FolderClasses(("wall",), codes, labels, in_colors=False)
@@ -82,32 +82,32 @@ class FolderClasses:
                     found=f"value {past.min()} in {counted(past.size, 'pixels')}",
                     expected=f"0 to {self.length - 1}, the places in the list of classes.json, or "
                     f"{_UNKNOWN_VALUES[0]}",
-                    remedy="Name the class, or write null in its place in the list.",
+                    remedy="Add the class to the list, or null for a value without a class.",
                 )
         codes = self.pack(stored)
         place = np.minimum(np.searchsorted(self.codes, codes), len(self.codes) - 1)
         return np.where(self.codes[place] == codes, self.labels[place], np.uint8(0))
 
     def pack(self, stored: NDArray[np.integer]) -> NDArray[np.int32]:
-        """Return one number for each pixel of a label image, as in `codes`."""
+        """Return the code of each pixel of a label image, as in `codes`."""
         numbers = stored.astype(np.int32)
         if not self.in_colors:
             return numbers
         return numbers[..., 0] << 16 | numbers[..., 1] << 8 | numbers[..., 2]
 
     def describe(self, codes: NDArray[np.int32]) -> str:
-        """Format some codes as in `classes.json`."""
+        """Format codes as in `classes.json`."""
         written = "#{:06x}" if self.in_colors else "{}"
         shown = [written.format(code) for code in codes[:_MOST_SHOWN].tolist()]
         shown += ["…"] if len(codes) > _MOST_SHOWN else []
-        return ("colours " if self.in_colors else "values ") + ", ".join(shown)
+        return ("colors " if self.in_colors else "values ") + ", ".join(shown)
 
 
 def read_classes(path: Path) -> FolderClasses:
     """Read `classes.json`, in one of these forms.
 
-    * A list of names: the value of a class is its place in the list, from 0. ``null`` in the place
-      of a name leaves a value without a class::
+    * A list of names: the value of a class is its index in the list, from 0. ``null`` instead of a
+      name leaves a value without a class::
 
           [null, "wall", "floor"]
 
@@ -119,21 +119,21 @@ def read_classes(path: Path) -> FolderClasses:
 
           {"wall": "#ff0000", "floor": ["#00ff00", "#00ee00"]}
 
-    Values and colors that are not named, 255 among them, are unknown: such pixels count neither
-    in training nor in evaluation. "unknown" is therefore no class.
+    Other values and colors, including 255, are unknown: such pixels are ignored in training and
+    evaluation. "unknown" is therefore not a class.
 
     Args:
-        path: The file.
+        path: File to read.
 
     Raises:
-        DataError: It cannot be read, is in another form, gives a value twice, or nothing.
+        DataError: The file cannot be read, has another form, repeats a value, or has no classes.
     """
     if not path.exists():
         raise DataError(
             path,
             found="no such file" if path.parent.is_dir() else f"no folder {path.parent}",
             expected="the classes of your images",
-            remedy="Give data.root=<folder>; docs/how-to/own_data.md says what is in it.",
+            remedy="Give data.root=<folder>; docs/how-to/own_data.md describes its files.",
         )
     guide = "docs/how-to/own_data.md shows how to bring your own data."
     content = read_json(path, _EXPECTED, guide)
@@ -179,23 +179,23 @@ def _check_names(path: Path, names: list[Any]) -> None:
             path,
             found=f"class {twice[0]!r} twice",
             expected="every name once",
-            remedy='For several values or colours, write {"floor": [2, 3]}.',
+            remedy='For several values or colors, write {"floor": [2, 3]}.',
         )
 
 
 def _codes(path: Path, named: list[tuple[str, list[Any]]]) -> dict[int, int]:
     """Return the label of every value or color."""
     if len({isinstance(value, str) for _, values in named for value in values}) > 1:
-        raise DataError(path, found="values and colours", expected="either values or colours")
+        raise DataError(path, found="values and colors", expected="either values or colors")
     labels: dict[int, int] = {}
     for label, (name, values) in enumerate(named, start=1):
         if not values:
-            raise DataError(path, found=f"nothing for {name!r}", expected="a value or a colour")
+            raise DataError(path, found=f"nothing for {name!r}", expected="a value or a color")
         for value in values:
             other = named[labels.setdefault(_code(path, name, value), label) - 1][0]
             if other != name:
                 found = f"{value} for {other!r} and {name!r}"
-                raise DataError(path, found=found, expected="every value or colour once")
+                raise DataError(path, found=found, expected="every value or color once")
     return labels
 
 
@@ -207,5 +207,5 @@ def _code(path: Path, name: str, value: Any) -> int:
     raise DataError(
         path,
         found=f"{json.dumps(value)} for {name!r}",
-        expected=f'a value of 0 to {_MOST_VALUE}, a colour such as "#ff8000", or a list of either',
+        expected=f'a value of 0 to {_MOST_VALUE}, a color such as "#ff8000", or a list of either',
     )

@@ -21,10 +21,10 @@ from datamodules.images.pixel_files import read_depth_m, read_image_size, read_p
 from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
 
-# What label images may be. In grey of 1 to 4 bits the numbers may be meant, or the steps from black
-# to white that they stand for: better asked than guessed. 16 bits beside alpha are not decoded.
-_VALUES = ("8-bit grey", "16-bit grey", "8-bit grey with alpha", "palette")
-_COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit grey", "8-bit grey with alpha", "palette")
+# Allowed formats of label images. Gray of 1 to 4 bits is ambiguous: the stored numbers, or the gray
+# levels that they stand for. 16 bits with alpha cannot be decoded.
+_VALUES = ("8-bit gray", "16-bit gray", "8-bit gray with alpha", "palette")
+_COLORS = ("8-bit RGB", "8-bit RGBA", "8-bit gray", "8-bit gray with alpha", "palette")
 
 
 @dataclass(frozen=True)
@@ -32,8 +32,8 @@ class FolderReader(ImageReader):
     """Decoder of images and labels of a user.
 
     Attributes:
-        classes: Meaning of their labels.
-        depth_units_per_m: Units in a meter of depth files of whole numbers.
+        classes: Classes of the label images.
+        depth_units_per_m: Units per meter of integer depth files.
         cameras: Cameras of photos.
     """
 
@@ -43,13 +43,13 @@ class FolderReader(ImageReader):
 
     @property
     def settings(self) -> dict[str, str]:
-        """The classes in short, the units and, as they are stored with photos, the cameras."""
+        """See `ImageReader`: classes, depth units and, for photos, cameras."""
         units = f"{self.depth_units_per_m:g}"
-        settings = {"classes": self.classes.fingerprint, "depth units per metre": units}
+        settings = {"classes": self.classes.fingerprint, "depth units per meter": units}
         return settings | ({"cameras": self.cameras.fingerprint} if self.cameras else {})
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
-        """See `ImageReader`, as all others."""
+        """See `ImageReader`."""
         if part == "labels":
             _check_there(path)
             _check_kind(path, read_png_header(path), in_colors=self.classes.in_colors)
@@ -60,7 +60,7 @@ class FolderReader(ImageReader):
         return read_rgb(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return classes by ``classes.json``."""
+        """Return the labels, by ``classes.json``."""
         codes = read_codes(files.labels, in_colors=self.classes.in_colors)
         codes = codes if shape is None else resize_nearest(codes, shape)
         return self.classes.decode(codes, files.labels)
@@ -81,8 +81,8 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
 
     Args:
         root: Folder with ``images/`` and ``labels/``.
-        problems: Duplicate names and missing or ambiguous files are added.
-        with_depth: True to name files of depth.
+        problems: Collects duplicate names and missing or ambiguous files.
+        with_depth: True to list depth files too.
 
     Raises:
         DataError: A folder is missing, or there are no images.
@@ -160,8 +160,8 @@ def _check_kind(path: Path, header: PngHeader, *, in_colors: bool) -> None:
             path,
             found=kind,
             expected=f"{', '.join(allowed)}: "
-            f"classes.json names {'colours' if in_colors else 'values'}",
-            remedy="Convert the labels, or say in classes.json what they hold.",
+            f"classes.json names {'colors' if in_colors else 'values'}",
+            remedy="Convert the labels, or describe them in classes.json.",
         )
 
 
@@ -169,12 +169,12 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
     """Decode a label image.
 
     Args:
-        path: The PNG.
-        in_colors: True if classes are colors, not values. The values of palettes are the numbers
-            of the entries.
+        path: PNG file.
+        in_colors: True if classes are colors, not values. The values of a palette image are its
+            indices.
 
     Returns:
-        ``(H, W)`` values, or ``(H, W, 3)`` colors; transparency is left out.
+        ``(H, W)`` values, or ``(H, W, 3)`` colors, without alpha.
 
     Raises:
         DataError: The file is broken.
@@ -183,15 +183,15 @@ def read_codes(path: Path, *, in_colors: bool) -> NDArray[np.integer]:
 
 
 def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
-    """Return masks of all pixels of some classes.
+    """Return masks that ignore all pixels of some classes.
 
     Args:
-        folder: With ``labels/`` and ``classes.json``, as of ``data=folder``.
+        folder: Folder with ``labels/`` and ``classes.json``, as for ``data=folder``.
         ignored: Names of the classes.
 
     Raises:
         DataError: ``classes.json`` or ``labels/`` is missing or cannot be used.
-        SettingError: It does not name one of the classes.
+        SettingError: ``classes.json`` lacks one of the classes.
     """
     classes = read_classes(folder / "classes.json")
     names, ignored = classes.names, list(map(image_files.composed, ignored))

@@ -17,22 +17,21 @@ from tangent_train.errors import DataError, counted
 
 @dataclass(frozen=True)
 class FolderSplits:
-    """The splits that ``train.txt``, ``val.txt`` and ``test.txt`` name, or that are drawn.
+    """Splits listed in ``train.txt``, ``val.txt`` and ``test.txt``, or drawn at random.
 
-    Scenes, the top-level folders in ``images/``, are drawn as a whole: images of one room or street
-    resemble each other. Images outside folders are drawn individually, and so are, with a warning,
-    those of a single scene.
+    Scenes (top-level folders in ``images/``) are drawn as a whole, because images of the same room
+    or street are similar. Images outside folders are drawn individually; so are the images of a
+    single scene, with a warning.
 
     Attributes:
-        root: Folder of the data set, with or without the lists. Without ``test.txt``, the test
-            images are those in no other list if there is a ``train.txt``, else drawn; without
-            ``train.txt`` all others are for training; without ``val.txt`` some of those for
-            training are drawn for validation.
-        test_fraction: Share of the scenes for test, if drawn: at least one, never all.
-        validation_fraction: Share of the training scenes for validation, if drawn: at least one,
-            never all, so none of a single image; 0 for no validation, whether there is a list or
-            not.
-        seed: Seed of the drawing.
+        root: Folder of the data set, with or without lists. Without ``test.txt``, the test images
+            are all unlisted ones if there is a ``train.txt``, else drawn. Without ``train.txt``,
+            all other images are for training. Without ``val.txt``, the validation images are
+            drawn from the training images.
+        test_fraction: Share of the scenes to draw for the test: at least one, at most all but one.
+        validation_fraction: Share of the training scenes to draw for validation: at least one, at
+            most all but one; 0 for no validation, even with a list.
+        seed: Seed of the draw.
     """
 
     root: Path
@@ -43,14 +42,14 @@ class FolderSplits:
     def divide(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, list[ImageFiles]]:
-        """Return the images of every split, in the order given.
+        """Return the images of every split, in their given order.
 
         Args:
-            images: All of the data set.
-            problems: Invalid lines of lists are added.
+            images: All images of the data set.
+            problems: Collects invalid lines of lists.
 
         Raises:
-            DataError: A list cannot be used, or there is one image, or none, to draw the test from.
+            DataError: A list cannot be used, or there are too few images to draw a test from.
         """
         listed = self._read_lists(images, problems)
         named = {name for names in listed.values() for name in names}
@@ -89,8 +88,8 @@ class FolderSplits:
     def _draw(
         self, split: Split, images: Sequence[ImageFiles], names: set[str], fraction: float
     ) -> set[str]:
-        """Draw the names in some scenes."""
-        # Scenes are top-level folders; an image outside folders is a scene of its own.
+        """Draw the names of the images of some scenes."""
+        # Scenes are top-level folders; an image outside folders is a separate scene.
         groups = {f.name: f.name.partition("/")[0] for f in images if f.name in names}
         if len(set(groups.values())) == 1 < len(groups):
             rank_zero_warn(
@@ -124,12 +123,12 @@ class FolderSplits:
 
 
 def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
-    """Return the image that a line of a list names, and assign it to that list."""
+    """Return the image named in a line of a list, and assign it to that list."""
     if line not in names:
         raise DataError(
             path,
-            found=f"{line!r}, of which there is no image",
-            expected="names of files in images/, as scene/name",
+            found=f"{line!r}, which is not an image",
+            expected="names of files in images/, e.g. scene/name",
         )
     name = names[line]
     if name in owners:

@@ -1,7 +1,7 @@
-"""A project for COLMAP: images, masks and the rig of a set of panoramas.
+"""COLMAP project: images, masks and the rig of a set of panoramas.
 
-COLMAP takes images of one name in the folders of several cameras as taken at the same time, and one
-camera for each folder (``--ImageReader.single_camera_per_folder``), so these have no subfolders.
+COLMAP assumes one camera per folder (``--ImageReader.single_camera_per_folder``), and that images
+of one name in several folders were taken at the same time. So these folders have no subfolders.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from tangent_train.rendering.camera_files import RIG_FILE, write_rig
 
 
 def flat_names(names: Sequence[str]) -> dict[str, str]:
-    """Return names without folders, by the names of panoramas.
+    """Return file names without folders, by names of panoramas.
 
     Raises:
-        DataError: Two are the same.
+        DataError: Two names are the same.
 
     >>> flat_names(["x/1", "1"])
     {'x/1': 'x__1', '1': '1'}
@@ -46,11 +46,11 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
 
 @dataclass
 class ColmapProject:
-    """A project that is being written.
+    """COLMAP project that is being written.
 
     Args:
-        folder: A new one.
-        grid: The images of every panorama.
+        folder: New folder.
+        grid: Tangent images of every panorama.
         faces: Indices of the rendered images.
         suffix: Suffix of the image files.
         interpolation: See `equirect_to_tangent`.
@@ -65,7 +65,7 @@ class ColmapProject:
 
     @property
     def _prefixes(self) -> dict[str, int]:
-        """Faces by the prefix of their images."""
+        """Faces by prefix of their images."""
         return {f"{face_name(self.grid, face)}/": face for face in self.faces}
 
     def add(
@@ -80,7 +80,7 @@ class ColmapProject:
 
         Args:
             name: Name of the images, from `flat_names`.
-            file: File of the panorama, as named in the rig.
+            file: File name of the panorama in the rig.
             image: ``(H, W)`` or ``(H, W, C)``.
             counts: ``(H', W')``, 0 where pixels are ignored.
             progress: See `write_each`.

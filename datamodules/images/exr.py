@@ -34,14 +34,14 @@ def read_exr(path: Path) -> NDArray[Any]:
     """Decode one channel of an OpenEXR image.
 
     Args:
-        path: The file. Of several channels the one whose name ends in Z, Y, V or R is read, in this
+        path: File. Of several channels, the one whose name ends in Z, Y, V or R is read, in this
             order of preference.
 
     Returns:
         ``(H, W)`` float32, float16 or uint32, as stored.
 
     Raises:
-        DataError: It cannot be read, or has several parts, several depths per pixel or no such
+        DataError: The file cannot be read, has several parts or depths per pixel, or lacks such a
             channel.
         SettingError: The OpenEXR package is missing.
     """

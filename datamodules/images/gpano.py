@@ -1,8 +1,8 @@
-"""GPano tags of cameras and stitchers: a panorama's part of the sphere, and its pose.
+"""GPano tags of cameras and stitchers: the part of the sphere that an image shows, and its pose.
 
-They write it into the XMP data of the image, in the tags of Google's Photo Sphere format
-(https://developers.google.com/streetview/spherical-metadata): the size the whole panorama would
-have, the place of the image in it, and the pitch and roll of the camera.
+The tags of Google's Photo Sphere format are stored in the XMP data of an image
+(https://developers.google.com/streetview/spherical-metadata): the size of the whole panorama, the
+position of the image in it, and the pitch and roll of the camera.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _SIZES = (
     "CroppedAreaTopPixels",
 )
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-_TOLERANCE = 0.02  # of pixels that should be square: angles and sizes are rounded
-_MOST_COLUMNS = 32768  # of the whole panorama
-_SAY_IT = "Say with crop=[west,east,south,north] in degrees what the image shows."
+_TOLERANCE = 0.02  # tolerance of square pixels: angles and sizes are rounded
+_MOST_COLUMNS = 32768  # columns of the whole panorama
+_SAY_IT = "Give crop=[west,east,south,north] in degrees: the part of the sphere that it shows."
 _NOT_WHOLE = (
     "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
     "GPano tags in its XMP data. Photos are for tangent-predict with projection=perspective."
@@ -46,13 +46,13 @@ _NOT_WHOLE = (
 
 @dataclass(frozen=True)
 class PanoramaArea:
-    """The place of an image on the sphere.
+    """The part of the sphere that an image shows.
 
     Attributes:
         full_shape: Rows H and columns W = 2 H of the whole panorama.
-        rows: First row of the image in it, and the one after its last.
-        columns: First column of the image, below W, and the one after its last; beyond W the image
-            continues at the left, across ±180°.
+        rows: First row of the image in the panorama, and the row after its last.
+        columns: First column of the image, below W, and the column after its last; beyond W the
+            image continues at the left, across ±180°.
         image_shape: Rows and columns of the image itself, which may differ from `rows` and
             `columns` by rounding.
     """
@@ -81,7 +81,7 @@ class PanoramaArea:
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
         """Cut the image ``(h, w[, C])`` out of a panorama ``(H, W[, C])``; inverse of `place`.
 
-        Of a whole panorama it is the panorama itself.
+        A whole panorama is returned as it is.
         """
         if self.is_whole and self.image_shape == self.full_shape:
             return whole
@@ -97,7 +97,7 @@ class PanoramaArea:
 
 
 def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
-    """Return the place of an image on the sphere by its GPano tags.
+    """Return the part of the sphere that an image shows, by its GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
 
@@ -109,7 +109,7 @@ def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
         The whole sphere if tags are missing, see `whole_area`.
 
     Raises:
-        DataError: The tags cannot be those of such an image, or none say what it shows.
+        DataError: The tags contradict the image, or it is not 2:1 and has no tags.
     """
     tags = read_properties(path, _NAMESPACE)
     projection = tags.get("ProjectionType", "equirectangular")
@@ -145,15 +145,15 @@ def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
 
 
 def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
-    """Return the place of an image by the angles of its outer edges.
+    """Return the part of the sphere between the angles of an image's outer edges.
 
     Args:
         size: Rows and columns of the image.
-        crop: West and east, −180 to 180; west is the greater one of an image across ±180°. South
-            and north, −90 to 90. Degrees.
+        crop: West, east (−180 to 180; west > east for an image across ±180°), south and north
+            (−90 to 90) in degrees.
 
     Raises:
-        SettingError: There is no such part, or the image would not have square pixels.
+        SettingError: The angles are invalid, or the image would not have square pixels.
         DataError: The whole panorama would be too large.
     """
     west, east, south, north = crop if len(crop) == 4 else (0, 0, 0, 0)
@@ -180,16 +180,16 @@ def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
 
 
 def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> PanoramaArea:
-    """Return the place of an image that shows the whole sphere.
+    """Return the area of an image that shows the whole sphere.
 
     Args:
-        path: The image, for the message.
-        size: Rows and columns of the image. One column too many or too few is allowed, a rounding
-            error of other programs: it is left out, or its neighbor is repeated.
-        remedy: Remedy in the message.
+        path: Image, for the error message.
+        size: Rows and columns of the image. One column too many is dropped, one too few is
+            repeated: a rounding error of other programs.
+        remedy: Remedy in the error message.
 
     Raises:
-        DataError: It is not twice as wide as high.
+        DataError: The image is not twice as wide as high.
     """
     height, width = size
     if abs(width - 2 * height) > 1 or width < 2:
@@ -203,7 +203,7 @@ def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> P
 
 
 def read_up(path: Path) -> NDArray[np.float64] | None:
-    """Return the direction of up by the GPano tags of a panorama, see `up_from_pose`.
+    """Return the up direction by the GPano tags of a panorama, see `up_from_pose`.
 
     Args:
         path: JPEG, PNG, TIFF or WebP.
@@ -213,7 +213,7 @@ def read_up(path: Path) -> NDArray[np.float64] | None:
         which programs write by default.
 
     Raises:
-        DataError: A tag is not such an angle.
+        DataError: A tag is not an angle.
     """
     tags = read_properties(path, _NAMESPACE)
     pitch = _number(path, "PosePitchDegrees", tags.get("PosePitchDegrees", "0"), 90)
@@ -236,10 +236,10 @@ def _number(path: Path, name: str, text: str, most: float) -> float:
 def _area(
     subject: object, size: tuple[int, int], across: tuple[float, float], down: tuple[float, float]
 ) -> PanoramaArea:
-    """Return the place of an image.
+    """Return the area of an image.
 
     Args:
-        subject: Subject of the error.
+        subject: Subject of the error message.
         size: Rows and columns of the image.
         across: Left edge and width of the image, as fractions of the whole width.
         down: Upper edge and height, as fractions of the whole height.

@@ -1,4 +1,4 @@
-"""Finding and naming images and depth maps of users."""
+"""Finding and naming image and depth files."""
 
 from __future__ import annotations
 
@@ -41,15 +41,15 @@ def image_paths(
         pattern: A file; a folder, searched recursively; or a glob pattern, with ``**`` for folders
             of any depth.
         suffixes: Suffixes of images, in lower case.
-        is_result: True for files that a command wrote: they are passed over.
-        tell: Called with the number of the other files of a folder or pattern, if there are any.
+        is_result: Function that is True for files that a command wrote; they are skipped.
+        tell: Called with a message about skipped files of a folder or pattern, if any.
 
     Returns:
-        Sorted paths. Of folders and patterns only files with one of the suffixes, in lower or upper
-        case, that are not hidden.
+        Sorted paths. From folders and patterns: visible files with one of the suffixes, in lower
+        or upper case.
 
     Raises:
-        DataError: There are none, or a folder cannot be opened.
+        DataError: No image was found, or a folder cannot be opened.
     """
     path = Path(pattern)
     if path.is_file() and not is_result(path):
@@ -58,7 +58,7 @@ def image_paths(
         named = list(walk_files(path))
     else:
         named = [Path(name) for name in glob.glob(str(path), recursive=True)]  # noqa: PTH207
-    # Broken links stay: reading them is an error.
+    # Broken links are kept, so that reading them is an error.
     files = {file for file in named if not file.is_dir() and not file.name.startswith(".")}
     found = {file for file in files if not is_result(file)}
     images = sorted(file for file in found if file.suffix.lower() in suffixes)
@@ -103,9 +103,9 @@ def _refuse(error: OSError) -> None:
 
 
 def composed(name: str) -> str:
-    """Compose the letters of a name (Unicode's form NFC).
+    """Compose the letters of a name (Unicode normalization form NFC).
 
-    Keyboards write "ü" as one character; macOS and its archives, as "u" and an accent.
+    Keyboards write "ü" as one character; macOS stores it as "u" and an accent.
 
     >>> composed("u" + chr(0x308)) == "ü"
     True
@@ -114,7 +114,7 @@ def composed(name: str) -> str:
 
 
 def spelled(name: str) -> str:
-    """Quote a name, with the code points of its letters beyond ASCII.
+    """Quote a name, with code points for letters beyond ASCII.
 
     >>> spelled("k" + chr(0xFC) + "che")
     "'k<U+00FC>che'"
@@ -166,10 +166,10 @@ def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
         files: The depth maps.
         name: Path of the image below the folder of images, without suffix. The depth map has the
             same name, or that with ``_depth`` at the end, and one of `DEPTH_SUFFIXES`.
-        remedy: Remedy if there is none.
+        remedy: Remedy for a missing file.
 
     Raises:
-        DataError: There is none, or there are several.
+        DataError: The file is missing, or there are several.
     """
     candidates = [files.path(f"{name}{end}{s}") for end in ("", "_depth") for s in DEPTH_SUFFIXES]
     found = [path for path in candidates if path.is_file()]

@@ -125,7 +125,7 @@ def _unknown_layout(path: Path, tags: Any) -> DataError:
     return DataError(
         path,
         found=f"a TIFF layout that cannot be decoded: {', '.join(known)}",
-        expected="grey or RGB of 8 or 16 bits or depth of 32-bit float, all channels of one type, "
+        expected="gray or RGB of 8 or 16 bits or depth of 32-bit float, all channels of one type, "
         "interleaved (PlanarConfiguration 1), without premultiplied alpha",
         remedy="Convert the image to PNG, or to TIFF of 8 or 16 bits; depth, to 32-bit float.",
     )
@@ -134,7 +134,7 @@ def _unknown_layout(path: Path, tags: Any) -> DataError:
 def _exif(image: Image.Image) -> Image.Exif:
     """Return the EXIF data; none if they are broken."""
     try:
-        # Of PNG files, Pillow would decode the pixels to look for more.
+        # Pillow would decode the pixels of a PNG file to look for more.
         return Image.Image.getexif(image)
     except Exception:  # the parser raises many kinds of errors
         return Image.Exif()
@@ -241,14 +241,14 @@ def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
 
 
 def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | None:
-    """Return the channel type of a file for OpenCV, and True for grey; None for Pillow.
+    """Return the channel type of a file for OpenCV, and True for gray; None for Pillow.
 
     Raises:
         DataError: Neither of them decodes it correctly.
     """
     if image.format == "PNG":
         header = read_png_header(path)
-        return (np.dtype(np.uint16), "grey" in header.color) if header.bits == 16 else None
+        return (np.dtype(np.uint16), "gray" in header.color) if header.bits == 16 else None
     if not isinstance(image, TiffImagePlugin.TiffImageFile):
         return None
     tags: Any = image.tag_v2
@@ -269,7 +269,7 @@ def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | 
     return None if exact is None else (exact, channels == 1)
 
 
-def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> NDArray[Any]:
+def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], gray: bool) -> NDArray[Any]:
     # From memory: `cv2.imread` cannot open paths beyond the system's code page.
     content = np.fromfile(path, np.uint8)
     if page:
@@ -279,7 +279,7 @@ def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> 
     pixels: Any = pages[0]
     if pixels is None or pixels.dtype != dtype or pixels.shape[2:] not in ((), (3,), (4,)):
         raise ValueError("broken pixels")
-    if grey:
+    if gray:
         return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)[..., 0])
     return pixels[..., 2::-1]
 
@@ -287,7 +287,7 @@ def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], grey: bool) -> 
 def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
     """Decode the colors of an image, ``(H, W, 3)``.
 
-    The upper 8 of 16 bits per channel are kept; grey becomes three equal channels; alpha is
+    The upper 8 of 16 bits per channel are kept; gray becomes three equal channels; alpha is
     dropped; the EXIF orientation is applied.
 
     Args:
@@ -306,7 +306,7 @@ def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
         raise DataError(
             image if isinstance(image, Path) else "image",
             found=f"{pixels.dtype} of shape {pixels.shape}",
-            expected="colours of 8 or 16 bits",
+            expected="colors of 8 or 16 bits",
             remedy="Export the image as JPEG or PNG.",
         )
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=-1)
@@ -329,13 +329,13 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
         SettingError: The units are not positive.
     """
     if not 0 < units_per_m < math.inf:
-        raise SettingError("depth units per metre", found=units_per_m, expected="more than 0")
+        raise SettingError("depth units per meter", found=units_per_m, expected="more than 0")
     stored = read_pixels(path, indices=True)
     if stored.ndim != 2 or stored.dtype in (np.uint8, np.bool_):
         raise DataError(
             path,
             found=f"{stored.dtype} of shape {stored.shape}",
-            expected="depth: 16-bit grey PNG or TIFF, 32-bit float TIFF, .npy or .exr",
+            expected="depth: 16-bit gray PNG or TIFF, 32-bit float TIFF, .npy or .exr",
         )
     depth = stored.astype(np.float32)
     if stored.dtype.kind != "f":

@@ -24,7 +24,7 @@ _METADATA = (b"IHDR", b"eXIf", b"iTXt", b"tEXt", b"zTXt")
 _NO_PIXELS = b"".join(
     struct.pack(">I4sI", 0, name, zlib.crc32(name)) for name in (b"IDAT", b"IEND")
 )
-_COLOR_TYPES = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"}
+_COLOR_TYPES = {0: "gray", 2: "RGB", 3: "palette", 4: "gray with alpha", 6: "RGBA"}
 _REMEDY = "Copy or extract the file again."
 
 

@@ -30,12 +30,12 @@ def panorama_area(
     """Return the part of the sphere that a file shows.
 
     Args:
-        path: An image, or an array or video, which have no GPano tags.
+        path: Image, array or video; arrays and videos have no GPano tags.
         size: Rows and columns of the image or of a frame of the video.
-        crop: The part, see `area_of_crop`; None for the part in the GPano tags.
+        crop: Part of the sphere, see `area_of_crop`; None to read it from GPano tags.
 
     Raises:
-        DataError: It is neither a whole panorama nor tagged as a part of one.
+        DataError: The file is neither a whole panorama nor tagged as a part.
         SettingError: The crop does not fit.
     """
     if crop is not None:
@@ -50,17 +50,16 @@ def read_placed(
     crop: Sequence[float] | None = None,
     frame: Callable[[], NDArray[np.uint8]] | None = None,
 ) -> tuple[NDArray[Any], PanoramaArea]:
-    """Read a panorama of any dtype; a part of a panorama is placed on the whole sphere.
+    """Read a panorama of any dtype; place a part of a panorama on the whole sphere.
 
     Args:
         path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
         crop: See `panorama_area`.
-        frame: Returns the frame, if the file is a video.
+        frame: Function that returns the frame of a video.
 
     Returns:
-        ``(H, W)`` or ``(H, W, C)``, the whole sphere, 0 where a part of a panorama shows nothing;
-        and that part.
+        ``(H, W)`` or ``(H, W, C)`` of the whole sphere, 0 outside of the part; and the part.
 
     Raises:
         DataError: The file cannot be used.
@@ -72,12 +71,12 @@ def read_placed(
 
 
 def face_name(grid: TangentGrid, face: int) -> str:
-    """Name of a tangent image, ``face_007``; names are in the order of the images."""
+    """Return the name of a tangent image, e.g. ``face_007``; names sort like the images."""
     return f"face_{face:0{max(3, len(str(grid.num_images - 1)))}}"
 
 
 def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
-    """Downsample a panorama with more rows than a level by area averaging.
+    """Downsample a panorama that has more rows than a level, by area averaging.
 
     Args:
         image: ``(H, W)`` or ``(H, W, C)``; other dtypes than uint8, uint16, float32 and float64
@@ -85,7 +84,7 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
         level: Level s.
 
     Returns:
-        The image itself, or one of the level's size.
+        The image itself, or a copy of the level's size.
     """
     height, width = equirect_shape(level)
     if image.shape[0] <= height or image.dtype not in _RESIZABLE:
@@ -104,12 +103,12 @@ def write_tangent_folder(
     interpolation: Interpolation,
     progress: Callable[[float], object],
 ) -> None:
-    """Render tangent images to a folder, which appears once complete.
+    """Render tangent images to a folder, which appears when it is complete.
 
     Args:
-        folder: A new one, or one with tangent images of an earlier run, which it replaces.
+        folder: New folder, or a folder of an earlier run, which is replaced.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
-        cameras: Content of its ``cameras.json``.
+        cameras: Content of ``cameras.json``.
         interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
@@ -129,13 +128,13 @@ def write_tangent_folder(
 
 @contextmanager
 def replaced_folder(folder: Path) -> Iterator[Path]:
-    """Open a folder to be filled by the block; it appears once the block has succeeded.
+    """Return a context that fills a folder; the folder appears when the context succeeds.
 
     Args:
-        folder: A new one, or one that holds only what an earlier run wrote.
+        folder: New folder, or a folder that holds only files of an earlier run.
 
     Raises:
-        SettingError: It holds other files.
+        SettingError: The folder holds other files.
     """
     folder.parent.mkdir(parents=True, exist_ok=True)
     unfinished = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".partial-"))
@@ -154,7 +153,7 @@ def write_each(
     """Write the images of some faces in threads.
 
     Args:
-        write: Takes the name of an image and its face.
+        write: Function of the name of an image and its face.
         faces: Faces by name.
         progress: Called with the share of the images written since its last call.
     """
@@ -167,11 +166,11 @@ def _remove_earlier(folder: Path) -> None:
     """Remove a folder that holds only the files of an earlier run."""
     there = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
     if there:
-        ours = _written(folder)
-        if there - ours:
+        written = _written(folder)
+        if there - written:
             raise SettingError(
                 "output",
-                found=f"{folder / min(there - ours)}, which is no tangent image of {folder}",
+                found=f"{folder / min(there - written)}, which is not a tangent image of {folder}",
                 expected="a folder that may be replaced",
                 remedy="Move the file, or choose another output.",
             )

@@ -1,4 +1,4 @@
-"""Results of other programs on tangent images, rendered back to the panorama."""
+"""Rendering results of other programs on tangent images back to the panorama."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads
 
 ResultKind = Literal["color", "labels", "depth", "features"]
-"""Meaning of pixels: colors and features are interpolated, labels and depth never."""
+"""Meaning of pixels: colors and features are interpolated, labels and depth are not."""
 
 _TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
 _CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}
 
 _GROUP_BYTES = 2**28
-"""Channels are rendered together while their images take no more than this."""
+"""Largest size in bytes of the images of channels that are rendered together."""
 
 _NO_DEPTH = 65535
-"""Marks missing depth in many 16-bit files; 0 does in all."""
+"""Value for missing depth in many 16-bit files, besides 0."""
 
 
 def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
-    """List the results for all images of a grid: files with the images' names.
+    """List the result files for all images of a grid, which have the names of the images.
 
     Args:
         folder: Folder of the results.
-        cameras: The images.
+        cameras: Cameras of the images.
 
     Returns:
-        One file for every image of the grid, in its order.
+        One file for each image of the grid, in the order of the grid.
 
     Raises:
-        DataError: Some are missing, or there are two of one name.
+        DataError: A file is missing, or two files have the same name.
     """
     grid = cameras.grid
     if len(cameras.faces) < grid.num_images:
@@ -65,7 +65,7 @@ def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
             folder,
             found=files or f"no {wrong[0]}",
             expected=f"one file for each of the {len(stems)} images of the cameras, named as these",
-            remedy="Results go into a folder of their own; cameras= says where their cameras are.",
+            remedy="Put results into a separate folder, and give cameras=<folder of the images>.",
         )
     return [there[stem][0] for stem in stems]
 
@@ -75,8 +75,8 @@ class TangentResults:
     """Results for all images of one panorama.
 
     Attributes:
-        arrays: ``(d, d)`` or ``(d, d, C)`` for every image of the grid, all alike.
-        grid: The geometry of the images the results were made of.
+        arrays: ``(d, d)`` or ``(d, d, C)`` for every image of the grid, all of one shape and dtype.
+        grid: Grid of the images that the results belong to.
         kind: Meaning of the pixels.
     """
 
@@ -88,11 +88,11 @@ class TangentResults:
     def read(
         cls, files: Sequence[Path], grid: PinholeGrid, kind: ResultKind | Literal["auto"]
     ) -> TangentResults:
-        """Read and check them.
+        """Read and check result files.
 
         Args:
-            files: One for every image, in the order of the grid; from `result_files`.
-            grid: The images.
+            files: One file for each image, in the order of the grid, see `result_files`.
+            grid: Grid of the images.
             kind: ``auto`` decides by the first file: ``.npy`` of floats are features; three
                 channels are colors, one channel of integers labels; images of one channel with 16
                 bits or floats are depth.
@@ -119,32 +119,31 @@ class TangentResults:
                 found=f"{first.dtype} of shape {first.shape}",
                 expected=f"{decided}",
                 remedy=f"Choose kind={', '.join(get_args(ResultKind))}: labels and depth have one "
-                "channel, colours one or three.",
+                "channel, colors one or three.",
             )
         return cls(arrays, grid, decided)
 
     @property
     def suffix(self) -> str:
-        """The suffix of a file that can hold the panorama as it is."""
+        """Suffix of a file format that keeps the pixels unchanged."""
         if self.kind == "features":
             return ".npy"
         return ".tif" if self.arrays[0].dtype.kind == "f" else ".png"
 
     def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> None:
-        """Render them back to a panorama.
+        """Render the results back to a panorama, and write it.
 
         Results of another size than the images cover the same field of view, edge to edge.
 
         Args:
-            path: The panorama's file. Arrays (``.npy``) keep the dtype; in images, floats are
-                32-bit and labels the smallest integers that hold them.
+            path: File of the panorama. Arrays (``.npy``) keep the dtype; images hold 32-bit floats,
+                or labels in the smallest integers that suffice.
             shape: ``(H, W)`` of the panorama.
             blend: Blending of overlapping images, for colors and features.
-            z_depth: True if depth is along the axes of the images' cameras, to be converted to
-                distance from the center.
+            z_depth: True to convert z-depth of the images to distance from the center.
 
         Raises:
-            SettingError: Such a file cannot hold it, or `z_depth` is set for no depth.
+            SettingError: The format cannot hold the pixels, or `z_depth` is set without depth.
             DataError: Distances do not fit into the dtype.
         """
         suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
@@ -201,7 +200,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
-    """Convert depth ``(d, d)`` along the axis of an image's camera to distances."""
+    """Convert z-depth ``(d, d)`` of an image to distances."""
     lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)

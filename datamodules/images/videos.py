@@ -1,4 +1,4 @@
-"""Videos: their frames one after another, and new videos with the times of another."""
+"""Videos: reading frames, and writing videos with the frame times of another video."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 """Suffixes of videos, in lower case."""
 
 _READERS = "mov,matroska,avi"
-"""FFmpeg's readers of these files. Others read playlists, scripts and neighbors of a file."""
+"""FFmpeg's demuxers of these formats. Other demuxers read playlists, scripts and further files."""
 
 _EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
 _BOXES = b"ftyp styp moov moof mdat mfra free skip wide meta sidx ssix prft pdin emsg uuid".split()
@@ -37,12 +37,12 @@ _BT709 = 1  # of the matrix, primaries and transfer: what players assume of larg
 
 
 def read_video_size(path: Path) -> tuple[int, int, int]:
-    """Return the number of frames that players show, and upright rows and columns of the first.
+    """Return the number of frames that players show, and rows and columns of an upright frame.
 
     All packets are read; only the first frame is decoded.
 
     Raises:
-        DataError: It cannot be read, is truncated or damaged, or lacks a video stream or frames.
+        DataError: The video cannot be read, is truncated or damaged, or has no frames.
         SettingError: PyAV is missing.
     """
     _check_end(path)
@@ -65,7 +65,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
         raise DataError(path, found="no frame that can be decoded", expected="a whole video")
     check_pixels(path, first.height, first.width)
     rows, columns = _upright(first, _orientation(path, first)).shape[:2]
-    # A cut without encoding leaves frames before the first one that need what was cut off.
+    # Cutting without encoding leaves frames at the start that refer to missing ones.
     start = first.pts
     return sum(None in (time, start) or time >= start for time in times), rows, columns
 
@@ -76,15 +76,15 @@ def read_frames(
     """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
 
     Args:
-        path: The video.
-        frames: Number of frames by `read_video_size`; None to read it.
-        every: Distance n of the frames.
+        path: Video file.
+        frames: Number of frames, see `read_video_size`; None to read it.
+        every: Step n between frames.
 
     Yields:
-        A function that converts a frame: upright in RGB, ``(H, W, 3)``.
+        Function that converts a frame to upright RGB, ``(H, W, 3)``.
 
     Raises:
-        DataError: A frame is damaged, or there are more or fewer.
+        DataError: A frame is damaged, or the number of frames differs.
     """
     for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
         yield partial(_upright, *frame)
@@ -99,7 +99,7 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
             for number, frame in enumerate(container.decode(stream)):
                 if frame.is_corrupt:
                     raise _damaged(path, f"frame {number}, and frames before that refer to it")
-                # Within an H.264 stream, a matrix may be that of the first frame alone.
+                # Within an H.264 stream, only the first frame may have the matrix.
                 given = _orientation(path, frame)
                 signs = given if number == 0 else signs
                 if "DISPLAYMATRIX" in frame.side_data and (given != signs).any():
@@ -118,7 +118,7 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
 
 @contextmanager
 def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
-    """Open a container and its video stream; errors in the block name the file."""
+    """Return a context with a container and its video stream; its errors name the file."""
     with of_extra("video", path):
         import av
     options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
@@ -143,13 +143,13 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 
 
 def _file_url(path: Path) -> str:
-    # A name alone may be that of another protocol: "http:…".
+    # A bare name may select another protocol, e.g. "http:…".
     return f"file:{path.absolute()}"
 
 
 @contextmanager
 def _logged_errors(path: Path) -> Iterator[list[str]]:
-    """Collect the errors that FFmpeg's reader of Matroska logs; it skips damaged parts."""
+    """Collect the errors that FFmpeg's Matroska demuxer logs when it skips damaged parts."""
     with of_extra("video", path):
         import av.logging as log
     errors: list[str] = []
@@ -166,7 +166,7 @@ def _logged_errors(path: Path) -> Iterator[list[str]]:
 
 
 def _check_end(path: Path) -> None:
-    """Refuse a file that ends within one of its outermost elements; FFmpeg reads what is there.
+    """Refuse a file that ends within one of its outermost elements, which FFmpeg accepts.
 
     These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
     """
@@ -201,7 +201,7 @@ def _check_end(path: Path) -> None:
 
 
 def _is_shown(packet: Any) -> bool:
-    """False for packets hidden by an edit list, and for reference frames of VP8 (RFC 6386, 9.1)."""
+    """Return False for packets that an edit list hides and VP8 reference frames (RFC 6386, 9.1)."""
     hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
     return not (packet.is_discard or hidden)
 
@@ -222,7 +222,7 @@ def _orientation(path: Path, frame: Any) -> NDArray[np.int64]:
     The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M.
 
     Raises:
-        DataError: It is not a rotation by quarter turns, mirrored or not.
+        DataError: The matrix is not a rotation by quarter turns, with or without mirroring.
     """
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
@@ -254,18 +254,18 @@ def write_video(
     paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
     every: int = 1,
 ) -> None:
-    """Write a video (H.264 in MP4) with the size, rate and times of another; without its sound.
+    """Write a video (H.264 in MP4) with size, rate and frame times of another one, without sound.
 
     Args:
-        path: The file, which appears once complete.
-        source: The other video.
-        size: Number of frames, rows and columns of the other video by `read_video_size`.
-        paint: Returns a frame ``(H, W, 3)`` of the new one for the number of a frame and the
-            upright frame of the other one. Called in threads.
-        every: Take the first and then every n-th frame.
+        path: New file, which appears when it is complete.
+        source: Source video.
+        size: Number of frames, rows and columns of the source, see `read_video_size`.
+        paint: Function that returns a new frame ``(H, W, 3)`` for the number of a frame and the
+            upright source frame; called in threads.
+        every: Step n: the first and then every n-th frame is written.
 
     Raises:
-        DataError: The other one cannot be decoded.
+        DataError: The source cannot be decoded.
         SettingError: The disk is full.
     """
     import av
@@ -290,7 +290,7 @@ def write_video(
     ):
         rate = stream.average_rate or 30
         step = max(1, round(1 / (rate * stream.time_base)))
-        # Players want colors at half the resolution, which takes an even size.
+        # Players expect colors at half the resolution, which requires an even size.
         pixels = "yuv444p" if rows % 2 or columns % 2 else "yuv420p"
         encoder: Any = output.add_stream(_ENCODER, rate=rate, options=_QUALITY)
         encoder.width, encoder.height, encoder.pix_fmt = columns, rows, pixels

@@ -23,7 +23,7 @@ def read_properties(path: Path, namespace: str) -> dict[str, str]:
     without. Properties of structures are ignored: they may describe another image.
 
     Args:
-        path: An image; arrays and OpenEXR images have no XMP data.
+        path: Image file; arrays and OpenEXR images have no XMP data.
         namespace: URI of the namespace.
 
     Returns:

@@ -1,7 +1,7 @@
 """ModelNet40 (Wu et al. 2015): 12,311 meshes of 40 classes, as spheres.
 
 The meshes are free for research: https://modelnet.cs.princeton.edu (``ModelNet40.zip``, 2 GB). See
-`shape_files` about the layouts and `meshes` about spheres. Any other data set with the same layout
+`shape_files` for the layouts and `meshes` for the spheres. Any other data set with the same layout
 can be used, such as ModelNet10.
 """
 
@@ -43,7 +43,7 @@ _PER_PROCESS = 40
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class ModelNet40(SplitDataModule[ShapeFile]):
-    """Shapes as spheres, to be classified.
+    """Shapes as spheres, for classification.
 
     The spheres are computed once, on all cores, before the first run (`prepare_data`), into a
     folder for their size, ``spheres_<height>x<width>``, of `store`, by default of `root`.
@@ -52,16 +52,16 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     Args:
         shapes_per_step: Shapes per training step and process, and in every step of evaluation.
         test_rotation: Rotate the test shapes: `yaw` about the vertical, `so3` uniformly over all
-            rotations; the same shape the same way in every run with the same seed.
+            rotations; with the same seed, a shape is rotated equally in every run.
 
     Attributes:
-        class_names: Names of the classes there are, in alphabetical order; those of ModelNet40 as
-            long as `root` is missing.
+        class_names: Names of the classes in alphabetical order; those of ModelNet40 while `root`
+            is missing.
         erp_height: Rows of the spherical images.
 
     Raises:
         SettingError: A setting is invalid.
-        DataError: `root` holds no tree of meshes.
+        DataError: `root` does not contain a tree of meshes.
     """
 
     noun: ClassVar[str] = "shapes"
@@ -86,7 +86,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return TangentRepresentation(0, 5 if self.level is None else self.level)
 
     def find_classes(self) -> tuple[str, ...]:
-        """Names of the classes, even before the files exist."""
+        """Return the names of the classes, even before the files exist."""
         if not self.root.exists():
             return MODELNET40
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
@@ -119,11 +119,11 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     @property
     def in_channels(self) -> int:
-        """Channels of a sphere."""
+        """Number of channels of a sphere."""
         return CHANNELS
 
     def normalized(self, batch: ShapeSample) -> Tensor:
-        """The views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
+        """Return the normalized views of a `ShapeSample`, ``(B, N, 6, h, w)`` float32."""
         normalization: Any = self.normalization
         return normalize_spheres(batch.images, normalization)
 
@@ -132,9 +132,9 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         return self.per_step
 
     def _choose_for_validation(self, meshes: Sequence[ShapeFile]) -> set[str]:
-        """Names drawn from those for training, of every class the same share.
+        """Draw the names of validation shapes: the same share of every class's training shapes.
 
-        Broken meshes are drawn too, so that the draw does not depend on them.
+        Broken meshes are included, so that the draw does not depend on them.
         """
         chosen: set[str] = set()
         for number, label in enumerate(self.class_names if self.validation_fraction else ()):

@@ -1,9 +1,9 @@
 """Meshes in OFF files, such as ModelNet40's, and their spherical images.
 
 The recipe is that of Cohen et al., Spherical CNNs (2018), which the paper follows. A mesh is moved
-so that the centroid of its surface is at the origin, and scaled to reach to `RADIUS`. From every
-point of the unit sphere that is the direction of a pixel of an equirectangular image, a ray goes
-inward through the origin. Three channels describe its first hit, three more that of the convex hull
+so that the centroid of its surface is at the origin, and scaled to reach to `RADIUS`. For every
+pixel of an equirectangular image, a ray goes from its point on the unit sphere inward through the
+origin. Three channels describe its first hit, three more that of the convex hull
 of the mesh:
 
 ==== ============================================== ==========
@@ -40,10 +40,10 @@ RADIUS = 0.99
 """Distance of the farthest vertex from the origin."""
 
 _DIGITS = 6
-"""Vertices that agree to so many decimals of the longest extent are merged."""
+"""Number of decimals, relative to the longest extent, to which merged vertices agree."""
 
 _LEAST_HEIGHT = 1e-8
-"""Triangles lower than this part of the longest extent are dropped."""
+"""Smallest height of a triangle, relative to the longest extent; lower ones are dropped."""
 
 _COUNTS = re.compile(r"OFF\s*(\d{1,15})\s+(\d{1,15})")
 
@@ -52,20 +52,20 @@ def read_off(path: Path) -> Trimesh:
     """Read a mesh with trimesh's OFF loader; polygons become triangles.
 
     Raises:
-        DataError: The file cannot be read, is no such file, is truncated or has no triangles.
+        DataError: The file cannot be read, is not an OFF file, is truncated or has no triangles.
     """
     try:
         text = path.read_text(encoding="latin-1")
         loaded = load_off(StringIO(text))
-    # Of broken files the loader raises anything from ValueError to IndexError.
+    # The loader raises anything from ValueError to IndexError for broken files.
     except Exception as error:
         raise _unreadable(path, error) from error
-    # The loader takes files that end within the faces, and coordinates that are NaN.
+    # The loader accepts files that end within the faces, and NaN coordinates.
     lines = re.sub("#.*", "", text)
     counts = _COUNTS.search(lines)
     rows = len(re.findall(r"\n[^\S\n]*\S", lines[counts.end() :])) if counts else 0
     if counts is None or rows < int(counts[1]) + int(counts[2]):
-        raise _unreadable(path, f"{rows} lines of vertices and faces, fewer than its header says")
+        raise _unreadable(path, f"{rows} lines of vertices and faces, fewer than in its header")
     if not len(loaded["faces"]) or not np.isfinite(loaded["vertices"]).all():
         raise _unreadable(path, "no triangles with finite coordinates")
     return Trimesh(**loaded, process=False)
@@ -105,7 +105,7 @@ def clean_mesh(mesh: Trimesh) -> Trimesh:
 def mesh_spheres(mesh: Trimesh, shape: tuple[int, int]) -> NDArray[np.float64]:
     """Return the spherical images of a mesh and of its convex hull.
 
-    A flat mesh has no hull: it is its own.
+    A flat mesh counts as its own hull.
 
     Args:
         mesh: From `clean_mesh`.

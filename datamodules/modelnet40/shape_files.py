@@ -1,4 +1,4 @@
-"""The meshes of a data set of shapes, in one of the two layouts in which ModelNet40 is distributed.
+"""Meshes of a data set of shapes, in one of the two layouts in which ModelNet40 is distributed.
 
 By class, as released (``ModelNet40.zip``), or by split::
 
@@ -41,9 +41,9 @@ class ShapeFile(NamedTuple):
     """A mesh of the data set.
 
     Attributes:
-        path: The file.
+        path: File of the mesh.
         name: Path of the file in the data set, without suffix.
-        label: Name of its class.
+        label: Name of the class.
         part: Split of the mesh.
     """
 
@@ -54,7 +54,7 @@ class ShapeFile(NamedTuple):
 
     @property
     def parts(self) -> dict[str, Path]:
-        """The files that its spheres are made from."""
+        """Files that the spheres are computed from."""
         return {"mesh": self.path}
 
 
@@ -65,7 +65,7 @@ def find_shapes(root: Path) -> list[ShapeFile]:
         root: Folder of the data set.
 
     Raises:
-        DataError: The folder is missing or holds no such tree, or a class has no training shape.
+        DataError: The folder is missing or has another layout, or a class has no training shape.
     """
     if not root.is_dir():
         raise DataError(root, found="no such folder", expected="the data set", remedy=_GET_IT)

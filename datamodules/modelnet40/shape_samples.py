@@ -34,9 +34,9 @@ TestRotation = Literal["yaw", "so3"] | None
 
 
 STEPS = 16384
-"""Steps of the prepared values in 1.
+"""Steps of prepared values per unit.
 
-Distances reach to 1.99, so 15 bits hold all values with an error of at most 1/32768, less than
+Distances are at most 1.99, so 15 bits hold all values with an error of at most 1/32768, less than
 2/10000 of a channel's standard deviation. Float16 would take as much space and be eight times as
 coarse around 1, and OpenCV does not sample it.
 """
@@ -63,13 +63,13 @@ def make_spheres(shape: tuple[int, int], mesh: ShapeFile) -> Spheres:
 
 
 class ShapeSample(NamedTuple):
-    """One shape seen through N images; collated, each has a leading batch dimension.
+    """N views of one shape; collating adds a leading batch dimension.
 
     Attributes:
-        images: From the loader ``(N, h, w, 6)`` int16 in steps of `STEPS`: half the bytes. On the
-            device `normalize_spheres` makes them ``(N, 6, h, w)`` float32.
+        images: ``(N, h, w, 6)`` int16 in steps of `STEPS`, which is half the bytes.
+            `normalize_spheres` converts them to ``(N, 6, h, w)`` float32 on the device.
         label: Class, int64.
-        index: Place in its split, int64.
+        index: Index in its split, int64.
     """
 
     images: Tensor
@@ -83,10 +83,10 @@ class ShapeViews(Dataset[ShapeSample]):
 
     Attributes:
         source: The shapes.
-        class_names: Names of the labels, in their order.
+        class_names: Names of the labels, in order.
         representation: Representation of the images.
         seed: Seed of the run, 0 or more.
-        random: True to draw views for every epoch and index; else all views are taken.
+        random: True to draw views for every epoch and index; otherwise all views are returned.
         rotation: Rotation of whole shapes in evaluation, different for each shape.
     """
 
@@ -104,7 +104,7 @@ class ShapeViews(Dataset[ShapeSample]):
         epoch, index = sample_key(key, len(self))
         spheres = self.source.read(index).spheres
         images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(epoch, index)])
-        # Torch hardly knows uint16; all values are below 2 · STEPS = 2¹⁵.
+        # torch has few operations on uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
             torch.tensor(self.class_names.index(self.source.items[index].label)),
@@ -120,7 +120,7 @@ class ShapeViews(Dataset[ShapeSample]):
         return self.representation.with_rotation(self.shape_rotation(index).T).view_sets()
 
     def shape_rotation(self, index: int) -> NDArray[np.float64]:
-        """Return the rotation of one shape, ``(3, 3)``: its point x is now at R x."""
+        """Return the rotation R of one shape, ``(3, 3)``: point x moves to R x."""
         rng = sample_rng(self.seed, 0, index)
         if self.rotation == "so3":
             return random_rotation(rng)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
-if TYPE_CHECKING:  # slow, and SynthRooms needs the names alone
+if TYPE_CHECKING:  # slow to import; SynthRooms needs only the names
     from datamodules.core.panoramas import ImageFiles
 
 
@@ -31,7 +31,7 @@ CLASSES: tuple[str, ...] = (
     "wall",
     "window",
 )
-"""The 13 classes; the label of a class is its place here plus one."""
+"""The 13 classes; the label of a class is its index plus one."""
 
 UNKNOWN_CLASS = "<UNK>"
 """Class of unlabeled instances."""
@@ -69,10 +69,10 @@ class FileName(NamedTuple):
         """Parse a file name.
 
         Args:
-            name: The name without folders.
+            name: Name without folders.
 
         Raises:
-            DataError: It is not a name of the data set.
+            DataError: The name does not follow the data set.
 
         >>> FileName.parse(f"camera_{'0f' * 16}_office_7_frame_3_domain_rgb.png")[1:]
         ('office', 7, '3')
@@ -84,7 +84,7 @@ class FileName(NamedTuple):
                 found="an unknown file name",
                 expected="camera_<32 hex>_<room>_<n>_frame_<equirectangular or number>"
                 "_domain_rgb.png",
-                remedy="Move files that are not of the data set elsewhere.",
+                remedy="Move files that do not belong to the data set elsewhere.",
             )
         camera, room, number, frame = match.groups()
         return cls(camera, room, int(number), frame)
@@ -96,7 +96,7 @@ class PictureFiles(NamedTuple):
     Attributes:
         area: One of `AREAS`.
         name: Parts of the file name.
-        image: Files of the image, named ``area_3/office_2/<32 hex>``; photos with the frame.
+        image: Files of the image, named ``area_3/office_2/<32 hex>``; for photos, ``…/<frame>``.
         pose: File of camera and pose.
     """
 
@@ -107,7 +107,7 @@ class PictureFiles(NamedTuple):
 
     @property
     def room(self) -> tuple[str, str, int]:
-        """Building, kind and number of the room: 5a and 5b are one building."""
+        """Building, kind and number of the room; 5a and 5b are one building."""
         return self.area.rstrip("ab"), self.name.room, self.name.room_number
 
 
@@ -124,8 +124,8 @@ def list_pictures(
         root: Folder of the data set.
         area: One of `AREAS`.
         group: Panoramas or photos.
-        with_depth: True to name files of depth.
-        problems: Problems are added: no images, or other files.
+        with_depth: True to list depth files too.
+        problems: Collects problems: no images, or unknown files.
     """
     from datamodules.core.panoramas import ImageFiles
 

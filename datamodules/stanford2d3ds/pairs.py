@@ -1,11 +1,11 @@
-"""Pairs of Stanford2D3DS's panoramas: the paper's sixty of area 1, or all of the same rooms.
+"""Pairs of Stanford2D3DS's panoramas: the paper's sixty pairs of area 1, or all pairs in a room.
 
 ``pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
 number, split, images, overlap of the fields of view, then PMR, MS and P on the equirectangular
 image and at base levels 0, 1 and 2. Inconsistencies in print are kept: the means of
 the overlaps are 0.896 (easy) and 0.836 (hard) where the paper's text has 89.35 % and 83.35 %, and
 the mean PMR of the hard pairs at level 0 is 28.7 % where its table has 28.4 %. Pairs 17 and 22 are
-hard with the overlap, 0.86, that six easy ones have: the split is by figures before rounding.
+hard although six easy pairs have the same overlap, 0.86: the split uses figures before rounding.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
 from tangent_train.errors import DataError, SettingError
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
-_SHORT = 7  # hexadecimal digits of a camera that the paper prints
+_SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
 
 
 def published_pairs() -> list[PublishedPair]:
@@ -53,9 +53,8 @@ class StanfordPairs(PanoramaPairs):
     """Pairs of Stanford2D3DS's panoramas with depth and pose; see `read_panorama_pose`.
 
     Args:
-        root: Folder with ``area_1`` …, of which ``pano/rgb``, ``pano/depth`` and ``pano/pose`` are
-            read.
-        pairs: `paper`, the sixty of area 1; or `rooms`, any two panoramas of the same room.
+        root: Folder with ``area_1`` …; ``pano/rgb``, ``pano/depth`` and ``pano/pose`` are read.
+        pairs: `paper`, the sixty pairs of area 1; or `rooms`, any two panoramas of a room.
         areas: Areas to search with `rooms`; by default all present.
         erp_height: Rows to downsample the panoramas to; by default unchanged.
 
@@ -79,7 +78,7 @@ class StanfordPairs(PanoramaPairs):
 
     @cached_property
     def pairs(self) -> list[tuple[str, PictureFiles, PictureFiles]]:
-        """The paper's numbers of pairs, or their rooms and the beginnings of their cameras.
+        """See `PanoramaPairs`; names are the paper's numbers, or rooms and abbreviated cameras.
 
         Raises:
             DataError: Panoramas are missing.
@@ -133,7 +132,7 @@ def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str,
     """Return the files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
 
     Raises:
-        DataError: Some names fit no panorama, or several; the message lists all.
+        DataError: Lists all names that match no panorama, or several.
     """
     by_name: defaultdict[str, list[PictureFiles]] = defaultdict(list)
     for file in files:

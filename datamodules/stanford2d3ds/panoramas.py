@@ -1,7 +1,7 @@
 """Stanford2D3DS (Armeni et al. 2017): six areas of three buildings, 1,413 panoramas, 70,496 photos.
 
 Features: 2048×4096 RGB, depth and 13 semantic classes (`files.CLASSES`), captured with a
-Matterport camera; all panoramas are upright. Three folds of its authors, by area.
+Matterport camera; all panoramas are upright. Three folds by area, defined by the authors.
 
 On disk, as released::
 
@@ -46,16 +46,16 @@ from tangent_train.registry import registered
 class StanfordAreas(ImageDataModule):
     """The three folds of the authors, with rooms for validation.
 
-    Validation pictures are those of whole rooms drawn from the training areas, so that nothing is
-    selected on the test areas: at least one room, never all.
+    Validation uses whole rooms drawn from the training areas, at least one and at most all but one.
+    Nothing is selected on the test areas.
 
     Args:
         fold: 1, 2 or 3, see `FOLDS`.
         areas: Areas to use, all of which must exist; by default all.
-        label_table: The class table, if not at the place of the release.
+        label_table: Path of the class table, if not where the release has it.
 
     Attributes:
-        group: Kind of pictures.
+        group: Folder of the images, `pano` or `data`.
 
     Raises:
         SettingError: A setting is invalid.
@@ -110,7 +110,7 @@ class StanfordAreas(ImageDataModule):
         }
 
     def _reader(self) -> StanfordReader:
-        """The reader, with the class table and the choice of unknown pixels."""
+        """Return the reader, with the class table and the setting for unknown pixels."""
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         if self.label_table is not None:
             places = [self.label_table]
@@ -131,7 +131,7 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 
     Args:
-        unknown: Pixels that count as unknown, see `mask_black`.
+        unknown: Pixels that are unknown, see `mask_black`.
 
     Raises:
         SettingError: A setting is invalid.
@@ -152,7 +152,7 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
 class Stanford2D3DSPerspective(StanfordAreas, PhotoDataModule):
     """The photos of Stanford2D3DS, 13 classes, in the three folds of its authors.
 
-    Validation rooms are those of the panoramas, where every room has both.
+    The validation rooms are those of the panoramas if every room has photos and panoramas.
 
     Raises:
         SettingError: A setting is invalid.

@@ -21,9 +21,9 @@ from tangent_train.files import parse_json, read_json
 from tangent_train.geometry import PanoramaPose, is_camera_matrix
 
 UNKNOWN = 0
-"""The label of pixels without a class: ignored in training and evaluation."""
+"""Label of pixels without a class, which are ignored in training and evaluation."""
 
-_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("grey",))}
+_FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("gray",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
 _PANORAMA_KEYS = {
     "camera_rt_matrix": (3, 4),
@@ -52,10 +52,10 @@ class LabelTable:
         """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
 
         Args:
-            path: The file.
+            path: File to read.
 
         Raises:
-            DataError: It cannot be read or is no such list.
+            DataError: The file cannot be read or is not such a list.
         """
         expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or {UNKNOWN_CLASS}"
         remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
@@ -88,13 +88,13 @@ class LabelTable:
         return np.where(past, np.uint8(UNKNOWN), self.class_ids[instances])
 
     def past_end(self, colors: NDArray[np.uint8]) -> NDArray[np.int32]:
-        """Return the instances past the end of the table, without the mark of missing labels.
+        """Return the instances past the end of the table, except the value of missing labels.
 
         Args:
             colors: See `decode`.
 
         Returns:
-            ``(n,)``, one for each of n pixels.
+            ``(n,)`` instances of n pixels.
         """
         instances = _instances(colors)
         return instances[(instances >= len(self.class_ids)) & (instances != MISSING_LABEL)]
@@ -110,8 +110,8 @@ class StanfordReader(PngReader):
     """Reader of panoramas and photos.
 
     Attributes:
-        table: The classes of the instances.
-        unknown: Pixels that count as unknown, see `mask_black`.
+        table: Classes of the instances.
+        unknown: Pixels that are unknown, see `mask_black`.
     """
 
     table: LabelTable
@@ -121,12 +121,12 @@ class StanfordReader(PngReader):
 
     @property
     def settings(self) -> dict[str, str]:
-        """Unknown pixels and the class table in short."""
+        """See `ImageReader`: unknown pixels and a digest of the class table."""
         classes = hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()
         return {"unknown": self.unknown, "class table": classes}
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return classes by the class table, 0 where black pixels are masked."""
+        """Return the labels by the class table; masked black pixels are 0."""
         colors = read_rgb(files.labels)
         shape = shape or (colors.shape[0], colors.shape[1])
         labels = self.table.decode(resize_nearest(colors, shape))
@@ -150,7 +150,7 @@ class StanfordReader(PngReader):
         return read_depth(files.parts["depth"])
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
-        """The pose in the pose file; None without a file."""
+        """Read the pose in the pose file; None without a file."""
         pose = files.rgb.name.removesuffix("rgb.png") + "pose.json"
         path = files.rgb.parents[1] / "pose" / pose
         if not path.is_file():
@@ -183,7 +183,7 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
         ``(3, 3)`` K for integer pixel centers (the file counts from pixel corners).
 
     Raises:
-        DataError: The file is missing or broken, or holds no such matrix.
+        DataError: The file is missing or broken, or lacks the matrix.
     """
     (matrix,) = read_pose_numbers(path, {"camera_k_matrix": (3, 3)})
     if not is_camera_matrix(matrix):

@@ -1,9 +1,9 @@
 """Generating OmniSYNTHIA from SYNTHIA: the four views of a frame form one panorama.
 
 The front view is in the middle of the panorama, every pixel belongs to one view, and depth is the
-distance from the center. The script that made the published panoramas (Zhang et al. 2019) has the
-left view in the middle, 90° away, keeps the z-depth of the views, and averages where views overlap,
-labels included.
+distance from the center. The script of the published panoramas (Zhang et al. 2019) puts the left
+view in the middle (90° away), keeps the z-depth of the views, and averages overlapping views,
+including labels.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ HEIGHT = 2096
 """Rows of the published panoramas."""
 
 MANIFEST = "tangent_train.json"
-"""File in ``pano`` that says that the panoramas there were made here, and how."""
+"""File in ``pano`` that marks generated panoramas and holds their settings."""
 
 _NOWHERE = -2  # a position outside all images, whatever interpolation reads around it
 
@@ -59,15 +59,15 @@ class ViewStitcher:
     ) -> None:
         rows, columns = size
         owner, x, y = _view_positions(camera_matrix, height)
-        # A view is seen up to the outer edges of its pixels. Beyond the outermost centers these are
-        # repeated: in the stack of all views, the next rows are another view's.
+        # A view extends to the outer edges of its pixels. Beyond the outermost centers, these are
+        # repeated: in the stack of all views, the next rows belong to another view.
         seen = (np.abs(x - (columns - 1) / 2) <= columns / 2) & (
             np.abs(y - (rows - 1) / 2) <= rows / 2
         )
         x, y = np.clip(x, 0, columns - 1), np.clip(y, 0, rows - 1) + owner * rows
         map_x, map_y = (np.where(seen, place, _NOWHERE).astype(np.float32) for place in (x, y))
         self._tables = {
-            # To 1/32 pixel, as always with 8-bit images: faster, and half the memory.
+            # OpenCV's precision for 8-bit images, 1/32 pixel: faster, and half the memory.
             "bilinear": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2),
             "nearest": cv2.convertMaps(map_x, map_y, cv2.CV_16SC2, nninterpolation=True),
         }
@@ -82,7 +82,7 @@ class ViewStitcher:
         """Return panorama ``(H, W[, C])`` of images in the order of `VIEWS`.
 
         Args:
-            views: The images.
+            views: Images of the views.
             interpolation: `bilinear` for colors, `nearest` for labels and distances.
             elsewhere: Value outside the views.
         """
@@ -104,12 +104,12 @@ def _view_positions(
     upright: there they are nearest to the image center.
 
     Returns:
-        ``(W,)`` place in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.
+        ``(W,)`` index in `VIEWS`, ``(W,)`` columns and ``(H, W)`` rows.
     """
     width = 2 * height
     level = lonlat_to_xyz(np.stack([equirect_longitudes(width), np.zeros(width)], axis=-1))
-    turns = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
-    ahead, right, _ = np.moveaxis(np.stack([level @ turn for turn in turns]), -1, 0)
+    rotations = [rotation_about((0, 0, 1), k * np.pi / 2) for k in range(len(reader.VIEWS))]
+    ahead, right, _ = np.moveaxis(np.stack([level @ rotation for rotation in rotations]), -1, 0)
     owner = ahead.argmax(axis=0)
     columns = np.arange(width)
     ahead, right = ahead[owner, columns], right[owner, columns]
@@ -128,14 +128,14 @@ def make_panoramas(
 ) -> int:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
-    Complete files are kept, so that the work can be interrupted. Published panoramas are left alone
-    and never mixed with generated ones, whose heading differs.
+    Complete files are kept, so that the work can be interrupted. Published panoramas stay unchanged
+    and are not mixed with generated ones, whose heading differs.
 
     Args:
         root: Folder of the sequences.
-        sequences: Sequences, as ``01``.
-        problems: Broken views are added under the name of the panorama.
-        frames: Approximate number per sequence, see `choose_frames`.
+        sequences: Sequences, e.g. ``01``.
+        problems: Collects broken views by name of the panorama.
+        frames: Approximate number of frames per sequence, see `choose_frames`.
         height: Rows of the panoramas.
 
     Returns:
@@ -156,15 +156,15 @@ def make_panoramas(
             )
             jobs += _unfinished(root, sequence, chosen, height, problems)
             total += len(chosen)
-    # Threads: OpenCV leaves the GIL alone, and the tables are shared. As fast as processes.
-    # Closed: an interrupt drops what is queued.
+    # Threads, as fast as processes: OpenCV releases the GIL, and the tables are shared.
+    # Closed, so that an interrupt drops queued work.
     with closing(in_threads(lambda make: make(), jobs)) as done:
         show_progress(done, "Making panoramas", "panoramas", total, total - len(jobs))
     return len(jobs)
 
 
 def _claim(folder: Path, frames: int, height: int) -> bool:
-    """Mark a folder in which panoramas are to be generated; False if there are none."""
+    """Mark a folder for generated panoramas; return False if none are to be generated."""
     pano = folder / "pano"
     is_ours, has_files = (pano / MANIFEST).exists(), any(pano.glob("**/[!.]*.png"))
     if not reader.list_frames(folder):
@@ -185,7 +185,7 @@ def _claim(folder: Path, frames: int, height: int) -> bool:
 def _unfinished(
     root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
 ) -> list[Callable[[], None]]:
-    """Return the panoramas to generate, after a check of all their sources."""
+    """Return the panoramas to generate, after checking all their sources."""
     size: tuple[int, int] | None = None
     whole = []
     for frame in frames:
@@ -225,7 +225,7 @@ def _make(
             "labels": stitcher.stitch(
                 [reader.read_ids(v.labels) for v in views], "nearest", reader.INVALID
             ),
-            # Last: frames with this file have a panorama.
+            # Written last: this file marks a complete panorama.
             "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }
         for part, image in parts.items():

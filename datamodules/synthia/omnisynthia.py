@@ -31,7 +31,7 @@ from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
-"""The sequences there are; OmniSYNTHIA has their summers."""
+"""Available sequences; OmniSYNTHIA uses the summer versions."""
 
 TRAIN: tuple[str, ...] = ("01", "02", "05", "06")
 TEST: tuple[str, ...] = ("04",)
@@ -47,7 +47,7 @@ class SynthiaSequences(ImageDataModule):
 
     Args:
         train_sequences: Sequences for training, e.g. ``01``.
-        test_sequences: Sequences for test, e.g. ``04``.
+        test_sequences: Sequences for the test, e.g. ``04``.
         frames: Approximate number of frames per sequence, see `choose_frames`.
 
     Attributes:
@@ -80,12 +80,12 @@ class SynthiaSequences(ImageDataModule):
 
     @property
     def sequences(self) -> tuple[str, ...]:
-        """Sequences for training, then those for test."""
+        """Training sequences, then test sequences."""
         return (*self.train_sequences, *self.test_sequences)
 
     @abstractmethod
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
-        """The images of every frame of a sequence, if there are any."""
+        """Return the images of every frame of a sequence, if any."""
 
     def find_images(
         self, problems: Problems
@@ -122,7 +122,7 @@ def divide(
         frames: Images of each frame, by sequence and in order.
         test: Sequences for the test; all others are for training.
         validation_fraction: Share of each training sequence for validation: at least one frame,
-            never all, so none of a single one; 0 for no validation.
+            at most all but one; 0 for no validation.
     """
     splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
     for sequence, found in frames.items():
@@ -154,7 +154,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """
 
     formats = reader.PANORAMA_FORMATS
-    remedy = f"Run tangent-prepare to make them from the views. {reader.GET_IT}"
+    remedy = f"Run tangent-prepare to generate them from the views. {reader.GET_IT}"
 
     panorama_height: int = HEIGHT
 
@@ -163,7 +163,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         self._not_made = Problems()
 
     def make_files(self) -> None:
-        """Generate the panoramas of sequences without or with unfinished panoramas.
+        """Generate missing panoramas of all sequences.
 
         Raises:
             DataError: The views are missing or broken.
@@ -180,7 +180,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `LabeledData`; panoramas that could not be generated count as broken."""
+        """See `LabeledData`; panoramas that could not be generated are broken."""
         problems.add_all(self._not_made)
         return super().find(problems)
 
@@ -195,7 +195,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
-    """SYNTHIA's views, 13 classes, of the frames and in the splits of OmniSYNTHIA.
+    """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA.
 
     Raises:
         SettingError: A setting is invalid.

@@ -1,4 +1,4 @@
-"""The files of SYNTHIA's video sequences and of OmniSYNTHIA: names, cameras, labels, depth.
+"""Files of SYNTHIA's video sequences and of OmniSYNTHIA: names, cameras, labels, depth.
 
 On disk, as released (`0X` is 01, 02, 04, 05 or 06)::
 
@@ -44,7 +44,7 @@ GET_IT = (
 """Remedy if the data set is missing."""
 
 FRAMES = 500
-"""About as many frames of each sequence became panoramas of OmniSYNTHIA."""
+"""Approximate number of frames of each sequence in OmniSYNTHIA."""
 
 _SIZE = (760, 1280)
 _CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, center from pixel corners
@@ -68,7 +68,7 @@ CLASSES: tuple[str, ...] = (
 """The classes as labels 1 to 13. In the files traffic lights are 15; 13 and 14 are reserved."""
 
 INVALID = 255
-"""Label of a panorama where no view looks."""
+"""Label in panoramas for pixels outside of all views."""
 
 NORMALIZATIONS = (
     Normalization(mean=(0.4512, 0.4257, 0.3920), std=(0.2601, 0.2680, 0.2931)),
@@ -77,8 +77,8 @@ NORMALIZATIONS = (
         std=(0.2601, 0.2680, 0.2931, RGBD_NORMALIZATION.std[3]),
     ),
 )
-"""RGB as in the released code of the paper. None is published for SYNTHIA's depth; this is
-that of Stanford2D3DS, clipped alike."""
+"""RGB as in the released code of the paper. For depth, where
+nothing is published, the values of Stanford2D3DS are used, with the same clipping."""
 
 Formats = dict[str, tuple[int, tuple[str, ...]]]
 """Bits and color types by part."""
@@ -86,14 +86,14 @@ Formats = dict[str, tuple[int, tuple[str, ...]]]
 VIEW_FORMATS: Formats = {
     "rgb": (8, ("RGB", "RGBA")),
     "labels": (16, ("RGB", "RGBA")),
-    "depth": (16, ("grey", "RGB", "RGBA")),
+    "depth": (16, ("gray", "RGB", "RGBA")),
 }
 """Pixel formats of a view."""
 
 PANORAMA_FORMATS: Formats = {
     "rgb": (8, ("RGB", "RGBA")),
-    "labels": (8, ("grey",)),
-    "depth": (16, ("grey",)),
+    "labels": (8, ("gray",)),
+    "depth": (16, ("gray",)),
 }
 """Pixel formats of a panorama."""
 
@@ -105,7 +105,7 @@ _LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
 
 
 def sequence_folder(root: Path, sequence: str) -> Path:
-    """Return folder of a sequence.
+    """Return the folder of a sequence.
 
     Raises:
         DataError: The data set is missing.
@@ -120,7 +120,7 @@ def sequence_folder(root: Path, sequence: str) -> Path:
 
 
 def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
-    """Return files of one of `VIEWS` of a frame; `frame` is as ``000000``."""
+    """Return the files of one of `VIEWS` of a frame, e.g. ``000000``."""
     folder = sequence_folder(root, sequence)
     place = f"Stereo_Left/Omni_{view}/{frame}.png"
     camera = _camera_file(folder)
@@ -134,7 +134,7 @@ def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: 
 
 
 def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -> ImageFiles:
-    """Return files of one panorama; `frame` is as ``000000``."""
+    """Return the files of the panorama of a frame, e.g. ``000000``."""
     pano, name = sequence_folder(root, sequence) / "pano", f"{frame}.png"
     return ImageFiles(
         f"sequence_{sequence}/{frame}",
@@ -145,7 +145,7 @@ def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -
 
 
 def list_frames(folder: Path) -> list[str]:
-    """List frames with a color image of a view, as ``000000``, in order."""
+    """List frames with a color image of a view, e.g. ``000000``, in order."""
     return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
 
 
@@ -155,15 +155,15 @@ def list_panorama_frames(folder: Path) -> list[str]:
 
 
 def _names(*folders: Path) -> list[str]:
-    # Of a folder that is missing or closed there is none.
+    # A folder that is missing or unreadable has no frames.
     return sorted({path.stem for folder in folders for path in folder.glob(_NAME)})
 
 
 def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     """Return the frames that become panoramas: all, or every n-th from the first, about `count`.
 
-    As OmniSYNTHIA's authors chose them (Zhang et al. 2019): n is the number of frames divided by
-    `count`, rounded, halves up.
+    The choice of OmniSYNTHIA's authors (Zhang et al. 2019): n is the number of frames divided by
+    `count`, rounded half up.
 
     Raises:
         SettingError: `count` is less than 1.
@@ -177,10 +177,10 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
 
 
 def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]:
-    """Read camera matrix of all views of a sequence.
+    """Read the camera matrix of all views of a sequence.
 
-    From ``CameraParams/intrinsics.txt``: the focal length, x and y of the center, and perhaps the
-    baseline. Without that file, the one camera of the release.
+    It comes from ``CameraParams/intrinsics.txt``: focal length, x and y of the center, optionally
+    the baseline. Without the file, it is the camera of the release.
 
     Args:
         folder: Folder of the sequence.
@@ -190,7 +190,7 @@ def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]
         ``(3, 3)`` K for integer pixel centers; the file counts from pixel corners.
 
     Raises:
-        DataError: The file holds something else, or is missing and the views have another size.
+        DataError: The file has another content, or is missing and the views have another size.
     """
     path = _camera_file(folder)
     text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
@@ -202,7 +202,7 @@ def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]
         raise DataError(
             path,
             found=repr(text[:80]) if path.exists() else "no such file",
-            expected="focal length, centre x and y, and perhaps the baseline, in pixels of "
+            expected="focal length, center x and y, and perhaps the baseline, in pixels of "
             f"views of {width_height(size)}; only of {width_height(_SIZE)} is it known without",
             remedy="Extract the file again.",
         )
@@ -215,7 +215,7 @@ def _camera_file(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class SynthiaReader(PngReader):
-    """Views and panoramas alike.
+    """Reader of views and panoramas.
 
     Attributes:
         formats: `VIEW_FORMATS` or `PANORAMA_FORMATS`.
@@ -224,7 +224,7 @@ class SynthiaReader(PngReader):
     formats: Formats
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return classes as in `CLASSES`, 0 where unknown."""
+        """Return the labels by `CLASSES`, 0 where unknown."""
         ids = read_ids(files.labels)
         return cv2.LUT(resize_nearest(ids, shape or (ids.shape[0], ids.shape[1])), _LABELS)
 
@@ -234,12 +234,12 @@ class SynthiaReader(PngReader):
         return meters_to_steps((centimeters / 100).astype(np.float32))
 
     def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Read the camera matrix of the sequence that the view is from."""
+        """Read the camera matrix of the view's sequence."""
         return read_view_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
 
 
 def read_first_channel(path: Path) -> NDArray[Any]:
-    """Decode the red or only channel of an image as it is, ``(H, W)``.
+    """Decode the red or only channel of an image unchanged, ``(H, W)``.
 
     Raises:
         DataError: The file is broken.
@@ -249,7 +249,7 @@ def read_first_channel(path: Path) -> NDArray[Any]:
 
 
 def read_ids(path: Path) -> NDArray[np.uint8]:
-    """Read labels as in the file, ``(H, W)``: 0 to 15, or `INVALID`.
+    """Read the labels in the file, ``(H, W)``: 0 to 15, or `INVALID`.
 
     Raises:
         DataError: The file is broken or holds other labels.

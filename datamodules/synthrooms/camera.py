@@ -62,7 +62,7 @@ class Pose:
 
     Attributes:
         location: ``(3,)`` center in meters.
-        world_from_camera: ``(3, 3)`` Rᵀ: its columns are the camera's right, down and forward.
+        world_from_camera: ``(3, 3)`` Rᵀ; its columns are the camera's right, down and forward.
     """
 
     location: NDArray[np.float64]
@@ -72,13 +72,13 @@ class Pose:
     def looking(
         cls, location: NDArray[np.float64], heading: float, pitch: float = 0.0, roll: float = 0.0
     ) -> Pose:
-        """Return the pose of angles in radians.
+        """Return the pose for some angles in radians.
 
         Args:
             location: ``(3,)`` center in meters.
             heading: Counterclockwise from the room's x axis, seen from above.
             pitch: Upward tilt.
-            roll: Clockwise as seen by the camera, which tilts the picture the other way.
+            roll: Clockwise as seen by the camera; the picture tilts counterclockwise.
         """
         upright = rotation_about(_Z, heading - math.pi / 2) @ rotation_about(
             _X, math.pi / 2 + pitch
@@ -108,10 +108,12 @@ class PanoramaRays:
         """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
         lon = equirect_longitudes(2 * self.height, dx)
         lat = equirect_latitudes(self.height, dy)
-        # A direction is cos φ times its horizontal part plus the vertical: no trigonometry a pixel.
-        turn = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
-        level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ turn).astype(np.float32)
-        vertical = np.sin(lat)[:, None] * turn[2]
+        # A direction is cos φ times its horizontal part plus the vertical: no trigonometry here.
+        room_from_sphere = (self.pose.world_from_camera @ CAMERA_FROM_SPHERE).T
+        level = (lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ room_from_sphere).astype(
+            np.float32
+        )
+        vertical = np.sin(lat)[:, None] * room_from_sphere[2]
         spread = np.cos(lat).astype(np.float32)[:, None, None] * level
         return spread + vertical.astype(np.float32)[:, None, :]
 
@@ -152,13 +154,13 @@ class PerspectiveRays:
 
 
 PictureRays: TypeAlias = PanoramaRays | PerspectiveRays
-"""The pixels of a picture: their rays, and depth from distances along them."""
+"""Pixels of a picture: rays, and depth from distances along the rays."""
 
 
 def draw_rays(
     rng: np.random.Generator, kind: ViewKind, location: NDArray[np.float64], size: int
 ) -> PerspectiveRays:
-    """Draw a perspective view from a place.
+    """Draw a perspective view from a location.
 
     Args:
         rng: Source of randomness.

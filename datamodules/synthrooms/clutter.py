@@ -29,8 +29,8 @@ def add_desk_things(room: Room, frame: Frame, size: tuple[float, float, float]) 
     for k in range(number):
         x = wide * 0.8 * ((k + 0.5) / number - 0.5)
         y = deep * room.rng.uniform(-0.2, 0.2)
-        turn = room.rng.normal(0, 0.4)
-        _build_desk_thing(room, _new(room, frame.at(x, y, high, yaw=turn)))
+        heading = room.rng.normal(0, 0.4)
+        _build_desk_thing(room, _new(room, frame.at(x, y, high, yaw=heading)))
 
 
 def _build_desk_thing(room: Room, thing: RoomItem) -> None:

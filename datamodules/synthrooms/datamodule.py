@@ -1,4 +1,4 @@
-"""SynthRooms as data modules: Stanford2D3DS's own, after generating the files."""
+"""SynthRooms as data modules: those of Stanford2D3DS, after generating the files."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
-    """Photos of the same rooms, read as those of Stanford2D3DS.
+    """Photos of synthetic rooms, read as those of Stanford2D3DS.
 
     Raises:
         SettingError: A setting is invalid.
@@ -76,7 +76,7 @@ class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
 class SynthRoomsPairs(StanfordPairs):
     """Any two panoramas of the same synthetic room, with exact depth and pose.
 
-    There are no easy and hard pairs: overlaps are known only afterwards.
+    Pairs are not divided into easy and hard, because overlaps are known only afterwards.
 
     Args:
         root: Folder for the files.

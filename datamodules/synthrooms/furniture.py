@@ -146,8 +146,8 @@ def add_table(room: Room) -> None:
         for x in (np.arange(seats) - (seats - 1) / 2) * wide / seats:
             if room.chance(0.7):
                 away = side * (deep / 2 + rng.uniform(0.27, 0.4))
-                turn = (0 if side > 0 else np.pi) + rng.normal(0, 0.25)
-                add_chair_at(room, frame.at(float(x), away, yaw=turn))
+                heading = (0 if side > 0 else np.pi) + rng.normal(0, 0.25)
+                add_chair_at(room, frame.at(float(x), away, yaw=heading))
 
 
 def add_desk(room: Room) -> None:
@@ -157,8 +157,8 @@ def add_desk(room: Room) -> None:
     frame = room.plan.against_wall(rng, wide, deep, "low")
     _build_table(room, frame.at(0, deep / 2 + 0.02), 0 if room.chance(0.5) else 2, wide, deep)
     if room.chance(0.8):
-        turn = rng.normal(0, 0.4)
-        add_chair_at(room, frame.at(rng.uniform(-0.2, 0.2), deep + 0.33, yaw=turn))
+        heading = rng.normal(0, 0.4)
+        add_chair_at(room, frame.at(rng.uniform(-0.2, 0.2), deep + 0.33, yaw=heading))
 
 
 def _build_table(room: Room, frame: Frame, design: int, wide: float, deep: float) -> None:

@@ -26,10 +26,10 @@ MANIFEST = "synthrooms.json"
 """File that marks a folder as SynthRooms and holds its settings."""
 
 _VERSION = 1
-"""Version of the generator; another one makes other pictures from the same settings."""
+"""Version of the generator; other versions render other pictures from the same settings."""
 
 _LEAST = {"height": 8, "view_size": 8, "supersample": 1, "least_cameras": 1}
-_CAMERA_SHARES = (0.75, 0.15, 0.1)  # of rooms with one, two and three cameras
+_CAMERA_SHARES = (0.75, 0.15, 0.1)  # shares of rooms with one, two and three cameras
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class RoomSettings:
         views_per_camera: Perspective views per panorama.
         view_size: Side of the square perspective views in pixels.
         supersample: Rays per pixel side for the colors (labels and depth: one ray at the center).
-        least_cameras: Least number of panoramas per room; most rooms have one otherwise.
+        least_cameras: Smallest number of panoramas per room; by default most rooms have one.
 
     Raises:
         SettingError: A setting is invalid.
@@ -109,12 +109,12 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
     interrupted.
 
     Args:
-        root: Folder of the data set: new, empty, or of the same settings.
+        root: Folder of the data set: new, empty, or generated with the same settings.
         settings: Settings of the generator.
-        workers: Processes; 0 and 1 work in this one. By default one per CPU core.
+        workers: Number of processes, by default one per CPU core; 0 and 1 mean this process.
 
     Raises:
-        DataError: The folder holds other files, or rooms of other settings. Nothing is written.
+        DataError: The folder holds other files, or rooms of other settings; nothing is written.
     """
     claim_folder(root, MANIFEST, "SynthRooms", _VERSION, asdict(settings))
     plans = plan_rooms(settings)
@@ -136,7 +136,7 @@ def make_room(root: Path, settings: RoomSettings, plan: writer.RoomPlan) -> None
     Args:
         root: Folder of the data set.
         settings: Settings of the data set.
-        plan: The room.
+        plan: Plan of the room.
     """
     rng = plan.rng
     room = furnish(rng, plan.kind)

@@ -13,14 +13,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Zone = Literal["low", "high", "full"]
-"""Part of a wall's height that an item occupies: up to about a meter, above it, or all of it."""
+"""Part of a wall's height that an item occupies: up to about a meter, above, or all of it."""
 
 _TRIES = 24
 _GAP = 0.06
 
 
 class NoPlaceError(Exception):
-    """An item does not fit into a room: it is left out."""
+    """An item does not fit into a room, and is left out."""
 
 
 class Frame(NamedTuple):
@@ -47,7 +47,7 @@ class Frame(NamedTuple):
 
 
 class Rectangle(NamedTuple):
-    """An axis-aligned rectangle on the floor: its least and greatest x and y."""
+    """Axis-aligned rectangle on the floor, given by its least and greatest x and y."""
 
     x0: float
     y0: float
@@ -55,7 +55,7 @@ class Rectangle(NamedTuple):
     y1: float
 
     def meets(self, other: Rectangle, gap: float = 0.0) -> bool:
-        """True if the two come closer than `gap` meters along both axes."""
+        """Return True if two rectangles are closer than `gap` meters along both axes."""
         return (
             self.x0 < other.x1 + gap
             and other.x0 < self.x1 + gap
@@ -86,7 +86,7 @@ class Wall:
     taken: list[tuple[float, float, Zone]] = field(default_factory=list)
 
     def is_free(self, start: float, end: float, zone: Zone) -> bool:
-        """True if nothing hangs or stands between two positions along the wall."""
+        """Return True if the wall is free between two positions along it."""
         return not any(
             start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
             for a, b, other in self.taken
@@ -94,7 +94,7 @@ class Wall:
 
 
 class FloorPlan:
-    """A rectangle, or an L: the rectangle without its corner of greatest x and y.
+    """Rectangle, or L-shape: a rectangle without its corner of greatest x and y.
 
     Args:
         size: Width (x), depth (y) and height (z) of the room in meters.
@@ -134,7 +134,7 @@ class FloorPlan:
         return sum((r.x1 - r.x0) * (r.y1 - r.y0) for r in self.floors)
 
     def contains(self, area: Rectangle, margin: float = 0.0) -> bool:
-        """True if a rectangle is inside, `margin` meters away from every wall."""
+        """Return True if a rectangle is inside and `margin` meters away from every wall."""
         inside = (
             area.x0 >= margin
             and area.y0 >= margin
@@ -144,12 +144,12 @@ class FloorPlan:
         return inside and not (self.notch is not None and area.meets(self.notch, margin))
 
     def claim(self, area: Rectangle, margin: float = 0.0, gap: float = 0.0) -> bool:
-        """Take a rectangle of the floor if it is inside and free.
+        """Occupy a rectangle of the floor if it is inside and free; return True if so.
 
         Args:
-            area: The rectangle.
-            margin: Meters from every wall.
-            gap: Meters from everything else.
+            area: Rectangle to occupy.
+            margin: Distance from every wall in meters.
+            gap: Distance from everything else in meters.
         """
         free = not any(area.meets(other, gap) for other in self._taken)
         if not (free and self.contains(area, margin)):
@@ -160,12 +160,12 @@ class FloorPlan:
     def against_wall(
         self, rng: np.random.Generator, width: float, depth: float, zone: Zone
     ) -> Frame:
-        """Find and take a place at a wall.
+        """Find and occupy a place at a wall.
 
         Args:
             rng: Source of randomness.
             width: Meters along the wall.
-            depth: Meters of floor in front of it that must be and stay free; 0 for what hangs.
+            depth: Meters of floor in front of it to occupy; 0 for hanging items.
             zone: Part of the wall's height.
 
         Returns:
@@ -191,7 +191,7 @@ class FloorPlan:
     def in_the_open(
         self, rng: np.random.Generator, width: float, depth: float, gap: float = 0.12
     ) -> Frame:
-        """Find and take a place away from the walls, ``width × depth`` meters, axis-aligned.
+        """Find and occupy an axis-aligned place of ``width × depth`` meters away from the walls.
 
         Raises:
             NoPlaceError: No place was found.

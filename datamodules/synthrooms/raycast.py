@@ -25,7 +25,7 @@ class Hits(NamedTuple):
     """Hit points of rays.
 
     Attributes:
-        found: ``(n,)`` whether the ray hit a surface; the other fields are undefined where not.
+        found: ``(n,)`` True where the ray hit a surface; other fields are undefined elsewhere.
         distance: ``(n,)`` meters along the unit direction.
         part: ``(n,)`` position in `Room.parts`.
         points: ``(n, 3)`` meters.
@@ -54,7 +54,7 @@ class RayScene:
     """A furnished room ready for rays.
 
     Args:
-        room: The room; it is only read.
+        room: Furnished room, which is not changed.
     """
 
     def __init__(self, room: Room) -> None:

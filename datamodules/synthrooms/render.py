@@ -20,13 +20,13 @@ Floats = NDArray[np.float32]
 MISSING = -1
 """Item number of pixels without a scan."""
 
-_RAYS_AT_ONCE = 1 << 17  # keeps a 2048 × 4096 panorama within 200 MB, and the caches warm
+_RAYS_AT_ONCE = 1 << 17  # a 2048 × 4096 panorama takes at most 200 MB, and caches stay warm
 _GRAZING = 0.04  # cosine below which a depth camera gets no return
 _WHITE = 9.0  # square of the light, in units of exposure, that becomes white
 _HEIGHTS = (1.3, 1.7)
 _CLEAR = 0.55  # meters around a camera that should be free
 _APART = 1.2  # meters between the cameras of a room
-_PLACES = 60  # tried for every camera
+_PLACES = 60  # locations tried for every camera
 
 
 class Picture(NamedTuple):
@@ -66,7 +66,7 @@ class Holes(NamedTuple):
 
 @dataclass(frozen=True)
 class Camera:
-    """The place of a camera, and its sensor, the same in all of its pictures.
+    """Location and sensor of a camera, the same in all of its pictures.
 
     Attributes:
         location: ``(3,)`` meters.
@@ -110,7 +110,7 @@ def _draw_location(
     plan: FloorPlan,
     others: list[NDArray[np.float64]],
 ) -> NDArray[np.float64]:
-    """Draw the first place with enough room around it, or the best of those tried."""
+    """Draw the first location with enough free space, or the best one tried."""
     directions = even_directions(192)
     best, most = np.zeros(3), -math.inf
     for _ in range(_PLACES):
@@ -141,12 +141,12 @@ def render_picture(
     tone curve; labels and depth come from one ray through the pixel's center.
 
     Args:
-        scene: The room.
-        view: The picture's pixels; it must look from the camera's place.
-        camera: The sensor.
-        holes: Holes of the scan.
+        scene: Scene of the room.
+        view: Pixels of the picture, at the camera's location.
+        camera: Sensor of the camera.
+        holes: Holes in the scan.
         supersample: Rays per pixel side.
-        rng: Source of the sensor's noise.
+        rng: Random generator of the sensor's noise.
     """
     rays = view.rays()
     shape = (rays.shape[0], rays.shape[1])

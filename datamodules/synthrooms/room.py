@@ -1,4 +1,4 @@
-"""A room being furnished: items made of boxes, cylinders and balls, with their materials."""
+"""Rooms under construction: items composed of boxes, cylinders and balls, with materials."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _SHAPES = {
     "prism": creation.cylinder(0.5, 1.0, sections=6),
     "ball": creation.icosphere(subdivisions=2, radius=0.5),
 }
-"""Each fills the cube of side 1 around the origin; cylinder and prism are upright."""
+"""Unit shapes: each fills the cube of side 1 around the origin; cylinder and prism are upright."""
 
 _Triple = tuple[float, float, float]
 
@@ -47,7 +47,7 @@ class Light(NamedTuple):
         center: ``(3,)`` in meters.
         half_sides: ``(2, 3)`` vectors from the center to the middle of two sides.
         normal: ``(3,)`` unit vector it shines along.
-        intensity: Along the normal; it falls with the cosine, as a Lambertian emitter's.
+        intensity: Intensity along the normal; it falls with the cosine (Lambertian emitter).
     """
 
     center: NDArray[np.float64]
@@ -58,10 +58,10 @@ class Light(NamedTuple):
 
 @dataclass
 class RoomItem:
-    """One labelled object, composed of parts.
+    """One labeled object, composed of parts.
 
     Attributes:
-        parts: The room's parts, to which the parts of the item are added.
+        parts: Parts of the room, to which those of the item are added.
         index: Position in `Room.items`.
         frame: Place of the item; all parts are given in this frame.
     """
@@ -76,9 +76,9 @@ class RoomItem:
         """Add one of `_SHAPES`, scaled to `size` and rotated by `yaw` about its own vertical."""
         place = self.frame.at(*center, yaw)
         cos, sin = math.cos(place.yaw), math.sin(place.yaw)
-        turn = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
+        rotation = np.array([[cos, -sin, 0], [sin, cos, 0], [0, 0, 1.0]])
         unit = np.array(_SHAPES[shape].triangles, np.float64)
-        corners = unit * size @ turn.T + np.array(place[:3])
+        corners = unit * size @ rotation.T + np.array(place[:3])
         self.parts.append(RoomPart(self.index, material, corners))
 
     box = partialmethod(add, "box")
@@ -92,7 +92,7 @@ class Room:
 
     Attributes:
         rng: Source of randomness.
-        plan: Floor plan, with what is taken.
+        plan: Floor plan, with occupied places.
         palette: Colors of the room.
         items: Class name of every item.
         parts: Parts of all items.
@@ -114,7 +114,7 @@ class Room:
         return RoomItem(self.parts, len(self.items) - 1, frame)
 
     def chance(self, probability: float) -> bool:
-        """True with a probability."""
+        """Return True with a probability."""
         return bool(self.rng.random() < probability)
 
     def pick(self, shares: Sequence[float]) -> int:
@@ -122,5 +122,5 @@ class Room:
         return int(self.rng.choice(len(shares), p=np.asarray(shares) / np.sum(shares)))
 
     def count(self, least: int, most: int) -> int:
-        """Draw an integer between two limits, both included."""
+        """Draw an integer between two limits, inclusive."""
         return int(self.rng.integers(least, most + 1))

@@ -55,7 +55,7 @@ _PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
     (clutter.add_floor_clutter, 1.0, 2, 5),
     (clutter.add_wall_clutter, 0.9, 1, 3),
 )
-"""Furniture in order of placement: how, in which share of rooms, how many (least and most)."""
+"""Furniture in order of placement: function, share of rooms, smallest and largest number."""
 
 
 def draw_room_type(rng: np.random.Generator) -> str:
@@ -65,7 +65,7 @@ def draw_room_type(rng: np.random.Generator) -> str:
 
 
 def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
-    """Make an empty room: floor, ceiling and walls."""
+    """Build an empty room: floor, ceiling and walls."""
     room = Room(rng, plan, Palette(rng))
     materials = [
         add(room) for add in (structure.add_floor, structure.add_ceiling, structure.add_walls)
@@ -75,7 +75,7 @@ def shell(rng: np.random.Generator, plan: FloorPlan) -> Room:
 
 
 def furnish(rng: np.random.Generator, room_type: str) -> Room:
-    """Make a furnished room.
+    """Build a furnished room.
 
     Args:
         rng: The room's source of randomness.

@@ -1,4 +1,4 @@
-"""Stanford2D3DS's files: names, label table, pictures and poses.
+"""Files in Stanford2D3DS's format: names, label table, pictures and poses.
 
 Every picture is four files in ``area_<a>/<pano|data>/<kind>/``, named
 ``camera_<uuid>_<room>_frame_<frame>_domain_<kind>.<png|json>``. A panorama's frame is
@@ -29,9 +29,9 @@ SUFFIXES = {"rgb": ".png", "depth": ".png", "semantic": ".png", "pose": ".json"}
 """Files of every picture by kind."""
 
 INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
-"""Number of entries for a class that each room has in the label table, used or not.
+"""Number of entries per room and class in the label table, used or not.
 
-The indices of a room thus do not depend on other rooms. Further instances share the last entry.
+So the indices of a room do not depend on other rooms. Further instances share the last entry.
 """
 
 _DEPTH_UNITS = 512  # per meter
@@ -44,11 +44,11 @@ class RoomPlan(NamedTuple):
 
     Attributes:
         area: ``"1"`` to ``"6"``, with ``"5a"`` and ``"5b"``.
-        kind: Room type, as ``office``.
-        number: From 1, unique in the area; 5a and 5b count as one area here, as in the real set.
-        order: Place of the room in the label table, from 0.
+        kind: Room type, e.g. ``office``.
+        number: Number from 1, unique in the area; 5a and 5b count as one area, as in the real set.
+        order: Index of the room in the label table, from 0.
         cameras: Identifier of each of its panoramas, 32 hexadecimal digits.
-        rng: Source of randomness of everything in it.
+        rng: Random generator of the room.
     """
 
     area: str
@@ -64,7 +64,7 @@ class RoomPlan(NamedTuple):
         return f"{self.kind}_{self.number}"
 
     def files(self, frames: Sequence[str]) -> list[PurePosixPath]:
-        """Return the paths of all files of some frames of all cameras, see `file`."""
+        """Return the paths of all files of some frames, for all cameras, see `file`."""
         every = product(self.cameras, frames, SUFFIXES)
         return [self.file(camera, frame, kind) for camera, frame, kind in every]
 
@@ -87,7 +87,7 @@ def camera_identifier(seed: int, area: str, room: str, number: int) -> str:
 
 
 def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
-    """Return the label table: ``class_instance_roomtype_roomnumber_area``, the unknown first."""
+    """Return the label table: ``class_instance_roomtype_roomnumber_area``, unknown first."""
     labels = [f"{UNKNOWN_CLASS}_0_{UNKNOWN_CLASS}_0_0"]
     for room in rooms:
         labels += [
@@ -115,7 +115,7 @@ def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, by
     """Encode a picture as PNG files.
 
     Args:
-        picture: The rendered picture.
+        picture: Rendered picture.
         labels: Index into the label table of every item.
 
     Returns:
@@ -143,12 +143,12 @@ def pose_record(
     """Return the pose file of a picture, with all keys of the real set.
 
     `datamodules.synthrooms.camera` states the formulas. The camera matrix counts from pixel corners
-    (the middle of n pixels is n/2), as the real set's. A panorama has, as there, the field of view
-    of 90° and the camera matrix of one face of the cube around it.
+    (the middle of n pixels is n/2), as in the real set. Also as there, a panorama has the field of
+    view (90°) and the camera matrix of one cube face.
 
     Args:
-        room: The room.
-        camera: One of its cameras.
+        room: Plan of the room.
+        camera: Identifier of one of its cameras.
         frame: `PANORAMA`, or the number of a perspective view.
         view: Camera of the picture.
         original: Pose of the panorama of the same camera.
@@ -158,12 +158,12 @@ def pose_record(
     if not isinstance(image, PerspectiveRays):
         image = PerspectiveRays(pose, image.height, math.pi / 2)
     focal, center = image.size / (2 * math.tan(image.fov_rad / 2)), image.size / 2
-    turn = pose.world_from_camera @ original.world_from_camera.T
+    rotation = pose.world_from_camera @ original.world_from_camera.T
     return {
         "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
         "field_of_view_rads": image.fov_rad,
         "camera_original_rotation": original.euler_angles.tolist(),
-        "rotation_from_original_to_point": euler_angles(turn).tolist(),
+        "rotation_from_original_to_point": euler_angles(rotation).tolist(),
         "point_uuid": camera,
         "camera_location": pose.location.tolist(),
         "frame_num": frame,

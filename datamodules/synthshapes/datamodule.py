@@ -1,4 +1,4 @@
-"""SynthShapes as a data module: ModelNet40's own, after generating the files."""
+"""SynthShapes as a data module: that of ModelNet40, after generating the files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class SynthShapes(ModelNet40):
         super().__post_init__()
 
     def find_classes(self) -> tuple[str, ...]:
-        """The names of the ten classes."""
+        """Return the names of the ten classes."""
         return CLASSES
 
     def make_files(self) -> None:

@@ -82,13 +82,13 @@ def generate_shapes(root: Path, settings: ShapeSettings, *, workers: int | None 
     interrupted.
 
     Args:
-        root: Folder of the data set: new, empty, or of the same settings.
+        root: Folder of the data set: new, empty, or generated with the same settings.
         settings: Settings of the generator.
-        workers: Processes; 0 and 1 work in this one. By default one per CPU core, fewer for little
-            work.
+        workers: Number of processes, by default one per CPU core, fewer for little work; 0 and 1
+            mean this process.
 
     Raises:
-        DataError: The folder holds other files, or shapes of other settings. Nothing is written.
+        DataError: The folder holds other files, or shapes of other settings; nothing is written.
     """
     plans = plan_shapes(settings)
     claim_folder(root, MANIFEST, "SynthShapes", _VERSION, asdict(settings))
@@ -106,15 +106,15 @@ def _write(path: Path, seed: int, label: str, number: int) -> None:
 def make_shape(seed: int, label: str, number: int) -> Trimesh:
     """Make a shape, the same for the same arguments.
 
-    Like models of catalogues it has units and an origin of its own, and about the heading of its
-    class.
+    Like models in catalogs, each shape has a different scale and origin, and roughly the heading of
+    its class.
 
     Args:
         seed: Seed of the data set.
         label: Class.
         number: Index within its class.
     """
-    # The name, not its place: classes that are added later leave the others as they are.
+    # The name, not its index, so that classes added later do not change the others.
     rng = np.random.default_rng((seed, zlib.crc32(label.encode()), number))
     parts = Parts(rng)
     _FAMILIES[label](parts)

@@ -1,4 +1,4 @@
-"""Shapes composed of trimesh's primitives, like models of catalogues: open, overlapping, uneven.
+"""Shapes composed of trimesh's primitives, like models in catalogs: open, overlapping, uneven.
 
 Everything is in meters, z up, and stands on z = 0; the front of an object faces +x.
 """
@@ -20,7 +20,7 @@ class Parts:
     """A shape under construction.
 
     Args:
-        rng: Source of randomness of the shape.
+        rng: Random generator of the shape.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -32,7 +32,7 @@ class Parts:
         return float(self.rng.uniform(low, high))
 
     def chance(self, share: float) -> bool:
-        """True with a probability."""
+        """Return True with a probability."""
         return bool(self.rng.random() < share)
 
     def mesh(self) -> Trimesh:

@@ -148,7 +148,7 @@ def _handle(parts: Parts, x: float, z: float, size: float) -> None:
 
 
 def _curve(*groups: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Return the points of an outline, each group smoothed on its own."""
+    """Return the points of an outline, each group smoothed separately."""
     outline: list[tuple[float, float]] = []
     for group in groups:
         radius, height = np.array(group).T

@@ -1,9 +1,9 @@
 """Homes of ZInD: the panoramas in ``zind_data.json``.
 
-Read is its ``merger``: floors, in them complete rooms, in them the parts of rooms that annotators
-drew, in them panoramas. Lengths are in heights of the camera. A place x of a panorama is at
+Its ``merger`` is read: floors contain complete rooms, these contain partial rooms, and these
+contain panoramas. Lengths are in camera heights. A point x of a panorama is at
 ``scale · R(rotation) x + translation`` of its floor, in units of ``scale_meters_per_coordinate``
-meters; that is null where the length of a unit is not known.
+meters, which is null where unknown.
 """
 
 from __future__ import annotations
@@ -44,13 +44,13 @@ _FROM_SPHERE = np.array([[0, -1.0, 0], [1.0, 0, 0], [0, 0, 1.0]])
 
 @dataclass(frozen=True, eq=False)
 class HomePanorama:
-    """A panorama of a home, as its file describes it.
+    """A panorama of a home, as described in its file.
 
     Attributes:
         file: ``zind_data.json``.
         path: Names of floor, complete room, partial room and panorama.
         record: Record of the panorama in the file.
-        unit_m: Meters in a unit of the floor; None where unknown.
+        unit_m: Meters per unit of the floor; None if unknown.
     """
 
     file: Path
@@ -70,7 +70,7 @@ class HomePanorama:
 
     @property
     def room(self) -> str:
-        """The complete room, as ``000/floor_01/complete_room_06``."""
+        """Complete room, e.g. ``000/floor_01/complete_room_06``."""
         return "/".join((self.home, *self.path[:2]))
 
     @property
@@ -87,7 +87,7 @@ class HomePanorama:
         """Return the path of the picture.
 
         Raises:
-            DataError: The file does not name one in ``panos``.
+            DataError: The file does not name a picture in ``panos``.
         """
         path = PurePosixPath(self._fields({"image_path": Text})["image_path"])
         if path.parent != PurePosixPath("panos"):
@@ -115,10 +115,10 @@ class HomePanorama:
         return Layout(vertices, -camera, ceiling - camera, fixtures)
 
     def pose(self) -> tuple[PanoramaPose, float]:
-        """Place and orientation on its floor, whose height is 0, and meters in a camera height.
+        """Return the pose on its floor (height 0), and the camera height in meters.
 
         Raises:
-            DataError: The file does not say.
+            DataError: The file does not contain them.
         """
         camera = self._fields({"camera_height": float})["camera_height"]
         kinds = {"rotation": float, "scale": float, "translation": list[float]}
@@ -128,11 +128,11 @@ class HomePanorama:
         usable = len(numbers) == 6 and all(abs(number) <= _MOST for number in numbers)
         if not usable or min(lengths) <= 0:
             found = f"{moved}, a unit of {self.unit_m} m and camera_height={camera}"
-            raise self._wrong(found, "a place on the floor, in metres")
+            raise self._wrong(found, "a place on the floor, in meters")
         unit_m = lengths[0] * moved["scale"]
-        turn = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
+        rotation = rotation_about((0, 0, 1), math.radians(moved["rotation"]))
         location_m = np.array([*moved["translation"], moved["scale"] * camera]) * lengths[0]
-        return PanoramaPose(turn @ _FROM_SPHERE, location_m), unit_m
+        return PanoramaPose(rotation @ _FROM_SPHERE, location_m), unit_m
 
     def _fixtures(self, kind: str, label: int) -> Iterator[Fixture]:
         points = self._points(kind)
@@ -153,7 +153,7 @@ class HomePanorama:
         return np.array(points, np.float64).reshape(-1, 2)
 
     def _fields(self, kinds: Mapping[str, Any], section: str = "") -> dict[str, Any]:
-        """Return fields of the record or of a section, with checked types."""
+        """Return fields of the record or of a section, after checking their types."""
         content = self._fields({section: dict})[section] if section else self.record
         return check_fields(self.file, content, kinds, _EXPECTED, self._place(section))
 
@@ -170,7 +170,7 @@ def list_home_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
 
     Args:
         root: Folder with a folder for every home.
-        problems: Files that cannot be read are added.
+        problems: Collects unreadable files.
 
     Raises:
         DataError: There are no homes.
@@ -206,7 +206,7 @@ def _read_home(file: Path) -> list[HomePanorama]:
     unit_m = check_fields(file, given[place], units, _EXPECTED, place)
     panoramas = [(path, dict(_named(file, path, record))) for path, record in branches]
     return [
-        # The rest is most of the file, which would fill the memory with a thousand homes.
+        # The rest is most of the file, and a thousand homes would fill the memory.
         HomePanorama(file, path, {n: record.get(n) for n in _READ}, unit_m[path[0]])
         for path, record in panoramas
     ]
@@ -226,5 +226,5 @@ def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:
     """True if a polygon goes round the origin once."""
     angles = np.arctan2(vertices[:, 1], vertices[:, 0])
     steps = np.diff(angles, append=angles[:1])
-    turned = (steps + np.pi) % (2 * np.pi) - np.pi
-    return bool(abs(abs(turned.sum()) - 2 * np.pi) < np.pi / 2)
+    angles = (steps + np.pi) % (2 * np.pi) - np.pi
+    return bool(abs(abs(angles.sum()) - 2 * np.pi) < np.pi / 2)

@@ -1,9 +1,9 @@
-"""Classes and distances of a room layout as a camera sees it, in closed form.
+"""Classes and distances of a room layout from a camera, in closed form.
 
 Walls stand upright on a polygon around the camera, floor and ceiling are level, and doors, windows
 and openings are rectangles on the walls. A column of a panorama is a vertical plane: it shows the
 nearest wall in its direction, and the height at which a row meets that wall decides between floor,
-wall and ceiling. Only the centers of pixels are rounded to.
+wall and ceiling. The only approximation is that pixels are sampled at their centers.
 
 The frame is ZInD's, as overlays on the pictures show: x to the left, y to the middle column, z up,
 the camera in the origin.
@@ -25,16 +25,16 @@ CLASSES: tuple[str, ...] = ("ceiling", "floor", "wall", "door", "window")
 
 _CEILING, _FLOOR, _WALL, DOOR, WINDOW = range(1, 6)
 OPENING = 0
-"""Openings are unknown: they show the next room, of which the layout says nothing."""
+"""Openings are unknown: they show the next room, which the layout does not describe."""
 
 _OFF_WALL = 0.05
-"""Largest distance of a fixture from its wall, in camera heights; in the sample tour 0.002."""
+"""Largest distance of a fixture from its wall, in camera heights (sample tour: 0.002)."""
 
 _OFF_DIRECTION = 0.2
-"""Largest sine of the angle between a fixture and its wall: tells apart the walls of a corner."""
+"""Largest sine of the angle between a fixture and its wall; separates the walls of a corner."""
 
 _ROUNDING = 1e-9
-"""Walls are longer by this share, so that a ray to a corner meets one of them."""
+"""Share by which walls are extended, so that a ray to a corner hits one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,12 +55,12 @@ class Fixture:
 
 
 class _Columns(NamedTuple):
-    """The walls in the columns of a panorama.
+    """Walls in the columns of a panorama.
 
     Attributes:
         away: ``(W,)`` horizontal distance of the wall.
-        points: ``(W, 2)`` x and y of the place on it.
-        along: ``(W, 2)`` unit vector along it.
+        points: ``(W, 2)`` x and y of the point on the wall.
+        along: ``(W, 2)`` unit vector along the wall.
     """
 
     away: NDArray[np.float64]
@@ -76,7 +76,7 @@ class Layout:
         vertices: ``(n, 2)`` x and y of its corners, in order; the polygon contains the camera.
         floor_z: Height of the floor, below 0.
         ceiling_z: Height of the ceiling, above 0.
-        fixtures: On the walls; the first one counts where several overlap.
+        fixtures: Fixtures on the walls; where several overlap, the first one is used.
     """
 
     vertices: NDArray[np.float64]
@@ -85,7 +85,7 @@ class Layout:
     fixtures: Sequence[Fixture] = ()
 
     def labels(self, shape: tuple[int, int]) -> NDArray[np.uint8]:
-        """Return class of every pixel of a panorama of a shape ``(H, W)``."""
+        """Return the class of every pixel of a panorama of a shape ``(H, W)``."""
         columns = self._columns(shape[1])
         z = np.tan(equirect_latitudes(shape[0]))[:, None] * columns.away
         labels = np.full(shape, _WALL, np.uint8)
@@ -99,12 +99,12 @@ class Layout:
         return labels
 
     def distances(self, shape: tuple[int, int]) -> NDArray[np.float64]:
-        """Return distance from the camera of every pixel of a panorama of a shape ``(H, W)``.
+        """Return the distance from the camera for every pixel of a panorama of a shape ``(H, W)``.
 
-        NaN on doors, windows and openings: they may show what is behind them.
+        It is NaN on doors, windows and openings, which may show what is behind them.
         """
         latitudes = equirect_latitudes(shape[0])[:, None]
-        with np.errstate(divide="ignore"):  # on the horizon, which never meets floor or ceiling
+        with np.errstate(divide="ignore"):  # on the horizon, which never reaches floor or ceiling
             plane = np.where(latitudes < 0, self.floor_z, self.ceiling_z) / np.tan(latitudes)
         distances = np.minimum(np.abs(plane), self._columns(shape[1]).away) / np.cos(latitudes)
         known = np.isin(self.labels(shape), (_CEILING, _FLOOR, _WALL))

@@ -22,12 +22,12 @@ from tangent_train.errors import DataError
 class ZindPairs(PanoramaPairs):
     """Any two panoramas of a complete room whose cameras are inside.
 
-    On floors whose unit is not known in meters there are no pairs. Distances are those of floor,
+    Floors whose unit is unknown in meters have no pairs. Distances are those of floor,
     walls and ceiling of the layout; through doors, windows and openings they are unknown.
 
     Args:
         root: Folder with a folder for every home, see `datamodules.zind.panoramas`.
-        max_distance_m: Largest distance of the two cameras; by default any.
+        max_distance_m: Largest distance between the cameras; by default unlimited.
         erp_height: Rows to downsample the panoramas to; by default unchanged.
     """
 
@@ -37,10 +37,10 @@ class ZindPairs(PanoramaPairs):
 
     @cached_property
     def pairs(self) -> list[tuple[str, HomePanorama, HomePanorama]]:
-        """The room and both panoramas.
+        """See `PanoramaPairs`; names are the room and both panoramas.
 
         Raises:
-            DataError: There are none, or a file is broken.
+            DataError: There are no pairs, or a file is broken.
         """
         problems, root = Problems(), Path(self.root)
         most_m = math.inf if self.max_distance_m is None else self.max_distance_m

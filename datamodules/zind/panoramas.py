@@ -60,11 +60,11 @@ Doors = Literal["class", "ignore"]
 
 @dataclass(frozen=True, eq=False)
 class ZindReader(ImageReader):
-    """Reads the pictures and labels them by layouts.
+    """Reads the pictures, with labels from layouts.
 
     Attributes:
-        layouts: By the name of the panorama.
-        doors: Labels of doors.
+        layouts: Layouts by name of the panorama.
+        doors: Label of doors.
     """
 
     layouts: Mapping[str, Layout]
@@ -72,19 +72,19 @@ class ZindReader(ImageReader):
 
     @property
     def settings(self) -> dict[str, str]:
-        """Labels of doors."""
+        """See `ImageReader`: label of doors."""
         return {"doors": self.doors}
 
     def size(self, part: str, path: Path) -> tuple[int, int] | None:
-        """See `ImageReader`, as all others; layouts have none."""
+        """See `ImageReader`; layouts have no size."""
         return read_image_size(path) if part == "rgb" else None
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Colors."""
+        """See `ImageReader`."""
         return read_rgb(files.rgb)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Classes, cast anew at every size."""
+        """See `ImageReader`; labels are cast for the requested size."""
         labels = self.layouts[files.name].labels(shape or read_image_size(files.rgb))
         if self.doors == "ignore":
             labels[labels == DOOR] = 0
@@ -96,15 +96,15 @@ class ZindReader(ImageReader):
 class Zind(PanoramaDataModule):
     """ZInD, 5 classes.
 
-    With ``zind_partition.json`` in `root` the splits are its homes. Without it, as for the sample,
-    complete rooms are drawn: no room is in two splits, though doorways show others.
+    With ``zind_partition.json`` in `root`, it defines the splits. Without it, e.g. for the sample,
+    complete rooms are drawn: a room is in one split only, although doorways show other rooms.
 
     Args:
-        doors: `class`, or `ignore`: unknown.
-        test_fraction: Share of the rooms for test, without a partition; 1 for all, to evaluate
-            networks that were trained on something else.
-        split_seed: Seed of the splits. Independent of the run's
-            seed, so that runs with different seeds share their splits.
+        doors: `class`, or `ignore` to make doors unknown.
+        test_fraction: Share of the rooms for the test, without a partition; 1 uses all rooms, to
+            evaluate networks that were trained on other data.
+        split_seed: Seed of the splits. Independent of the run's seed, so that runs with different
+            seeds share their splits.
 
     Raises:
         SettingError: A setting is invalid.
@@ -119,7 +119,7 @@ class Zind(PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("inputs", "depth" not in self.inputs, "no depth, ZInD has none")
+        self.require("inputs", "depth" not in self.inputs, "no depth: ZInD has no depth images")
         self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
         self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
         self.require("split_seed", self.split_seed >= 0, "0 or more")
@@ -140,7 +140,7 @@ class Zind(PanoramaDataModule):
         return ZindReader(layouts, self.doors), splits
 
     def _divided(self, panoramas: Sequence[HomePanorama]) -> list[Split]:
-        """The split of every panorama."""
+        """Return the split of every panorama."""
         partition = self.root / "zind_partition.json"
         homes = {panorama.home for panorama in panoramas}
         if partition.is_file():
@@ -166,7 +166,7 @@ class Zind(PanoramaDataModule):
 
 
 def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
-    """The split of every home in a ``zind_partition.json``."""
+    """Return the split of every home in a ``zind_partition.json``."""
     expected = "lists of homes for train, val and test"
     content = read_json(path, expected)
     lists = check_fields(path, content, dict.fromkeys(SPLITS, list[Text]), expected)

@@ -116,7 +116,7 @@ def _build_entries(settings: Mapping[str, Any], group: str, known: Mapping[str, 
             is_missing = isinstance(error.__cause__, ModuleNotFoundError)
             if not is_missing or package not in _EXTRAS:
                 raise
-            remedy = f"pip install 'tangent-train[{package}]'"
+            remedy = f"Run in the checkout: pip install -e '.[{package}]'."
             expected = "an installed package"
             raise SettingError(
                 setting, found=error.found, expected=expected, remedy=remedy

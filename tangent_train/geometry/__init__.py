@@ -4,14 +4,14 @@ Convention, stated here once and used everywhere:
 
 * **Directions** are unit vectors ``x = cos φ cos λ, y = cos φ sin λ, z = sin φ`` with latitude φ
   growing upwards and longitude λ growing to the right, as seen from the center: x points to the
-  middle of the panorama, y to the right, z up. In a right-handed room this frame is mirrored (y is
-  to the left there): `FLIP_Y` changes between the two.
+  middle of the panorama, y to the right, z up. This frame is left-handed. In a right-handed room
+  frame y points to the left; `FLIP_Y` converts between the two.
 * **Equirectangular (ERP) pixels** have integer centers ``(u, v)``, u to the right, v down:
   ``λ = (u + ½) / W · 2π − π``, ``φ = π/2 − (v + ½) / H · π``. Longitude wraps for every
   interpolation, nearest included; beyond a pole the row reflects with a half-turn in longitude.
 * **Camera axes** are x right, y down, z forward. **Image pixels** have integer centers, so that a
   camera matrix maps the pixel in row i, column j to (j, i).
-* Angles are in radians unless a name says ``deg``.
+* Angles are in radians unless a name ends in ``deg``.
 """
 
 from tangent_train.geometry.camera import (

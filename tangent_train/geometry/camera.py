@@ -32,7 +32,7 @@ def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.
 
 
 def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
-    """True for a ``(3, 3)`` K without skew and with focal lengths above 0."""
+    """Return True for a ``(3, 3)`` K without skew and with focal lengths above 0."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return False
     plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0

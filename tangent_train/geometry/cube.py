@@ -1,4 +1,4 @@
-"""Cube maps: six images, a baseline beside tangent images."""
+"""Cube maps: the six faces of a cube, a baseline for tangent images."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class CubeGrid(PinholeGrid):
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
-        """``(6, 4)`` faces that share an edge with a face: all but itself and the opposite one."""
+        """``(6, 4)`` faces that share an edge with each face: all but itself and its opposite."""
         return _NEIGHBORS
 
     @property
@@ -77,7 +77,7 @@ class CubeGrid(PinholeGrid):
 
     @property
     def overlapping(self) -> bool:
-        """True if there is a margin; else neighbors meet at their outer edges."""
+        """True if there is a margin. Without one, neighbors meet at their outer edges."""
         return self.dim * self.pitch > 2
 
     def _resting_axes(self) -> NDArray[np.float64]:

@@ -40,7 +40,7 @@ def nearest_level(height: int) -> int:
         height: Rows of the panorama, 2 or more.
 
     Raises:
-        SettingError: There are fewer rows.
+        SettingError: There are fewer than 2 rows.
 
     >>> [nearest_level(rows) for rows in (512, 724, 725, 1024, 2688)]
     [8, 8, 9, 9, 10]

@@ -18,7 +18,7 @@ _MAX_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take too 
 
 
 class _FaceTable:
-    """Data that depend on the base level alone: centers, axes, neighbors, extent of the cells."""
+    """Data that depend only on the base level: centers, axes, neighbors, extent of the cells."""
 
     def __init__(self, base_level: int) -> None:
         vertices, self.faces = icosphere(base_level)
@@ -67,7 +67,7 @@ class _FaceTable:
 
 
 def _group(faces: NDArray[np.int64], num_vertices: int) -> NDArray[np.int64]:
-    """Return the faces around every vertex, ``(V, 6)``; of five, the first one is repeated."""
+    """Return the faces around every vertex, ``(V, 6)``; where there are five, the first repeats."""
     corner = np.argsort(faces.ravel(), kind="stable")
     valence = np.bincount(faces.ravel(), minlength=num_vertices)
     start = np.cumsum(valence) - valence
@@ -92,10 +92,9 @@ class TangentGrid(PinholeGrid):
     Args:
         base_level: Base level b.
         level: Level s of the panorama, at least b.
-        dim: Side d in pixels, default 2^(s−b). It changes the extent of the images, never the
-            pitch: less crops towards the owned cell, more adds a margin.
-        rotation: ``(3, 3)`` proper rotation R of the whole icosahedron: directions become
-            R·d.
+        dim: Side d in pixels, default 2^(s−b). It changes the extent of the images and keeps the
+            pitch: a smaller side crops towards the owned cell, a larger one adds a margin.
+        rotation: ``(3, 3)`` proper rotation R of the whole icosahedron: directions become R·d.
 
     Raises:
         SettingError: A level is out of range, the rotation is not a rotation, or `dim` would leave
@@ -153,7 +152,7 @@ class TangentGrid(PinholeGrid):
 
     @property
     def overlapping(self) -> bool:
-        """True: even the smallest images reach half a pixel beyond the owned cells."""
+        """Always True: even the smallest images reach half a pixel beyond the owned cells."""
         return True
 
     def _resting_axes(self) -> NDArray[np.float64]:

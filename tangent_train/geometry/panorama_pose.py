@@ -13,17 +13,16 @@ from tangent_train.geometry.sphere import checked_rotation
 
 @dataclass(frozen=True, eq=False, init=False)
 class PanoramaPose:
-    """Pose of a panorama in a world of meters.
+    """Pose of a panorama in a world frame in meters.
 
-    The point seen at distance d in direction s of the panorama (`tangent_train.geometry`: x to the
-    middle of the image, y to its right, z up) is
-    ``location_m + d · world_from_panorama @ s``.
+    A point at distance d in direction s of the panorama (`tangent_train.geometry`: x to the middle
+    of the image, y to its right, z up) is ``location_m + d · world_from_panorama @ s``.
 
-    In a right-handed world the matrix reflects, as `FLIP_Y` does: its determinant is −1.
+    In a right-handed world the matrix is a reflection, like `FLIP_Y`: its determinant is −1.
 
     Args:
-        world_from_panorama: ``(3, 3)`` orthogonal, of determinant 1 or −1.
-        location_m: ``(3,)`` center.
+        world_from_panorama: ``(3, 3)`` orthogonal matrix of determinant 1 or −1.
+        location_m: ``(3,)`` position of the center.
 
     Raises:
         SettingError: The matrix is not orthogonal, or the center is not three finite numbers.
@@ -48,17 +47,17 @@ class PanoramaPose:
         ahead = np.asarray(directions_xyz, np.float64) @ self.world_from_panorama.T
         return self.location_m + ahead * np.asarray(distance_m, np.float64)[..., None]
 
-    def seen(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Project world points ``(…, 3)``: directions ``(…, 3)`` and distances ``(…)`` in meters.
+    def project(self, points_m: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return directions ``(…, 3)`` and distances ``(…)`` in meters of world points ``(…, 3)``.
 
         A point at the center itself has the direction 0.
         """
-        way = (np.asarray(points_m, np.float64) - self.location_m) @ self.world_from_panorama
-        distance = np.linalg.norm(way, axis=-1)
-        return way / np.where(distance > 0, distance, 1.0)[..., None], distance
+        offset = (np.asarray(points_m, np.float64) - self.location_m) @ self.world_from_panorama
+        distance = np.linalg.norm(offset, axis=-1)
+        return offset / np.where(distance > 0, distance, 1.0)[..., None], distance
 
     def relative_to(self, other: PanoramaPose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return rotation and shift from another panorama to this: ``x_this = R x_other + t``.
+        """Return rotation and shift from another panorama to this one: ``x_this = R x_other + t``.
 
         Args:
             other: Pose in the same world.
@@ -67,7 +66,7 @@ class PanoramaPose:
             R ``(3, 3)``, a rotation, and t ``(3,)`` in meters: the position of the other's center.
 
         Raises:
-            SettingError: One of the two mirrors the world and the other does not.
+            SettingError: Only one of the two matrices is a reflection.
         """
         rotation = self.world_from_panorama.T @ other.world_from_panorama
         if np.linalg.det(rotation) < 0:

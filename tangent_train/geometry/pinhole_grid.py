@@ -19,12 +19,12 @@ Faces = Sequence[int] | NDArray[np.integer]
 
 
 class PinholeGrid(ABC):
-    """N square pinhole images of one pitch, which together cover all directions.
+    """N square pinhole images of the same pitch, which together cover all directions.
 
     Pixel (row i, column j) of an image sits on the plane at distance 1 in front of the camera, at
     ``(j − (d−1)/2)·p`` to the right and ``(i − (d−1)/2)·p`` down. Every direction is *owned* by the
-    image with the nearest center, where it is at most half a pixel off the outermost pixel
-    centers.
+    image with the nearest center. It lies at most half a pixel outside the outermost pixel centers
+    of that image.
 
     Attributes:
         dim: Side d in pixels.
@@ -41,7 +41,7 @@ class PinholeGrid(ABC):
     def neighbors(self) -> NDArray[np.int32]:
         """``(N, k)`` neighbors of every image, padded with the image itself.
 
-        Repeated steps to the neighbor with the nearest center end at the owner.
+        Stepping repeatedly to the neighbor with the nearest center ends at the owner.
         """
 
     @property
@@ -72,7 +72,7 @@ class PinholeGrid(ABC):
         """Return the same images under another rotation.
 
         Raises:
-            SettingError: The rotation is not a rotation.
+            SettingError: The matrix is not a rotation.
         """
         return self._changed(rotation)
 
@@ -83,7 +83,7 @@ class PinholeGrid(ABC):
     def resized(self, dim: int) -> Self:
         """Return the same images at another resolution: their outer edges agree.
 
-        The output of a network that downsamples or upsamples tangent images lies on such a grid.
+        Use it for the output of a network that downsamples or upsamples tangent images.
 
         Args:
             dim: Side d' in pixels; the pitch becomes p·d/d'.

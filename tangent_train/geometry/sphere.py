@@ -80,10 +80,10 @@ def checked_rotation(rotation: ArrayLike) -> NDArray[np.float64]:
     """Return a read-only copy of a rotation matrix.
 
     Args:
-        rotation: ``(3, 3)``.
+        rotation: ``(3, 3)`` matrix.
 
     Raises:
-        SettingError: It is not a proper rotation.
+        SettingError: The matrix is not a proper rotation.
     """
     matrix = np.array(rotation, np.float64)
     proper = matrix.shape == (3, 3) and np.allclose(matrix @ matrix.T, np.eye(3), atol=1e-6)

@@ -1,1 +1,1 @@
-"""From images to predictions: image → views → scores → panorama, and export to other programs."""
+"""Predict images (image → views → scores → panorama), and export networks to other programs."""

@@ -4,10 +4,12 @@ A map is a JSON file with the names of source classes for every target class::
 
     {"source": "ADE20K", "classes": {"wall": ["wall", "painting"], "floor": ["floor", "rug"]}}
 
-The probability of a target class is the sum of those of its source classes. Names fit whatever
-their case, and with hyphens or underscores as spaces; of a list of synonyms ("windowpane, window")
-the first one counts. A map names synonyms as well (``"windowpane", "window"``), and a network may
-lack some of the source classes: a target class without any is a label that is never given.
+The probability of a target class is the sum of the probabilities of its source classes.
+
+Names are compared without case, and with hyphens and underscores as spaces. If a network names a
+class by several synonyms ("windowpane, window"), only the first is compared; a map may list several
+names (``"windowpane", "window"``). A network may lack some of the source classes. A target class
+without source classes in the network is not predicted.
 """
 
 from __future__ import annotations
@@ -25,10 +27,10 @@ from tangent_train.files import read_json
 from tangent_train.registry import Text, check_fields
 
 Unmapped = Literal["unknown", "never"]
-"""Source classes that a map does not name are label 0 where they win, or never win."""
+"""Treatment of source classes that are not in a map: label 0 where they win, or they never win."""
 
 _FOLDER = Path(__file__).with_suffix("")
-"""The maps of this package: ``class_maps/<name>.json``."""
+"""Folder with the maps of this package, ``class_maps/<name>.json``."""
 
 _EXPECTED = 'a class map: {"classes": {"wall": ["wall", "painting"], "floor": ["floor"]}}'
 _MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
@@ -36,12 +38,12 @@ _MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
 
 @dataclass(frozen=True)
 class ClassMap:
-    """The classes of a source data set as those of a target.
+    """A mapping from classes of a source data set to classes of a target data set.
 
     Attributes:
-        name: Name of the map, or its file.
-        source: Name of the source data set; None if the file has none.
-        classes: Names of the source classes of every target class.
+        name: Name or file of the map.
+        source: Name of the source data set; None if the file does not name it.
+        classes: Names of the source classes of each target class.
     """
 
     name: str
@@ -51,13 +53,13 @@ class ClassMap:
 
 @dataclass(frozen=True)
 class MappedNetwork:
-    """A network whose classes are those of a map.
+    """A network with the classes of a map.
 
     Attributes:
         trained: The network.
-        classes: Classes of the original network that make up every target class.
+        classes: Classes of the original network in each target class.
         unmapped: Other classes of the original network.
-        unmapped_wins: True if unmapped classes may win.
+        unmapped_wins: True if unmapped classes may win, as label 0.
     """
 
     trained: TrainedNetwork
@@ -70,7 +72,7 @@ class MappedNetwork:
         parts = [f"{n} ← {', '.join(names)}" for n, names in self.classes.items() if names]
         missing = [name for name, names in self.classes.items() if not names]
         if missing:
-            parts.append(f"never given: {', '.join(missing)}")
+            parts.append(f"not predicted: {', '.join(missing)}")
         if self.unmapped:
             effect = "unknown where they win" if self.unmapped_wins else "never win"
             parts.append(f"{effect}: {', '.join(self.unmapped)}")
@@ -78,15 +80,15 @@ class MappedNetwork:
 
 
 def load_class_map(given: str | Path) -> ClassMap:
-    """A class map.
+    """Load a class map.
 
     Args:
-        given: The name of one of this package, such as ``ade20k_to_stanford2d3ds``, or a JSON file,
-            by its suffix ``.json``.
+        given: Name of a map of this package, such as ``ade20k_to_stanford2d3ds``, or the path of a
+            file with the suffix ``.json``.
 
     Raises:
         SettingError: There is no map of this name.
-        DataError: The file cannot be used.
+        DataError: The file is not a valid class map.
     """
     given = str(given)
     shipped = sorted(path.stem for path in _FOLDER.glob("*.json"))
@@ -121,17 +123,18 @@ def map_classes(
     unmapped: Unmapped = "unknown",
     targets: Sequence[str] | None = None,
 ) -> MappedNetwork:
-    """A network with the classes of a map in place of its own.
+    """Return a network with the classes of a map instead of its own.
 
     Args:
         trained: The network.
         class_map: The map.
-        unmapped: Effect of classes that the map does not name. Unknown classes of an imported
-            network stay unknown.
-        targets: All classes wanted, in their order, without unknown; None for those of the map.
+        unmapped: Treatment of classes that are not in the map. Unknown classes of an imported
+            network remain unknown.
+        targets: All target classes in order, without unknown; None for the classes of the map.
 
     Raises:
-        SettingError: The map names no class of the network, or a target that is not wanted.
+        SettingError: The map contains no class of the network, or a target that is not in
+            `targets`.
     """
     targets = list(class_map.classes) if targets is None else targets
     foreign = class_map.classes.keys() - set(targets)
@@ -139,42 +142,42 @@ def map_classes(
         raise SettingError(
             f"class_map={class_map.name}",
             found=f"target classes {', '.join(sorted(foreign))}",
-            expected=f"of {', '.join(targets)}",
+            expected=f"names among {', '.join(targets)}",
         )
     target_of = {_plain(n): target for target, names in class_map.classes.items() for n in names}
     names = trained.class_names[1:]
     groups = trained.groups or [[k] for k in range(len(names))]
-    places: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
+    members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
     for k, name in enumerate(names):
-        places[target_of.get(_plain(name))].append(k)
-    left = places.pop(None)
-    if len(left) == len(names):
+        members[target_of.get(_plain(name))].append(k)
+    remaining = members.pop(None)
+    if len(remaining) == len(names):
         raise SettingError(
             f"class_map={class_map.name}",
             found=f"no class of {class_map.source or 'the map'} in a network of {', '.join(names)}",
-            expected="a map whose source classes are the network's",
+            expected="a map whose source classes include the network's",
         )
-    if left and unmapped == "never" and trained.score_kind == "labels":
+    if remaining and unmapped == "never" and trained.score_kind == "labels":
         raise SettingError(
             "unmapped",
             found="never, for a network that returns labels",
-            expected="unknown: there is no second best class",
+            expected="unknown, because labels have no second best class",
         )
-    scores = [[k for place in group for k in groups[place]] for group in places.values()]
+    scores = [[k for member in group for k in groups[member]] for group in members.values()]
     unknown = [k for group in groups[len(names) :] for k in group]
     if unmapped == "unknown":
-        unknown += [k for place in left for k in groups[place]]
+        unknown += [k for member in remaining for k in groups[member]]
     scores += [unknown] if unknown else []
-    found = {str(target): [names[k] for k in group] for target, group in places.items()}
+    found = {str(target): [names[k] for k in group] for target, group in members.items()}
     return MappedNetwork(
         trained=replace(trained, class_names=("unknown", *targets), groups=scores),
         classes=found,
-        unmapped=[names[k] for k in left],
+        unmapped=[names[k] for k in remaining],
         unmapped_wins=unmapped == "unknown",
     )
 
 
 def _plain(name: str) -> str:
-    """The first synonym of a name, as names are compared."""
+    """Return the first synonym of a name in the form in which names are compared."""
     first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
     return " ".join(first.casefold().split())

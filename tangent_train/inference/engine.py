@@ -1,9 +1,9 @@
 """The engine: images → views → network → mosaic → labels.
 
 A representation selects the views of an image. The engine renders them, or takes rendered views
-from the loader, gives them to the network a few at a time, and adds the scores to a mosaic. Images,
-views, scores and mosaic are on one device. Validation, test, prediction, transfer, `load` and
-`NetworkJudge` use it.
+from the loader, passes them to the network a few at a time, and adds the scores to a mosaic.
+Images, views, scores and mosaic are on one device. Validation, test, prediction, transfer, `load`
+and `NetworkJudge` use the engine.
 """
 
 from __future__ import annotations
@@ -43,19 +43,19 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Views
 
     ViewImages = Callable[[slice], Tensor]
-    """Gives some of the views as images ``(n, C, h, w)``, normalized."""
+    """Returns some of the views as normalized images ``(n, C, h, w)``."""
 
 _PIXELS_PER_FORWARD = 2**20
 
 
 def sees_rays(network: nn.Module) -> bool:
-    """True if a network takes viewing rays, as for cross-image attention."""
+    """Return True if a network takes viewing rays, such as one with cross-image attention."""
     inner = network.network if isinstance(network, ClassScoreNetwork) else network
     return "rays" in inspect.signature(inner.forward).parameters
 
 
 def views_per_forward(image_size: tuple[int, int]) -> int:
-    """Views of so many rows and columns per call of a network, which bounds memory."""
+    """Return the number of views of a size in one call of a network, which limits memory."""
     return max(1, _PIXELS_PER_FORWARD // math.prod(image_size))
 
 
@@ -67,19 +67,19 @@ def view_scores(
     per_forward: int,
     rays: Tensor | None = None,
 ) -> Iterator[tuple[slice, Tensor]]:
-    """Scores of the views of one image, a few views at a time.
+    """Compute the scores of the views of one image, a few views at a time.
 
     Args:
-        network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict with these
-            under ``"out"``.
-        images: The views.
+        network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
+            them under ``"out"``.
+        images: Function that returns views.
         count: Number of views N.
-        per_forward: Views per call of the network.
-        rays: ``(N, 3, 3)``, see `Views.rays`, for networks with cross-image attention: they are
-            called once with all views as ``network(images, rays[None])``.
+        per_forward: Number of views per call of the network.
+        rays: ``(N, 3, 3)`` viewing rays, see `Views.rays`, for networks with cross-image attention.
+            These are called once, with all views: ``network(images, rays[None])``.
 
     Yields:
-        Some of the views and their float32 scores ``(n, K, h, w)``.
+        A slice of the views and their float32 scores ``(n, K, h, w)``.
     """
     step = per_forward if rays is None else count
     for start in range(0, count, step):
@@ -101,10 +101,14 @@ def fill(
     Args:
         mosaic: The mosaic.
         network: See `view_scores`.
-        sets: Views that cover the whole image, their images, and the rays that the network takes.
-        per_forward: Views per call of the network.
-        progress: Called with the number of views done since its last call.
-        scored: Called with the scores of some views.
+        sets: Views that cover the whole image, their images, and viewing rays if the network takes
+            them.
+        per_forward: Number of views per call of the network.
+        progress: Called with the number of views since the last call.
+        scored: Called with scores and their views.
+
+    Returns:
+        The mosaic.
     """
     for views, images, rays in sets:
         for part, scores in view_scores(network, images, len(views), per_forward, rays):
@@ -117,11 +121,11 @@ def fill(
 def upright_rays(
     representation: Representation, device: torch.device | str
 ) -> Iterator[Tensor | None]:
-    """Viewing rays of each set of views, in a frame whose zenith is z.
+    """Yield the viewing rays of each set of views, in a frame with its zenith at z.
 
     Args:
-        representation: The representation of upright panoramas: the views of a tilted panorama
-            stand upright, so their rays are the same.
+        representation: Representation of upright panoramas. Views of a tilted panorama are upright
+            too, so they have the same rays.
         device: Device of the rays.
     """
     for views in representation.view_sets():
@@ -132,16 +136,16 @@ def upright_rays(
 def input_planes(
     image: InputImage, shape: tuple[int, int], inputs: Sequence[Input], device: torch.device | str
 ) -> tuple[Tensor, list[tuple[Tensor, Interpolation]]]:
-    """The inputs of a network as images of whole panoramas or photos, on a device.
+    """Return the inputs of a network on a device, as images of the whole panorama or photo.
 
     Args:
-        image: The image.
+        image: The panorama or photo.
         shape: Rows and columns to which it is resized.
         inputs: Inputs of the network.
         device: A torch device.
 
     Returns:
-        RGB ``(3, H, W)`` float32 of 0 to 255; and the others, ``(1, H, W)``, with their
+        RGB ``(3, H, W)``, float32 from 0 to 255; and other inputs ``(1, H, W)`` with their
         interpolation: depth as in `render_inputs`, and elevation.
     """
     rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(device).movedim(-1, 0).float()
@@ -159,19 +163,19 @@ def input_planes(
 
 
 def renders_arrays(device: torch.device | str) -> bool:
-    """True on the CPU, where OpenCV renders faster than torch."""
+    """Return True for the CPU, where OpenCV renders faster than torch."""
     return torch.device(device).type == "cpu"
 
 
 class RenderedViews:
-    """The views of one image, rendered on a device as a network takes them.
+    """Renders the views of one image on a device, as inputs of a network.
 
-    On the CPU arrays are rendered (see `render_inputs`), on other devices tensors: the image is
-    copied to the device once, and everything else happens there.
+    On the CPU arrays are rendered (see `render_inputs`). For other devices the image is copied to
+    the device once, and tensors are rendered there.
 
     Args:
         trained: The network, which is on the device.
-        image: The image.
+        image: The panorama or photo.
         shape: Rows and columns to which it is resized first.
         device: A torch device.
     """
@@ -184,7 +188,7 @@ class RenderedViews:
         device: torch.device | str,
     ) -> None:
         weights = next(trained.network.parameters(), None)
-        # Halves the time of a UNet on a CPU; an ONNX file takes the format it was made for.
+        # channels_last halves the time of a UNet on a CPU; an ONNX file has a fixed format.
         contiguous = torch.contiguous_format
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
@@ -194,7 +198,7 @@ class RenderedViews:
         self._planes = None if arrays else input_planes(image, shape, trained.inputs, device)
 
     def __call__(self, views: Views) -> Tensor:
-        """Views ``(n, C, h, w)``, normalized."""
+        """Return normalized views ``(n, C, h, w)``."""
         inputs = self._trained.inputs
         if self._planes is None:
             rendered = render_inputs(self._image, views, inputs)
@@ -206,7 +210,7 @@ class RenderedViews:
         return images.to(self._dtype).contiguous(memory_format=self._format)
 
     def of(self, views: Views) -> ViewImages:
-        """Gives some of the views."""
+        """Return a function that renders some of the views."""
         return lambda part: self(views[part])
 
 
@@ -215,19 +219,19 @@ class Predictor:
 
     Args:
         trained: The network; it is moved to the device.
-        view_sets: Its views.
-        device: A torch device, or ``auto``: a GPU if there is one.
-        images_per_forward: Views per call of the network, which bounds memory; None for 2^20
-            pixels' worth. A network with cross-image attention takes all views of a panorama
-            at once, and their scores are held.
-        min_confidence: Pixels whose best class has a lower probability, from 0 to 1, are unknown.
+        view_sets: Selects the views of an image.
+        device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
+        images_per_forward: Number of views per call of the network, which limits memory; None for
+            as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
+            a panorama at once, and their scores are kept in memory.
+        min_confidence: Pixels with a lower confidence, from 0 to 1, are unknown.
 
     Attributes:
         device: Device of the network, the views and the mosaic.
 
     Raises:
-        SettingError: There is no such device, the confidence is not a probability, or there are no
-            views per call.
+        SettingError: The device does not exist, `min_confidence` is not between 0 and 1, or
+            `images_per_forward` is less than 1.
     """
 
     def __init__(
@@ -243,7 +247,7 @@ class Predictor:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            self.device = torch.zeros(1, device=device).device  # an ONNX file has nothing to move
+            self.device = torch.zeros(1, device=device).device  # refuses a missing device
             trained.network.to(self.device).to(memory_format=torch.channels_last)
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(
@@ -263,15 +267,15 @@ class Predictor:
         *,
         probabilities: bool = False,
     ) -> ScoreMosaic:
-        """The scores of one image at its own resolution.
+        """Predict the scores of one image at its own resolution.
 
         Args:
             image: A panorama or photo.
-            progress: Called with the share of the image done since its last call.
+            progress: Called with the share of the image that was predicted since the last call.
             probabilities: True if `ScoreMosaic.probabilities` is needed.
 
         Returns:
-            The scores; score k is that of label k + 1, the last one perhaps of nothing, see
+            The scores. Score k belongs to label k + 1; the last score may belong to no class, see
             `TrainedNetwork.groups`.
         """
         network: Any = self._trained.network
@@ -289,7 +293,7 @@ class Predictor:
         return fill(mosaic, network, sets, self._per_forward, lambda done: progress(done / count))
 
     def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
-        """A mosaic; it reuses the memory of the last one that is no longer used."""
+        """Return an empty mosaic, which reuses the memory of an earlier one if possible."""
         spare = None
         with suppress(IndexError):
             spare = self._spare.pop()
@@ -302,6 +306,6 @@ class Predictor:
             device=self.device,
             spare=spare,
         )
-        if not isinstance(mosaic.sums, np.memmap):  # room on a disk is given back at once
+        if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic

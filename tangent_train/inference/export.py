@@ -1,4 +1,4 @@
-"""A trained network as a file for other programs, verified against PyTorch."""
+"""Export a trained network to a file for other programs, verified against PyTorch."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ from tangent_train.imports import hide_output
 SUFFIXES = (".onnx", ".safetensors")
 
 TOLERANCE = 1e-4
-"""Largest difference between the file's scores and PyTorch's, relative to their range."""
+"""Largest difference allowed between scores of the file and of PyTorch, relative to their range."""
 
 _BATCHES = (1, 3)
-"""Batch sizes that are compared; the one that is traced is 2."""
+"""Batch sizes that are compared; the graph is traced with batch size 2."""
 
 _LEAST_TRACED = 32
 
@@ -40,7 +40,7 @@ class Export(NamedTuple):
     """Result of an export.
 
     Attributes:
-        trained: The network as the file gives it back.
+        trained: The network, read from the file.
         difference: Largest difference between its scores and PyTorch's, relative to their range.
     """
 
@@ -57,16 +57,16 @@ def export_network(
 ) -> Export:
     """Write a network, read it again and compare it with PyTorch on random images.
 
-    The batch size is dynamic. Height and width are too (multiples of the network's stride) where
-    the exporter can express that; otherwise the file is for the size of the training.
+    The batch size is dynamic. Height and width are dynamic too (multiples of the network's stride)
+    if the exporter supports that; otherwise the file is for the image size of the training.
 
     Args:
-        trained: The network; of a checkpoint or of a safetensors file.
-        path: The file: ``.onnx``, the computation, for onnxruntime and others; or
-            ``.safetensors``, the tensors, with the settings of the network that takes them. It
-            appears when it has been verified, else not at all.
-        image_size: The only rows and columns to write an ONNX file for.
-        opset: Version of ONNX's operators; the exporter's default.
+        trained: A network from a checkpoint or a safetensors file.
+        path: File to write. ``.onnx`` contains the computation, for onnxruntime and others;
+            ``.safetensors`` contains the tensors and the settings of the network. The file is
+            created only if the verification succeeds.
+        image_size: Fixed rows and columns of an ONNX file; None for dynamic sizes.
+        opset: Version of ONNX's operators; None for the exporter's default.
 
     Raises:
         SettingError: A setting does not fit the format, the network cannot be exported, or the
@@ -88,7 +88,7 @@ def export_network(
                 return _verified(trained, size, temporary)
         except (SettingError, OSError):
             raise
-        except Exception as error:  # whatever the exporter cannot do with dynamic sizes
+        except Exception as error:  # exporters raise many kinds; a fixed size may still work
             failure = error
     cause: Any = failure
     while getattr(cause, "__cause__", None):
@@ -110,7 +110,7 @@ def _check(
     if trained.settings is None:
         raise SettingError(
             "checkpoint",
-            found="an exported network, of which only the computation is known",
+            found="an exported network, which contains only the computation",
             expected="a checkpoint of tangent-train, or a safetensors file",
         )
     if path.suffix.lower() == ".safetensors" and (image_size, opset) != (None, None):
@@ -131,7 +131,7 @@ def _write_onnx(
     if size is None:
         shape |= {2: step * torch.export.Dim("h"), 3: step * torch.export.Dim("w")}
         least = -(-_LEAST_TRACED // step)
-        size = step * max(3, least), step * max(4, least + 1)  # no two dimensions are equal
+        size = step * max(3, least), step * max(4, least + 1)  # all dimensions differ
     returns_labels = trained.score_kind == "labels"
     with hide_output():
         program: Any = torch.onnx.export(
@@ -155,18 +155,18 @@ def _write_onnx(
 
 
 def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
-    # Copies: the format knows neither tensors that share memory nor other memory formats.
+    # Copies, because the format supports neither shared memory nor other memory formats.
     tensors = trained.inner.state_dict()
     tensors = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
     described = {METADATA_KEY: json.dumps(metadata_of(trained))}
     described |= {CHECKSUM_KEY: tensor_checksum(tensors), "format": "pt"}
     save_file(tensors, path, metadata=described)
-    path.chmod(0o644)  # it was replaced by one that only its owner may read
+    path.chmod(0o644)  # save_file replaces it with a file that only its owner may read
 
 
 @torch.no_grad()
 def _verified(trained: TrainedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
-    """Read the file as a user would and compare."""
+    """Read the file as a user would, and compare its scores with PyTorch's."""
     exported = load_trained(path, trained.source.trust if trained.source else ())
     rows, columns = trained.image_size
     step = trained.size_multiple
@@ -181,7 +181,7 @@ def _verified(trained: TrainedNetwork, fixed_size: tuple[int, int] | None, path:
                 raise ArithmeticError(f"scores {tuple(found.shape)}, not {tuple(expected.shape)}")
             span = float(expected.max() - expected.min())
             difference = float((found - expected).abs().max())
-            if not difference <= TOLERANCE * span:  # so that NaN is refused too
+            if not difference <= TOLERANCE * span:  # "not" also refuses NaN
                 raise ArithmeticError(
                     f"its scores differ from PyTorch's by {difference:.2g}, of {span:.2g}"
                 )

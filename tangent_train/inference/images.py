@@ -1,4 +1,4 @@
-"""User images as network input, from files and from memory."""
+"""Read users' images, from files and from memory, as network input."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from tangent_train.inference.judge import NetworkJudge
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]
-    """Depth of an image with these rows and columns, in steps of 1/512 m; None without depth."""
+    """Returns depth for an image of a size, in steps of 1/512 m; None without depth."""
 
 Picture = str | Path | Image.Image | NDArray[Any] | Tensor
-"""A file; an image of Pillow; or RGB of 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
+"""A file; a Pillow image; or RGB from 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
 uint8 on any device."""
 
 _ASPECT_TOLERANCE = 0.01
 _IN_MEMORY = Path("image")
 _NOT_WHOLE = (
-    "Of a photo, give fov=, its horizontal field of view in degrees; of a part of a panorama, crop="
-    "[west, east, south, north] in degrees."
+    "For a photo, give fov=, its horizontal field of view in degrees; for a part of a panorama, "
+    "crop=[west, east, south, north] in degrees."
 )
 
 
@@ -49,9 +49,9 @@ class InputImage:
 
     Attributes:
         rgb: ``(H, W, 3)`` uint8.
-        depth: ``(H, W)`` uint16 in steps of 1/512 m, 0 where missing: distance from the center in
-            panoramas, along the optical axis in photos; or None.
-        up: ``(3,)`` direction of the zenith in a panorama; None where that is z.
+        depth: ``(H, W)`` uint16 in steps of 1/512 m, 0 where missing; or None. It is the distance
+            from the center in panoramas, and z-depth in photos.
+        up: ``(3,)`` direction of the zenith in a panorama; None if it is z.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for panoramas.
     """
 
@@ -66,18 +66,18 @@ class InputImage:
         return self.rgb.shape[0], self.rgb.shape[1]
 
     def resized(self, shape: tuple[int, int]) -> InputImage:
-        """The image at another size, as training resizes panoramas; depth is never averaged."""
+        """Return the image resized as in training; depth is not averaged."""
         depth = None if self.depth is None else resize_depth(self.depth, shape)
         return replace(self, rgb=resize(self.rgb, shape, "bilinear"), depth=depth)
 
 
 @dataclass(frozen=True)
 class DepthFolder:
-    """Depth images named as the images they belong to, or with ``_depth`` at the end.
+    """A folder of depth images with the names of the RGB images, or with ``_depth`` at the end.
 
     Attributes:
-        path: The folder.
-        units_per_m: Of files with whole numbers.
+        path: Path of the folder.
+        units_per_m: Units per meter in files with integers.
     """
 
     path: Path
@@ -88,14 +88,14 @@ class DepthFolder:
         return NamedFiles(self.path)
 
     def read(self, name: str, shape: tuple[int, int]) -> NDArray[np.uint16]:
-        """Depth of an image in steps of 1/512 m, 0 where missing.
+        """Read the depth of an image in steps of 1/512 m, 0 where missing.
 
         Args:
-            name: Of the image, see `find_depth`.
-            shape: Its rows and columns.
+            name: Name of the image, see `find_depth`.
+            shape: Rows and columns of the image.
 
         Raises:
-            DataError: There is none, it is broken, or its aspect ratio is another.
+            DataError: The depth image is missing, broken, or has another aspect ratio.
         """
         remedy = "Put depth into a folder of its own, with the names of the images."
         path = find_depth(self._files, name, remedy)
@@ -120,17 +120,17 @@ def read_panorama(
 
     Args:
         image: The panorama; only files have GPano tags.
-        crop: Its part of the sphere, see `area_of_crop`; None for that of its GPano tags.
-        upright: Source of its zenith: ``pose`` by its GPano tags, ``auto`` likewise, see
-            `with_up`; None for z.
-        depth: Gives its depth.
+        crop: Part of the sphere that it covers, see `area_of_crop`; None to use its GPano tags.
+        upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
+            `with_up` estimates it for ``auto``); None for z.
+        depth: Function that returns its depth.
 
     Returns:
-        The whole sphere, black outside the image's area, and that area.
+        An image of the whole sphere, black outside the area of the panorama; and that area.
 
     Raises:
         DataError: A file cannot be used, or the image is not a whole panorama.
-        SettingError: The crop does not fit, or it is not an image.
+        SettingError: The crop does not fit the image, or the value is not an image.
     """
     rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
     size = rgb.shape[0], rgb.shape[1]
@@ -144,12 +144,12 @@ def read_panorama(
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
-    """A panorama with its zenith: as given, or else as estimated.
+    """Return a panorama with its zenith, which is estimated if it is not given.
 
     Args:
         image: A panorama.
-        max_tilt_deg: Of estimates, see `estimate_up`.
-        judge: Helps to estimate.
+        max_tilt_deg: Largest tilt of an estimate, see `estimate_up`.
+        judge: Evidence for the estimate, from the confidence of a network.
     """
     if image.up is not None:
         return image
@@ -163,12 +163,12 @@ def read_photo(
 
     Args:
         image: The photo; only files have EXIF data.
-        fov_deg: Its horizontal field of view; None for that in its EXIF data.
-        depth: Gives its z-depth.
+        fov_deg: Horizontal field of view in degrees; None to read it from EXIF data.
+        depth: Function that returns its z-depth.
 
     Raises:
         DataError: A file cannot be used, or the field of view is unknown.
-        SettingError: It is not an image.
+        SettingError: The value is not an image.
     """
     rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
     size = rgb.shape[0], rgb.shape[1]
@@ -178,15 +178,15 @@ def read_photo(
         raise DataError(
             path or _IN_MEMORY,
             found="no focal length in its EXIF data",
-            expected="the field of view, which gives the angular resolution",
-            remedy="Give fov=, the horizontal one in degrees: 65 to 80 for most phones.",
+            expected="the field of view, which determines the angular resolution",
+            remedy="Give fov=, the horizontal field of view in degrees: 65 to 80 for most phones.",
         )
     matrix = camera_matrix_from_fov(fov_deg, size)
     return InputImage(rgb, None if depth is None else depth(size), camera_matrix=matrix)
 
 
 def _rgb(image: Any) -> NDArray[np.uint8]:
-    """An image ``(H, W, 3)``."""
+    """Return an image as ``(H, W, 3)`` uint8."""
     if isinstance(image, str | Path | Image.Image):
         return read_rgb(Path(image) if isinstance(image, str) else image)
     is_tensor = isinstance(image, Tensor)
@@ -198,12 +198,12 @@ def _rgb(image: Any) -> NDArray[np.uint8]:
     raise SettingError(
         "image",
         found=described(image),
-        expected="RGB of 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); an image of "
-        "Pillow; or the path of a file",
+        expected="RGB from 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); a Pillow image; "
+        "or the path of a file",
     )
 
 
 def described(value: Any) -> str:
-    """Kind, shape and type of a value, for messages."""
+    """Return class, shape and dtype of a value, for messages."""
     kind = type(value).__name__
     return f"{kind} {tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else kind

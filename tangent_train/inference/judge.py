@@ -1,4 +1,4 @@
-"""Up direction of a panorama, by the confidence of a network."""
+"""Evidence for the direction of up in a panorama, from the confidence of a network."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ if TYPE_CHECKING:
 
     from tangent_train.checkpoints.trained import TrainedNetwork
 
-_AROUND = np.arange(4)  # faces of a cube: all but up and down
-_FOV_DEG = 135.0  # the corners see ceiling and floor, where a wrong direction shows
-_EXPONENT = 3.0  # fitted to the real panoramas of one home, and to synthetic rooms
-_COUNTED = 20  # smaller views show the same
+_AROUND = np.arange(4)  # faces of a cube without up and down
+_FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
+_EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
+_COUNTED = 20  # more, smaller views do not add evidence
 _LEAST_DOUBT = 1e-4
 
 
 @dataclass(frozen=True)
 class NetworkJudge:
-    """Estimates how likely directions are to be up, by the confidence of a network.
+    """Estimates how likely directions are to be up, from the confidence of a network.
 
-    A network that was trained on upright images is most confident there. For every direction it
-    gets views that stand upright by that direction: four level views of 135°; a network with
-    cross-image attention all views of its representation, with which it was more often right. The
-    doubt of a view is the mean probability that the best class of a pixel is wrong; a direction
-    becomes more likely by doubt⁻³ of each view, of up to 20.
+    A network that was trained on upright images is most confident on upright images. For each
+    direction it gets four horizontal views of 135° that are upright for that direction. A network
+    with cross-image attention gets all views of its representation, with which it was more often
+    right. The doubt of a view is the mean of 1 − confidence over its pixels. The likelihood of a
+    direction is the product of doubt⁻³ over up to 20 views.
 
     Attributes:
         trained: The network.
@@ -53,15 +53,15 @@ class NetworkJudge:
     device: torch.device | str = "cpu"
 
     def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log-likelihoods of directions, up to a constant they share.
+        """Return log-likelihoods of directions, up to a common constant.
 
         Args:
-            image: A panorama: `InputImage`, or `Panorama` of a data set.
+            image: A panorama: an `InputImage`, or a `Panorama` of a data set.
             ups_xyz: ``(n, 3)`` directions in its frame.
 
         Returns:
-            ``(n,)``; all 0 for a network that takes the elevation of its pixels: that depends on
-            the direction itself.
+            ``(n,)`` log-likelihoods. All are 0 for a network with elevation as an input, because
+            that depends on the direction itself.
         """
         if "elevation" in self.trained.inputs:
             return np.zeros(len(ups_xyz))
@@ -73,7 +73,7 @@ class NetworkJudge:
         return -_EXPONENT * counted * np.log(doubts + _LEAST_DOUBT).mean(axis=1)
 
     def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Mean doubt in each of the views."""
+        """Return the mean doubt of each view."""
         network: Any = self.trained.network
         upright, rays = self._views, None
         views = replace(upright, grid=upright.grid.with_rotation(upright_rotation(up)))
@@ -94,7 +94,7 @@ class NetworkJudge:
         if sees_rays(trained.network):
             seen: Any = PanoramaViews(trained).representation
             return PinholeViews(seen.grid)
-        quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its resolution
+        quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its level
         least = quarter if trained.fixed_size is None else max(trained.fixed_size)
         side = -(-least // trained.size_multiple) * trained.size_multiple
         beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))

@@ -1,4 +1,4 @@
-"""Trained networks in Python: labels of files, images in memory and tensors."""
+"""Trained networks in Python: label files, images in memory and tensors."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 Depth = Tensor | NDArray[Any] | None
-"""``(H, W)`` floats: metres, 0 or NaN where missing."""
+"""``(H, W)`` floats in meters, 0 or NaN where missing."""
 
 _SHOWN = 6
 
@@ -54,25 +54,26 @@ def load(
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
 ) -> Network:
-    """A trained network from a file, for panoramas and photos.
+    """Load a trained network from a file, for panoramas and photos.
 
-    The settings are those of ``tangent-predict``, and so are the labels.
+    Settings and labels are the same as in ``tangent-predict``.
 
     Args:
-        path: A checkpoint, or what ``tangent-export`` or ``tangent-import`` wrote.
-        class_map: Labels of another data set: the name of a map, or a JSON file, see
+        path: A checkpoint, or a file written by ``tangent-export`` or ``tangent-import``.
+        class_map: Map to the classes of another data set: its name or a JSON file, see
             `class_maps.load_class_map`.
-        unmapped: Classes that the map does not name are ``unknown``, label 0, where they win; or
-            they ``never`` win.
-        device: A torch device, or ``auto``: a GPU if there is one.
-        levels: Level s, the angular resolution, or several to average over; None as trained.
+        unmapped: Treatment of classes that are not in the map: ``unknown`` gives label 0 where they
+            win; with ``never`` they cannot win.
+        device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
+        levels: Level s, which sets the angular resolution, or several to average over; None as
+            trained.
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
-        rotations: Rotations about the vertical to average over; 1 for photos.
-        images_per_forward: Images per call of the network, which bounds memory; None for 2^20
-            pixels' worth.
-        min_confidence: Pixels whose best class has a lower probability get the label 0.
-        trust: Full names of classes of other packages that the file may name.
+        rotations: Number of rotations about the vertical to average over; 1 for photos.
+        images_per_forward: Number of images per call of the network, which limits memory; None for
+            as many as fit into 2^20 pixels.
+        min_confidence: Pixels with a lower confidence get the label 0.
+        trust: Full names of classes from other packages that the file may instantiate.
 
     Raises:
         DataError: A file cannot be used.
@@ -95,22 +96,22 @@ def load(
 
 
 class Network:
-    """A trained network for panoramas and photos; made by `load`.
+    """A trained network for panoramas and photos, created by `load`.
 
-    Images are files or in memory, see `Picture`. Files are read as by ``tangent-predict``, with
-    their GPano tags. The EXIF orientation of files and of images of Pillow is applied. Results have
-    the size of the image: tensors on the image's device for tensors, else arrays.
+    Images are files or in memory, see `Picture`. Files are read as in ``tangent-predict``, with
+    their GPano tags. The EXIF orientation of files and Pillow images is applied. Results have the
+    size of the image: tensors on the same device for tensors, else arrays.
 
     Args:
         trained: The network.
-        panoramas: Its predictor of panoramas.
-        photos: Makes its predictor of photos.
-        judge: Helps to estimate which way is up.
+        panoramas: Predictor for panoramas.
+        photos: Function that creates the predictor for photos.
+        judge: Evidence for the direction of up, from the network's confidence.
 
     Attributes:
         trained: The network, with its inputs, level and representation.
         class_names: K + 1 names of the labels, the unknown class first.
-        palette: ``(K + 1, 3)`` uint8 RGB colours of the labels; ``palette[labels]`` is a picture.
+        palette: ``(K + 1, 3)`` uint8 RGB colors of the labels; ``palette[labels]`` is an image.
     """
 
     def __init__(
@@ -128,7 +129,7 @@ class Network:
         self._judge = judge
 
     def __repr__(self) -> str:
-        """Classes, inputs, views and device."""
+        """Return classes, inputs, views and device in one line."""
         trained, names = self.trained, self.class_names[1:]
         shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
         rows, columns = trained.image_size
@@ -150,25 +151,25 @@ class Network:
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
     ) -> Any:
-        """Label of every pixel.
+        """Return the label of every pixel.
 
         Args:
             image: A panorama, or a photo.
-            depth: ``(H, W)`` floats in metres, for networks that see depth, 0 or NaN where missing:
-                the distance from the center, in photos along the optical axis.
+            depth: ``(H, W)`` floats in meters, 0 or NaN where missing, for networks with depth as
+                an input: distance from the center for panoramas, z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             crop: West, east, south and north of a part of a panorama in degrees, see
-                `area_of_crop`; None for that of its file's GPano tags, else the whole sphere,
-                W = 2 H.
-            upright: Align a panorama with gravity: ``pose`` by its file's GPano tags, ``auto``
-                by these tags or, without them, by an estimate from the image.
+                `area_of_crop`. None to use the GPano tags of a file, or the whole sphere (W = 2 H)
+                without tags.
+            upright: Align a panorama with gravity: ``pose`` uses the GPano tags of a file; ``auto``
+                uses them too, or an estimate from the image without tags.
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
             mask: Pixels of a panorama that get the label 0: below a latitude in degrees; black in
                 a file; or 0 in an array or tensor. See `Masks`.
 
         Returns:
-            ``(H, W)`` labels 1 … K, and 0 where the network sees nothing it knows: an array of
-            uint8, or uint16 of many classes, or a tensor of int64.
+            ``(H, W)`` labels 1 … K, and 0 for unknown pixels: an array of uint8 (uint16 for many
+            classes), or a tensor of int64.
 
         Raises:
             DataError: A file cannot be used, or the image is not a whole panorama.
@@ -188,16 +189,16 @@ class Network:
         return labels
 
     def scores(self, image: Picture, **settings: Any) -> Any:
-        """Probability of every class at every pixel.
+        """Return the probability of every class at every pixel.
 
         Args:
             image: A panorama, or a photo.
-            **settings: Those of `labels`, but ``mask``.
+            **settings: Arguments of `labels`, except ``mask``.
 
         Returns:
-            An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; number k is that of label
-            k + 1. They add up to 1, or less by the probability of none of the classes, which some
-            imported networks have.
+            An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; index k belongs to label
+            k + 1. Probabilities add up to 1, or to less for imported networks that also predict
+            "none of the classes".
 
         Raises:
             DataError: See `labels`.
@@ -222,7 +223,7 @@ class Network:
         max_tilt_deg: float = 60.0,
         probabilities: bool = False,
     ) -> tuple[ScoreMosaic, PanoramaArea | None]:
-        """Scores of the whole sphere, with the part that the image shows; or those of a photo."""
+        """Predict a photo, or a panorama with the area of the sphere that it covers."""
         of_size = partial(self._depth, depth)
         if fov is not None:
             if crop is not None or upright is not None:
@@ -245,18 +246,18 @@ class Network:
         return self._panoramas.predict(panorama, probabilities=probabilities), area
 
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
-        """Depth in steps of 1/512 m, of the size of the image."""
-        wanted = "depth" in self.trained.inputs
-        if depth is None and not wanted:
+        """Return depth in steps of 1/512 m; refuse depth of another size or kind."""
+        is_input = "depth" in self.trained.inputs
+        if depth is None and not is_input:
             return None
         array = depth.numpy(force=True) if isinstance(depth, Tensor) else depth
         fits = isinstance(array, np.ndarray) and (array.shape, array.dtype.kind) == (size, "f")
-        if not (wanted and fits):
+        if not (is_input and fits):
             raise SettingError(
                 "depth",
                 found="none" if depth is None else described(depth),
-                expected=f"floats in metres, {width_height(size)}"
-                if wanted
-                else f"None: the network sees {' and '.join(self.trained.inputs)}",
+                expected=f"floats in meters, {width_height(size)}"
+                if is_input
+                else f"None: the network's inputs are {' and '.join(self.trained.inputs)}",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))

@@ -1,4 +1,4 @@
-"""The views of new panoramas and photos that a trained network is given."""
+"""Select views of new panoramas and photos for a trained network."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Views
 
 Levels = int | Sequence[int] | None
-"""A level s, the angular resolution, or several to average over; None as trained."""
+"""A level s, which sets the angular resolution, or several to average over; None as trained."""
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
@@ -38,19 +38,19 @@ _BASE_LEVEL = 1
 """For networks trained on photos (paper, section 5: transfer uses b = 1)."""
 
 _OVERLAP = 0.25
-"""Least overlap of neighboring crops of a photo that are feathered, as a share of their side."""
+"""Minimum overlap of neighboring crops of a photo with feathering, as a share of their side."""
 
 _OVERSAMPLED = 2
-"""Photos are shrunk to so many pixels per pixel of a crop before they are mirrored."""
+"""Photos are resized to at most 2 pixels per pixel of a crop before their borders are mirrored."""
 
 
 class SourceViews(NamedTuple):
     """Sets of views that are rendered from one image.
 
     Attributes:
-        image: The image.
+        image: The panorama or photo.
         shape: Rows and columns to which it is resized first.
-        sets: The sets, each of which shows all of the image.
+        sets: Sets of views, each of which covers the whole image.
     """
 
     image: InputImage
@@ -59,23 +59,23 @@ class SourceViews(NamedTuple):
 
 
 class PanoramaViews:
-    """Views of panoramas, by default those of training; scores of several sets are averaged.
+    """Selects views of panoramas, by default as in training; scores of several sets are averaged.
 
     Networks trained on photos get tangent images of base level 1, at the level that matches the
     angular resolution of their crops.
 
     Args:
         trained: The network.
-        levels: See `Levels`. All are rendered from a panorama of the highest one.
+        levels: See `Levels`. All are rendered from a panorama of the highest level.
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
-        rotations: Rotations about the vertical to average over.
+        rotations: Number of rotations about the vertical to average over.
 
     Attributes:
-        representation: The representation of upright panoramas.
+        representation: Representation of upright panoramas.
 
     Raises:
-        SettingError: The network cannot take such views.
+        SettingError: The network does not support such views.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class PanoramaViews:
         self.blend = self.representation.blend
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """The sets of views of one panorama."""
+        """Return the sets of views of one panorama."""
         representation: Representation = self.representation
         if image.up is not None:
             representation = representation.with_rotation(upright_rotation(image.up))
@@ -105,17 +105,17 @@ class PanoramaViews:
 
 
 class PhotoViews:
-    """Crops of photos, with the size and angular resolution of the network's training images.
+    """Selects crops of photos with the size and angular resolution of the training images.
 
     Args:
         trained: The network.
         levels: See `Levels`.
-        base_level: Crops of the size of tangent images of another base level b.
-        blend: ``feather``: crops overlap by a quarter and are averaged.
-        rotations: 1: photos have no other.
+        base_level: Base level b of tangent images whose size the crops get; None as trained.
+        blend: ``feather``: crops overlap by at least a quarter and are averaged.
+        rotations: 1; photos cannot be averaged over rotations.
 
     Raises:
-        SettingError: The network cannot take such crops, or there are other rotations.
+        SettingError: The network does not support such crops, or `rotations` is not 1.
     """
 
     def __init__(
@@ -143,7 +143,7 @@ class PhotoViews:
         self.blend: Blend = blend
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Crops that cover the photo; one smaller than a crop is mirrored at its borders."""
+        """Return crops that cover the photo. Photos smaller than a crop are mirrored at borders."""
         overlap = _OVERLAP if self.blend == "feather" else 0.0
         return [_covered(image, crops, overlap) for crops in self._crops]
 
@@ -151,7 +151,7 @@ class PhotoViews:
 def panorama_settings(
     trained: TrainedNetwork, levels: Levels = None, base_level: int | None = None
 ) -> dict[str, Any]:
-    """The section of a config for the representation of panoramas, see `PanoramaViews`.
+    """Return the settings of the representation of panoramas, see `PanoramaViews`.
 
     Args:
         trained: The network.
@@ -159,7 +159,7 @@ def panorama_settings(
         base_level: Base level b of tangent images; None as trained.
 
     Raises:
-        SettingError: The representation does not take several levels.
+        SettingError: The representation does not support several levels.
     """
     chosen = level_list(levels, trained.level)
     level = max(chosen)
@@ -177,7 +177,7 @@ def panorama_settings(
             raise SettingError(
                 "levels",
                 found=chosen,
-                expected="one, for a network that does not take tangent images",
+                expected="one level, for a network that does not take tangent images",
                 remedy="Give base_level= to use tangent images.",
             )
         settings["levels"] = chosen
@@ -186,17 +186,17 @@ def panorama_settings(
         if base_level is None and settings.get("dim") is None:
             settings["base_level"] = max(0, math.ceil(level - math.log2(side)))
         default = settings.get("dim") or 2 ** (level - settings["base_level"])
-        settings["dim"] = max(default, side)  # larger ones are divided
+        settings["dim"] = max(default, side)  # the network divides larger images
     return settings
 
 
 def _built(
     trained: TrainedNetwork, settings: dict[str, Any]
 ) -> PinholeRepresentation | EquirectRepresentation:
-    """The representation of some settings.
+    """Build the representation from settings.
 
     Raises:
-        SettingError: The network cannot take its images.
+        SettingError: The network does not support its image size.
     """
     built: Any = build_from_config(settings, "representation", trained.source)
     check_size(trained, built.image_size)
@@ -221,14 +221,14 @@ def _photo_representation(
 
 
 def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
-    """Refuse images that a network does not take.
+    """Refuse image sizes that a network does not support.
 
     Args:
         trained: The network.
         size: Rows and columns of the images.
 
     Raises:
-        SettingError: It does not take them.
+        SettingError: The network does not support the size.
     """
     fixed, multiple = trained.fixed_size, trained.size_multiple
     small = fixed is not None and any(n < least for n, least in zip(size, fixed, strict=True))
@@ -236,26 +236,26 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         raise SettingError(
             "level and base_level",
             found=f"images of {width_height(size)}",
-            expected=f"at least {width_height(fixed)}, as the network's file takes"
+            expected=f"at least {width_height(fixed)}, the input size of the network's file"
             if fixed
-            else f"multiples of {multiple}, as the network needs",
+            else f"multiples of {multiple}, the network's stride",
             remedy="Choose other levels, or leave both as trained.",
         )
 
 
 def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:
-    """Crops that cover a photo, mirrored at its borders as far as a crop is larger.
+    """Return crops that cover a photo; its borders are mirrored where a crop is larger.
 
     Args:
-        image: The photo; the depth of the result is the distance.
-        wanted: The common camera of the crops.
+        image: The photo. Its z-depth is converted to distance.
+        wanted: Common camera of the crops.
         overlap: See `PhotoSampler.cover`.
     """
     matrix, size = np.array(image.camera_matrix), image.rgb.shape[:2]
     depth = None if image.depth is None else distance_from_z_depth(image.depth, matrix)
     pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / wanted.image_size[1]
     per_pixel = pixel * np.diag(matrix)[[1, 0]]  # photo pixels per crop pixel, down and across
-    # Shrunk first: mirrored at full resolution, a photo of a telescope would fill the memory.
+    # Resized first: mirrored at full resolution, a photo of a tiny field of view fills the memory.
     kept = np.minimum(1, _OVERSAMPLED / per_pixel)
     rows, columns = (max(1, round(n * share)) for n, share in zip(size, kept, strict=True))
     scale = np.array([columns / size[1], rows / size[0]])
@@ -265,7 +265,7 @@ def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: floa
     rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
     if depth is not None:
         depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
-    # Crops that cover the whole image do not depend on its principal point.
+    # Crops that cover the whole image do not depend on the principal point.
     focal = np.diag([*np.diag(matrix)[:2] * scale, 1])
     offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
     mirrored = InputImage(rgb, depth)

@@ -1,7 +1,7 @@
 """Sparse keypoints on the sphere (paper, section "Sparse keypoint correspondences").
 
-Keypoints are detected on tangent images or on the panorama itself. From then on they live on the
-sphere: a direction, an angular size and an orientation, whatever image they were detected in.
+Keypoints are detected on tangent images or on the panorama itself. They are stored on the sphere,
+independently of the image: a direction, an angular size and an orientation.
 """
 
 from tangent_train.keypoints.detect import detect_on_equirect, detect_on_tangent_images

@@ -1,7 +1,7 @@
-"""COLMAP databases of panoramas, their keypoints and matches; poses that COLMAP found.
+"""Write COLMAP databases with panoramas, keypoints and matches; read poses that COLMAP estimated.
 
 In COLMAP the center of the first pixel is (½, ½). Panoramas have the camera model EQUIRECTANGULAR,
-whose parameters are their size.
+with their size as parameters.
 """
 
 from __future__ import annotations
@@ -32,15 +32,15 @@ def add_pair(
     matches: NDArray[np.integer],
     geometry: TwoView,
 ) -> None:
-    """Add a pair of panoramas to a COLMAP database; what it holds already stays as it is.
+    """Add a pair of panoramas to a COLMAP database; existing entries are not changed.
 
     Args:
-        path: The database; created if it is missing.
-        images: Name of the left and of the right image, relative to COLMAP's image folder, and
-            ``(H, W)`` of its file.
-        keypoints: Their keypoints, with SIFT's descriptors.
-        matches: ``(m, 2)`` indices of keypoints.
-        geometry: The geometry of the m matches.
+        path: Database file, created if it is missing.
+        images: Left and right image: its name, relative to COLMAP's image folder, and its
+            ``(H, W)``.
+        keypoints: Keypoints of the left and the right image, with SIFT descriptors.
+        matches: ``(m, 2)`` indices of matching keypoints.
+        geometry: Two-view geometry of the m matches.
 
     Raises:
         SettingError: pycolmap is missing.
@@ -78,7 +78,7 @@ def _image_id(
 
 
 def _camera_id(database: Any, shape: tuple[int, int]) -> int:
-    """The camera of a size of panoramas, with a rig that consists of it."""
+    """Return the camera for panoramas of a size; add it, with a rig of this camera, if missing."""
     pycolmap = colmap()
     height, width = shape
     cameras = database.read_all_cameras()
@@ -86,7 +86,7 @@ def _camera_id(database: Any, shape: tuple[int, int]) -> int:
         if (camera.height, camera.width) == shape:
             return int(camera.camera_id)
     number = len(cameras) + 1
-    # The focal length is one of other models.
+    # EQUIRECTANGULAR has no focal length; the argument is for other models.
     camera = pycolmap.Camera.create_from_model_name(number, "EQUIRECTANGULAR", 1.0, width, height)
     database.write_camera(camera, use_camera_id=True)
     rig = pycolmap.Rig(rig_id=number)
@@ -110,24 +110,24 @@ def _geometry(pairs: NDArray[np.uint32], found: TwoView) -> Any:
 
 
 def panorama_poses(model: Path, rig: RigFile) -> dict[str, PanoramaPose]:
-    """Poses of panoramas by those of their tangent images.
+    """Compute poses of panoramas from the poses of their tangent images in a COLMAP model.
 
     Args:
-        model: A sparse model of COLMAP, binary or text.
-        rig: Rig of the project that the model was made of.
+        model: Folder of a sparse COLMAP model, binary or text.
+        rig: Rig of the project from which the model was reconstructed.
 
     Returns:
-        Poses by file, of the panoramas in the model, in its world and units.
+        Pose of each panorama in the model, by file, in the model's world and units.
 
     Raises:
-        DataError: The model cannot be read, or no panorama is in it.
+        DataError: The model cannot be read, or it contains no panorama of the project.
         SettingError: pycolmap is missing.
     """
     pycolmap = colmap()
     try:
         images = pycolmap.Reconstruction(model).images.values()
     except (ValueError, RuntimeError, OSError, IndexError, KeyError) as error:
-        expected = "a folder with a sparse model of COLMAP, such as sparse/0"
+        expected = "a folder with a sparse COLMAP model, such as sparse/0"
         raise DataError(model, found=error, expected=expected) from error
     poses: dict[str, PanoramaPose] = {}
     for image in sorted((image for image in images if image.has_pose), key=lambda i: i.name):

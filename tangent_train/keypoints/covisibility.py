@@ -32,29 +32,29 @@ _ROWS = 512
 
 @dataclass(frozen=True, eq=False)
 class DepthView:
-    """Depth and pose of a panorama, as known of its room.
+    """Ground-truth depth and pose of a panorama.
 
     Args:
-        distance_m: ``(H, W)`` distances from the center in meters, of any resolution; NaN where
-            missing.
-        pose: Camera pose.
+        distance_m: ``(H, W)`` distances from the center in meters, NaN where missing. The
+            resolution may differ from the panorama's.
+        pose: Pose of the panorama.
     """
 
     distance_m: NDArray[np.floating]
     pose: PanoramaPose
 
     def distances(self, directions_xyz: Floats) -> tuple[Floats, Floats]:
-        """Distances in directions.
+        """Return distances in directions.
 
         Between four pixels of one surface 1/d is interpolated, which is linear in the direction on
-        a plane. At depth edges the distance is that of the nearest pixel that has one; its surface
-        may go on towards the next pixel, farther away.
+        a plane. At depth edges the distance is that of the nearest pixel with a distance; its
+        surface may continue towards the next pixel, farther away.
 
         Args:
-            directions_xyz: ``(n, 3)``.
+            directions_xyz: ``(n, 3)`` unit vectors.
 
         Returns:
-            ``(n,)`` distances in meters, and ``(n,)`` how far the same surface may be; NaN where
+            ``(n,)`` distances in meters, and ``(n,)`` upper bounds for the same surface; NaN where
             all four pixels are missing.
         """
         height, width = self.distance_m.shape
@@ -63,7 +63,7 @@ class DepthView:
         taps = bilinear_equirect_taps(u, v, (height, width))
         weight = taps.weight.numpy()
         four = self.distance_m.reshape(-1)[taps.source.numpy()].astype(np.float64)
-        touched = weight > 1e-6  # others are among the four by rounding only
+        touched = weight > 1e-6  # rounding may include pixels without weight
         there = touched & ~np.isnan(four)
         farthest = np.where(there, four, -np.inf).max(axis=0)
         closest = np.where(there, four, np.inf).min(axis=0)
@@ -76,16 +76,16 @@ class DepthView:
 
 
 def visible_from(directions_xyz: Floats, source: DepthView, target: DepthView) -> NDArray[np.bool_]:
-    """Mask of the directions of one panorama whose points are visible in another.
+    """Return a mask of directions in one panorama whose points are visible in another.
 
-    A panorama has no borders: a point is visible unless the target's distance in its direction is
-    shorter than its own by more than 3 % and 3 cm. A direction without distance cannot be placed
-    and does not count; where the target has no distance nothing is known to occlude the point.
+    A panorama has no borders: a point is visible unless a surface in the target is nearer than the
+    point by more than 3 % and 3 cm. Directions without a distance are not visible. Where the target
+    has no distance, points count as visible.
 
     Args:
         directions_xyz: ``(n, 3)`` unit vectors in the source.
-        source: The panorama they belong to.
-        target: The one that may see them.
+        source: Panorama of the directions.
+        target: Panorama in which the points may be visible.
 
     Returns:
         ``(n,)`` bool.
@@ -93,20 +93,24 @@ def visible_from(directions_xyz: Floats, source: DepthView, target: DepthView) -
     distance_m, _ = source.distances(directions_xyz)
     placed = ~np.isnan(distance_m)
     points_m = source.pose.points_m(directions_xyz, np.where(placed, distance_m, 1.0))
-    seen_xyz, away_m = target.pose.seen(points_m)
-    _, reach_m = target.distances(seen_xyz)
-    return placed & ~(away_m > reach_m + _TOLERANCE_M + _TOLERANCE * away_m)  # NaN hides nothing
+    target_xyz, away_m = target.pose.project(points_m)
+    _, reach_m = target.distances(target_xyz)
+    # A comparison with NaN is False: missing distances do not occlude.
+    return placed & ~(away_m > reach_m + _TOLERANCE_M + _TOLERANCE * away_m)
 
 
 def fov_overlap(left: DepthView, right: DepthView) -> float:
-    """Overlap of the fields of view (paper, section "Sparse keypoint correspondences").
+    """Return the overlap of fields of view (paper, section "Sparse keypoint correspondences").
 
-    The mean of two shares: of the right panorama's points, those that the left camera sees, and
-    vice versa. Points are pixels that have a distance; like the paper's share, this over-counts
-    the poles.
+    It is the mean of two shares: points of the right panorama that are visible in the left one, and
+    vice versa. Points are pixels with a distance; as in the paper, the poles are over-counted.
+
+    Args:
+        left: Left panorama.
+        right: Right panorama.
 
     Returns:
-        0 to 1; NaN where one of the two has no distances.
+        0 to 1; NaN if one of the two has no distances.
     """
     return (_seen_share(left, right) + _seen_share(right, left)) / 2
 
@@ -130,7 +134,7 @@ class MatchTruth(NamedTuple):
 
     Attributes:
         correct: ``(m,)`` bool.
-        known: ``(m,)`` bool, one of the two panoramas has a distance.
+        known: ``(m,)`` bool, True if at least one of the two panoramas has a distance.
     """
 
     correct: NDArray[np.bool_]
@@ -144,18 +148,19 @@ def correct_matches(
     right: DepthView,
     max_error_deg: float = 1.0,
 ) -> MatchTruth:
-    """Verify matches by depth and pose, independently of any estimated geometry.
+    """Verify matches by depth and pose, independently of estimated geometry.
 
-    The left point is placed at its distance and seen from the right, and vice versa; the match is
-    correct where one of the two ends within `max_error_deg` of its partner. One is enough:
-    keypoints are often at depth edges, where the other distance may be that of the background.
+    The left point is placed at its distance and projected into the right panorama, and vice versa.
+    A match is correct if one of the two is within `max_error_deg` of its partner. One is enough,
+    because keypoints are often at depth edges, where the other distance may belong to the
+    background.
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors in the left panorama.
-        right_xyz: ``(m, 3)`` unit vectors in the right one.
-        left: The left panorama.
-        right: The right one.
-        max_error_deg: Largest angle.
+        right_xyz: ``(m, 3)`` unit vectors in the right panorama.
+        left: Depth and pose of the left panorama.
+        right: Depth and pose of the right panorama.
+        max_error_deg: Largest angle of a correct match.
     """
     there = _transfer_errors_deg(left_xyz, right_xyz, left, right)
     back = _transfer_errors_deg(right_xyz, left_xyz, right, left)
@@ -166,7 +171,7 @@ def correct_matches(
 def _transfer_errors_deg(
     source_xyz: Floats, target_xyz: Floats, source: DepthView, target: DepthView
 ) -> Floats:
-    """Angles between where the target sees the source's points and where it should."""
+    """Return angles between the source's points, projected into the target, and their matches."""
     distance_m, _ = source.distances(source_xyz)
-    seen_xyz, _ = target.pose.seen(source.pose.points_m(source_xyz, distance_m))
-    return np.degrees(angles_between(seen_xyz, target_xyz))
+    projected_xyz, _ = target.pose.project(source.pose.points_m(source_xyz, distance_m))
+    return np.degrees(angles_between(projected_xyz, target_xyz))

@@ -1,4 +1,4 @@
-"""Detecting keypoints on panoramas and on their tangent images."""
+"""Detect keypoints on panoramas and on their tangent images."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 _cv2: Any = cv2  # its types lack the detectors
 
 _WRAP_SHARE = 8
-"""A panorama is continued by W/8 columns: SIFT's descriptors reach 5.3 times a keypoint's size, so
-those up to W/42 are computed as if there were no seam."""
+"""A panorama is extended by W/8 columns on both sides. SIFT descriptors cover 5.3 times the size of
+a keypoint, so keypoints up to W/42 are not affected by the seam."""
 
 _PIXELS_AT_ONCE = 2**23
-"""Pixels of images searched at once: SIFT needs about 300 bytes for each."""
+"""Number of pixels searched at once: SIFT needs about 300 bytes per pixel."""
 
 _REPEAT_PIXELS = 1.0
 _REPEAT_RATIO = 1.15
@@ -54,15 +54,15 @@ class Detections(NamedTuple):
 
 
 def detect(gray: NDArray[np.uint8]) -> Detections:
-    """Detect and describe SIFT keypoints. Several threads may call it at once.
+    """Detect and describe SIFT keypoints; safe to call from several threads.
 
-    OpenCV runs with ``enable_precise_upscale``: without it positions are off by ¼ pixel.
+    OpenCV's ``enable_precise_upscale`` is on: otherwise positions are off by ¼ pixel.
 
     Args:
         gray: ``(h, w)`` uint8.
 
     Returns:
-        All keypoints, in OpenCV's order; none within 1¾ pixels of the borders.
+        All keypoints in OpenCV's order. There are no keypoints within 1¾ pixels of the borders.
     """
     sift = _cv2.SIFT_create(enable_precise_upscale=True)
     points, descriptors = sift.detectAndCompute(np.ascontiguousarray(gray), None)
@@ -75,10 +75,10 @@ def detect(gray: NDArray[np.uint8]) -> Detections:
 
 
 def detect_on_equirect(image: NDArray[np.uint8]) -> SphericalKeypoints:
-    """Detect keypoints on a panorama as if it were an ordinary image, but across ±180°.
+    """Detect keypoints on a panorama as on an ordinary image, but across the seam at ±180°.
 
-    The image is extended by W/8 columns of its other side, left and right, so that keypoints at
-    ±180° are found once. It is not extended beyond the poles, as in the paper's baseline.
+    The image is extended by W/8 columns of its opposite side, left and right, so that keypoints at
+    ±180° are detected once. As in the paper's baseline, it is not extended beyond the poles.
 
     Args:
         image: ``(H, W)`` gray or ``(H, W, 3)`` RGB, uint8.
@@ -99,15 +99,15 @@ def detect_on_tangent_images(
 ) -> SphericalKeypoints:
     """Detect keypoints on the tangent images of a panorama, or on the faces of a cube.
 
-    Images overlap, and duplicates would spoil the ratio test: a keypoint is kept by the image that
-    owns its direction, and only once where two images find it on their common border. Where each
-    finds it in the other's cell it is lost, about one in 500 at base level 2.
+    Images overlap, and duplicates would break the ratio test. A keypoint is therefore kept only in
+    the image that owns its direction, and once if two images detect it at their common border. It
+    is lost if each image places it in the other's cell: about one in 500 at base level 2.
 
     Args:
         image: ``(H, W)`` gray or ``(H, W, 3)`` RGB, uint8.
-        grid: The images.
-        margin: Pixels added on every side of the images, at the same pitch: detectors find nothing
-            near borders, and large keypoints need space.
+        grid: Geometry of the images.
+        margin: Pixels added on every side of the images, at the same pitch. Detectors find no
+            keypoints near borders, and large keypoints need space.
 
     Returns:
         Keypoints in the order of the faces they were detected in.
@@ -135,15 +135,15 @@ def detect_on_tangent_images(
 def gnomonic_jacobian(
     directions_xyz: NDArray[np.float64], grid: PinholeGrid, face: int
 ) -> NDArray[np.float64]:
-    """Jacobian of directions by pixel in a tangent image, ``∂d/∂(column, row)``.
+    """Return the Jacobian of directions by pixel in a tangent image, ``∂d/∂(column, row)``.
 
     At (X, Y) on the tangent plane, with r² = 1 + X² + Y², pitch p and the camera's axes
     A = (a, b, c): ``d = A (X, Y, 1) / r``, ``∂d/∂(column, row) = p/r · (I − d dᵀ) (a, b)``.
 
     Args:
         directions_xyz: ``(n, 3)`` unit vectors in front of the image.
-        grid: The images.
-        face: The image.
+        grid: Geometry of the images.
+        face: Index of the image.
 
     Returns:
         ``(n, 3, 2)``.
@@ -169,7 +169,7 @@ def _on_sphere(
 
 
 def _repeated(keypoints: SphericalKeypoints, pitch: float) -> NDArray[np.bool_]:
-    """``(n,)`` the weaker of each two that are one keypoint, found on both sides of a border."""
+    """Return a mask ``(n,)`` of keypoints that a neighboring image detected more strongly."""
     tree = cKDTree(keypoints.directions_xyz)
     near = tree.query_pairs(_REPEAT_PIXELS * pitch, output_type="ndarray")
     left, right = near.T

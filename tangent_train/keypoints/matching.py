@@ -1,4 +1,4 @@
-"""Putative matches: exact nearest neighbours among descriptors."""
+"""Match keypoints: exact nearest neighbors among descriptors."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 _ROWS = 512
-"""Rows of the block of distances that is held."""
+"""Number of left descriptors whose distances are computed at once."""
 
 
 def match(
@@ -16,20 +16,20 @@ def match(
     *,
     mutual: bool = True,
 ) -> NDArray[np.int64]:
-    """The unambiguous nearest right descriptor of every left one.
+    """Match each left descriptor with its nearest right descriptor, if that is unambiguous.
 
-    Time grows with n_l · n_r, memory with n_r. Distances are exact for whole numbers up to 255, as
-    SIFT's. Of equally near right descriptors the first is the nearest.
+    Time grows with n_l · n_r, memory with n_r. Distances have no rounding errors for integers up to
+    255, such as SIFT's. The first of several equally near descriptors is taken.
 
     Args:
-        left_descriptors: ``(n_l, D)``.
-        right_descriptors: ``(n_r, D)``.
-        ratio: Keep a match whose Euclidean distance is less than this share of that to the second
-            nearest (Lowe 2004; the paper's matches have 0.8). 1 or more: keep all.
-        mutual: Keep a match only if the left one is also the nearest to the right one.
+        left_descriptors: ``(n_l, D)`` descriptors.
+        right_descriptors: ``(n_r, D)`` descriptors.
+        ratio: Keep a match if its Euclidean distance is less than this share of the distance to the
+            second nearest (Lowe 2004; the paper uses 0.8). 1 or more keeps all.
+        mutual: True to keep a match only if each descriptor is the nearest to the other.
 
     Returns:
-        ``(m, 2)`` indices of left and right descriptors, by the left ones.
+        ``(m, 2)`` indices of left and right descriptors, sorted by the left ones.
     """
     left, right = left_descriptors, right_descriptors
     if not (len(left) and len(right)):
@@ -45,7 +45,7 @@ def match(
 def _nearest_two(
     left: NDArray[np.float32], right: NDArray[np.float32]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """``(n,)`` index and squared distance of the nearest, squared distance of the second."""
+    """Return ``(n,)`` index and squared distance of the nearest, squared distance of the second."""
     nearest = np.empty(len(left), np.int64)
     first, second = np.full((2, len(left)), np.inf)
     squares = np.einsum("nd,nd->n", right, right)

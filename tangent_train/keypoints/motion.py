@@ -1,8 +1,9 @@
-"""Motion between two panoramas: its epipolar arcs, and the significance of a fit.
+"""Motion between two panoramas: epipolar arcs, and the significance of a fit.
 
-A point in direction l of the left panorama lies somewhere on a ray. In the right panorama, with
-``x_right = R x_left + t``, the ray appears as the great-circle arc from ``R l``, its point at
-infinity, to ``t``, the left center. Without translation the arc is the point ``R l``.
+A point in direction l of the left panorama lies on a ray at an unknown distance. In the right
+panorama, with ``x_right = R x_left + t``, the ray appears as a great-circle arc. It starts at
+``R l``, the ray's point at infinity, and ends at ``t``, the left center. Without translation the
+arc is the point ``R l``.
 """
 
 from __future__ import annotations
@@ -16,15 +17,15 @@ from tangent_train.keypoints.spherical import Floats, angles_between
 
 _SHIFTS = 16
 _PRECISION_RAD = math.radians(0.01)
-"""Below the precision of any keypoint."""
+"""Lower limit for σ, below the precision of keypoints."""
 
 
 class Motion(NamedTuple):
-    """From left to right coordinates: ``x_right = R x_left + t``.
+    """Motion from left to right coordinates, ``x_right = R x_left + t``.
 
     Attributes:
         rotation: ``(3, 3)`` R.
-        translation: ``(3,)`` t of length 1; None if both were taken at one place.
+        translation: ``(3,)`` t of length 1; None if both panoramas have the same center.
     """
 
     rotation: Floats
@@ -32,12 +33,12 @@ class Motion(NamedTuple):
 
     @property
     def sample(self) -> int:
-        """Size of a minimal sample of matches, which some motion always fits."""
+        """Number of matches that determine a motion (minimal sample)."""
         return 2 if self.translation is None else 5
 
 
 def motion_errors(left_xyz: Floats, right_xyz: Floats, motion: Motion) -> Floats:
-    """Angular error of matches under a motion.
+    """Return the angular error of matches under a motion.
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors.
@@ -45,8 +46,8 @@ def motion_errors(left_xyz: Floats, right_xyz: Floats, motion: Motion) -> Floats
         motion: The motion.
 
     Returns:
-        ``(m,)`` radians: the angle between the right direction and the arc of the left one, or
-        between the left one and the arc of the right one, whichever is larger.
+        ``(m,)`` radians: the larger of the angle between the right direction and the arc of the
+        left one, and the angle between the left direction and the arc of the right one.
     """
     rotation, translation = motion
     ahead = left_xyz @ rotation.T
@@ -58,11 +59,11 @@ def motion_errors(left_xyz: Floats, right_xyz: Floats, motion: Motion) -> Floats
 
 
 def _arc_angles(points_xyz: Floats, starts_xyz: Floats, end_xyz: Floats) -> Floats:
-    """Angles between points and the shorter arcs from ``(m, 3)`` starts to one end."""
+    """Return angles between points and the shorter arcs from ``(m, 3)`` starts to one end."""
     normals = np.cross(starts_xyz, end_xyz)
     sines = np.linalg.norm(normals, axis=1)
     across = np.abs((points_xyz * normals).sum(axis=1)) / np.maximum(sines, 1e-300)
-    # Beside the arc are points between its ends, seen along it; others are nearest to an end.
+    # A point is nearest to the inside of the arc, or to one of its ends.
     after_start = (points_xyz * np.cross(normals, starts_xyz)).sum(axis=1) >= 0
     before_end = (points_xyz * np.cross(end_xyz, normals)).sum(axis=1) >= 0
     ends = np.minimum(angles_between(points_xyz, starts_xyz), angles_between(points_xyz, end_xyz))
@@ -71,13 +72,13 @@ def _arc_angles(points_xyz: Floats, starts_xyz: Floats, end_xyz: Floats) -> Floa
 
 
 def is_by_chance(left_xyz: Floats, right_xyz: Floats, motion: Motion, max_error_rad: float) -> bool:
-    """True if a motion would fit as many matches by chance.
+    """Return True if a motion with as many inliers is expected by chance.
 
     The expected number of such motions is ``(m − s) · C(m, k) · C(k, s) · pᵏ⁻ˢ`` (Moisan and Stival
-    2004, equation 6; the criterion of OpenMVG, which the paper used) with m matches, k inliers, the
-    sample size s, and the share p of wrong matches that fit; a motion counts if it is below 1. p is
-    measured on directions that were not matched with each other, so that it accounts for where
-    keypoints are dense.
+    2004, equation 6; the criterion of OpenMVG, which the paper used). It has m matches, k inliers,
+    the sample size s, and the share p of wrong matches that fit the motion. A motion is significant
+    if the number is below 1. p is measured on directions that were not matched with each other, so
+    that it takes the density of keypoints into account.
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors.
@@ -101,11 +102,11 @@ def _log_choices(of: int, chosen: int) -> float:
 
 
 def prefers_rotation(general_errors: Floats, rotation_errors: Floats, max_error_rad: float) -> bool:
-    """True if a rotation alone explains the matches: Torr's GRIC (1998).
+    """Return True if a rotation explains the matches, by Torr's criterion GRIC (1998).
 
-    ``Σ min(e²/σ², 2 (4 − d)) + n d ln 4 + k ln 4n`` with d = 3, k = 5 for a general motion and
-    d = 2, k = 3 for a rotation, over the matches that one of the two allows; the smaller wins. σ
-    is that of the general motion, from the median of its errors.
+    ``Σ min(e²/σ², 2 (4 − d)) + n d ln 4 + k ln 4n`` is compared, over the matches that fit one of
+    the two: d = 3, k = 5 for a general motion, d = 2, k = 3 for a rotation. The smaller value wins.
+    σ is estimated from the median of the general motion's errors.
 
     Args:
         general_errors: ``(m,)`` radians.

@@ -1,4 +1,4 @@
-"""Keypoints as directions, and how they appear in a panorama."""
+"""Keypoints as directions on the sphere, and their positions in a panorama."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 class SphericalKeypoints:
     """n keypoints in the frame of `tangent_train.geometry`.
 
-    Sizes and orientations are OpenCV's, mapped from the image to the sphere (`local_to_sphere`).
+    Sizes and orientations come from OpenCV, mapped from image to sphere (`local_to_sphere`).
 
     Attributes:
         directions_xyz: ``(n, 3)`` float64 unit vectors.
@@ -27,7 +27,7 @@ class SphericalKeypoints:
         orientations_xyz: ``(n, 3)`` float64 unit vectors, perpendicular to the directions.
         responses: ``(n,)`` float32 strength.
         descriptors: ``(n, D)`` float32.
-        images: ``(n,)`` int32, the face each was detected in; 0 for a panorama.
+        images: ``(n,)`` int32, the face in which each was detected; 0 for a panorama.
     """
 
     directions_xyz: Floats
@@ -45,28 +45,28 @@ class SphericalKeypoints:
 
     @classmethod
     def concatenated(cls, parts: Sequence[SphericalKeypoints]) -> Self:
-        """The keypoints of one or more parts, in their order."""
+        """Return the keypoints of one or more parts, in their order."""
         columns = zip(*(part._arrays() for part in parts), strict=True)
         return cls(*(np.concatenate(column) for column in columns))
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.integer]) -> Self:
-        """Some of the keypoints, by a mask or by indices."""
+        """Return some of the keypoints, by a mask or by indices."""
         return type(self)(*(values[chosen] for values in self._arrays()))
 
     def equirect_pixels(self, shape: tuple[int, int]) -> Floats:
-        """``(n, 2)`` columns and rows in a panorama ``(H, W)``; pixel centers are integers."""
+        """Return ``(n, 2)`` columns and rows in a panorama ``(H, W)``; centers are integers."""
         return lonlat_to_equirect(xyz_to_lonlat(self.directions_xyz), shape)
 
 
 def angles_between(first_xyz: ArrayLike, second_xyz: ArrayLike) -> Floats:
-    """``(...)`` angles between ``(..., 3)`` unit vectors in radians, precise near 0 and π alike."""
+    """Return ``(...)`` angles of ``(..., 3)`` unit vectors in radians, precise near 0 and π."""
     first, second = np.asarray(first_xyz, np.float64), np.asarray(second_xyz, np.float64)
     halves = (np.linalg.norm(first + sign * second, axis=-1) for sign in (-1, 1))
     return np.asarray(2 * np.arctan2(*halves))
 
 
 def equirect_jacobian(directions_xyz: Floats, shape: tuple[int, int]) -> Floats:
-    """Jacobian of directions by pixel in a panorama, ``∂d/∂(u, v)``.
+    """Return the Jacobian of directions by pixel in a panorama, ``∂d/∂(u, v)``.
 
     With east e = (−sin λ, cos λ, 0) and north n: ``∂d/∂u = 2π/W · cos φ · e``,
     ``∂d/∂v = −π/H · n``.
@@ -90,11 +90,11 @@ def equirect_jacobian(directions_xyz: Floats, shape: tuple[int, int]) -> Floats:
 def local_to_sphere(
     jacobian: Floats, sizes: NDArray[np.floating], angles_rad: NDArray[np.floating]
 ) -> tuple[NDArray[np.float32], Floats]:
-    """Sizes and orientations of keypoints, from the image they were detected in to the sphere.
+    """Map sizes and orientations of keypoints from an image to the sphere.
 
-    A disc of the image becomes an ellipse on the sphere; its size is the diameter of the disc of
-    the same area: ``size · √|∂d/∂u × ∂d/∂v|``. The orientation of a keypoint is the mean gradient
-    of the gray values around it. A gradient is a covector: with the Jacobian J (3×2) it becomes
+    A disc in the image becomes an ellipse on the sphere. Its size is the diameter of a disc of the
+    same area: ``size · √|∂d/∂u × ∂d/∂v|``. The orientation of a keypoint is the mean gradient of
+    the gray values around it. A gradient is a covector: with the Jacobian J (3×2) it becomes
     ``J (JᵀJ)⁻¹ (cos a, sin a)``, scaled to length 1.
 
     Args:

@@ -1,6 +1,6 @@
-"""Two-view geometry of panoramas: their motion from matches with a majority of outliers.
+"""Two-view geometry of panoramas: estimate their motion from matches, most of them outliers.
 
-pycolmap calls are in COLMAP's camera axes: x right, y down, z to the middle of the panorama.
+Arguments of pycolmap are in COLMAP's camera axes: x right, y down, z to the panorama's middle.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ if TYPE_CHECKING:
 
 
 _CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
-"""From `tangent_train.geometry`'s axes to COLMAP's; it mirrors."""
+"""From the axes of `tangent_train.geometry` to COLMAP's; a reflection."""
 
 _MIN_INLIERS = 8
-"""COLMAP asks for 15; the test for chance makes fewer trustworthy."""
+"""COLMAP requires 15. Fewer are reliable here, because motions by chance are rejected."""
 
 _MAX_TRIALS = 50_000
 _STARTS = 4
 _DRAWS, _HYPOTHESES = 2**15, 512
-"""Pairs of matches tried for a rotation: enough at 2 % of inliers."""
+"""Random pairs of matches for a rotation, and hypotheses tested: enough for 2 % inliers."""
 
 _REFINEMENTS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class TwoView:
-    """The motion ``x_right = R x_left + t`` in the axes of `tangent_train.geometry`.
+    """Estimated motion ``x_right = R x_left + t`` in the axes of `tangent_train.geometry`.
 
     Attributes:
-        inliers: ``(m,)`` bool, matches within the largest error of the motion.
-        rotation: ``(3, 3)`` R; None if no motion fits more matches than chance would.
+        inliers: ``(m,)`` bool, matches whose error is small enough.
+        rotation: ``(3, 3)`` R; None if no motion was found that is better than chance.
         translation: ``(3,)`` t of length 1, the direction of the left center in the right panorama;
             None without a motion, and for a pure rotation.
     """
@@ -60,15 +60,16 @@ class TwoView:
         return "rotation" if self.translation is None else "general"
 
     def pose_error_deg(self, left: PanoramaPose, right: PanoramaPose) -> tuple[float, float]:
-        """Errors against the true poses.
+        """Return the errors of rotation and translation, given the true poses.
 
         Args:
             left: True pose of the left panorama.
-            right: True pose of the right one.
+            right: True pose of the right panorama.
 
         Returns:
             Angle between the rotations, and angle between the directions of translation, in
-            degrees; NaN where the estimate has none, or the true centers coincide.
+            degrees. NaN if the estimate has no rotation or translation, or the true centers
+            coincide.
         """
         rotation, translation_m = right.relative_to(left)
         rotation_error = translation_error = math.nan
@@ -86,17 +87,20 @@ class TwoView:
 def estimate_two_view(
     left_xyz: Floats, right_xyz: Floats, max_error_deg: float = 1.0, *, seed: int = 0
 ) -> TwoView:
-    """Find the motion between two panoramas from putative matches, all around the sphere.
+    """Estimate the motion between two panoramas from matches with outliers.
 
-    A general motion comes from COLMAP's five-point RANSAC, a rotation from pairs of matches. Torr's
-    criterion decides between them (`prefers_rotation`), because a general motion fits the matches
-    of a rotation as well. A motion explained by chance is rejected (`is_by_chance`).
+    A general motion is estimated by COLMAP's five-point RANSAC, a rotation from pairs of matches.
+    Torr's criterion decides between them (`prefers_rotation`), because a general motion also fits
+    the matches of a rotation. A motion that is expected by chance is rejected (`is_by_chance`).
 
     Args:
         left_xyz: ``(m, 3)`` unit vectors in the left panorama.
-        right_xyz: ``(m, 3)`` unit vectors in the right one.
+        right_xyz: ``(m, 3)`` unit vectors in the right panorama.
         max_error_deg: Largest error of an inlier.
         seed: Seed of the random samples.
+
+    Returns:
+        The motion and its inliers; without a motion, all matches are outliers.
 
     Raises:
         SettingError: pycolmap is missing.
@@ -122,7 +126,7 @@ def estimate_two_view(
 
 @dataclass(frozen=True)
 class _Search:
-    """Matches among which a motion is sought."""
+    """Searches a motion that fits matches."""
 
     left_xyz: Floats
     right_xyz: Floats
@@ -136,11 +140,11 @@ class _Search:
         return float((np.minimum(self.errors(motion), self.max_error_rad) ** 2).sum())
 
     def general(self) -> Motion | None:
-        """The best of several runs of COLMAP's LO-RANSAC on rays, each refined.
+        """Return the best of several runs of COLMAP's LO-RANSAC on rays, each refined.
 
-        A single run may stop at a motion degrees away that fits nearly as many matches.
-        `pycolmap.estimate_calibrated_two_view_geometry` measures errors in pixels of the ERP, so
-        that it loses matches near the poles.
+        A single run may return a motion that is degrees off but fits nearly as many matches.
+        `pycolmap.estimate_calibrated_two_view_geometry` is not used: it measures errors in pixels
+        of the panorama and loses matches near the poles.
         """
         pycolmap = colmap()
         left, right = (rays @ _CAMERA_FROM_PANORAMA.T for rays in (self.left_xyz, self.right_xyz))
@@ -151,7 +155,7 @@ class _Search:
             return None if refined is None else _motion(refined["cam2_from_cam1"])
 
         options = pycolmap.RANSACOptions()
-        # The Sampson error is a one-sided one over √2 where both sides weigh the same.
+        # The Sampson error is 1/√2 of the one-sided error if both sides have the same weight.
         options.max_error = self.max_error_rad / math.sqrt(2)
         options.max_num_trials = _MAX_TRIALS // _STARTS
         options.min_inlier_ratio = 0.01
@@ -160,17 +164,17 @@ class _Search:
         for number in np.random.SeedSequence(self.seed).generate_state(_STARTS) % 2**31:
             options.random_seed = int(number)
             start = pycolmap.estimate_relative_pose(left, right, options)
-            # COLMAP's choice among the four motions of an essential matrix counts points in front
-            # of both cameras; where rays are nearly parallel that is noise.
+            # COLMAP selects among the four motions of an essential matrix by counting points in
+            # front of both cameras, which is unreliable if rays are nearly parallel.
             twins = [] if start is None else _twins(_motion(start["cam2_from_cam1"]))
             found += [self._refined(twin, refit) for twin in twins]
         return min(found, key=self.cost, default=None)
 
     def rotation(self) -> Motion | None:
-        """The best of rotations through two matches each, refined."""
+        """Return the best rotation among those that fit two matches each, refined."""
         rng = np.random.default_rng(self.seed)
         pairs = rng.integers(0, len(self.left_xyz), (_DRAWS, 2))
-        # A rotation keeps the angle between two directions; those nearly parallel fix no rotation.
+        # A rotation keeps the angle between two directions; parallel ones do not determine it.
         apart = [
             np.linalg.norm(np.diff(rays[pairs], axis=1)[:, 0], axis=-1)
             for rays in (self.left_xyz, self.right_xyz)
@@ -195,13 +199,13 @@ class _Search:
     def _refined(
         self, motion: Motion, refit: Callable[[NDArray[np.bool_], Motion], Motion | None]
     ) -> Motion:
-        """Refit to the inliers as long as that lowers the cost."""
+        """Fit a motion to its inliers again as long as the cost decreases."""
         for _ in range(_REFINEMENTS):
             errors = self.errors(motion)
             fits = errors <= self.max_error_rad
             if fits.sum() < 2 * motion.sample:
                 break
-            # What is far off for this scene is rather a wrong match that fits by chance.
+            # Inliers with errors far above the median are probably wrong matches.
             sigma = 1.4826 * float(np.median(errors[fits]))
             better = refit(errors <= min(self.max_error_rad, 3 * sigma + 1e-9), motion)
             if better is None or self.cost(better) >= self.cost(motion):
@@ -211,7 +215,7 @@ class _Search:
 
 
 def colmap() -> Any:
-    """The module ``pycolmap``.
+    """Import and return the module ``pycolmap``.
 
     Raises:
         SettingError: It is not installed.
@@ -222,14 +226,14 @@ def colmap() -> Any:
 
 
 def rigid_matrix(rotation: Floats, translation: Floats | None) -> Floats:
-    """``(3, 4)`` [R | t] in COLMAP's axes of a motion in those of `tangent_train.geometry`."""
+    """Convert a motion in the axes of `tangent_train.geometry` to COLMAP's ``(3, 4)`` [R | t]."""
     axes = _CAMERA_FROM_PANORAMA
     shift = np.zeros(3) if translation is None else axes @ translation
     return np.column_stack([axes @ rotation @ axes.T, shift])
 
 
 def _motion(cam2_from_cam1: Any) -> Motion:
-    """COLMAP's motion in the axes of `tangent_train.geometry`."""
+    """Convert a motion from COLMAP's axes to those of `tangent_train.geometry`."""
     axes = _CAMERA_FROM_PANORAMA
     translation = axes.T @ cam2_from_cam1.translation
     rotation = axes.T @ cam2_from_cam1.rotation.matrix() @ axes
@@ -237,7 +241,7 @@ def _motion(cam2_from_cam1: Any) -> Motion:
 
 
 def _twins(start: Motion) -> list[Motion]:
-    """The four motions of one essential matrix (Hartley and Zisserman, result 9.19)."""
+    """Return the four motions of an essential matrix (Hartley and Zisserman, result 9.19)."""
     rotation, t = start
     if t is None:
         return [start]
@@ -246,7 +250,7 @@ def _twins(start: Motion) -> list[Motion]:
 
 
 def _rotations(left_xyz: Floats, right_xyz: Floats) -> Floats:
-    """``(..., 3, 3)`` least-squares rotations from left to right (Kabsch)."""
+    """Return ``(..., 3, 3)`` least-squares rotations from left to right (Kabsch)."""
     u, _, vt = np.linalg.svd(np.swapaxes(right_xyz, -1, -2) @ left_xyz)
     u[..., -1] *= np.linalg.det(u @ vt)[..., None]
     rotations: Floats = u @ vt

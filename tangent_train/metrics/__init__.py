@@ -1,4 +1,4 @@
-"""Integer confusion matrices and the scores read from them."""
+"""Confusion matrices of integer counts, and scores computed from them."""
 
 from tangent_train.metrics.segmentation import SegmentationMetric, segmentation_scores
 

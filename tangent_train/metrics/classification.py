@@ -1,4 +1,4 @@
-"""One confusion matrix of whole images over the data set, and the scores read from it."""
+"""Classification: one confusion matrix over the data set, and scores computed from it."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class ClassificationScores(NamedTuple):
     """Scores of one confusion matrix.
 
     Attributes:
-        accuracy: Share of all images that was classified correctly.
-        class_accuracy: Mean of `of_class`, so that every class counts the same.
-        of_class: ``(K,)`` share of a class that was classified correctly; NaN for classes that do
-            not occur, which are left out of the mean.
-        counts: ``(K,)`` images of each class.
+        accuracy: Share of images that were classified correctly.
+        class_accuracy: Mean of `of_class`, in which all classes have the same weight.
+        of_class: ``(K,)`` share of each class's images that were classified correctly; NaN for
+            classes that do not occur, which are left out of the mean.
+        counts: ``(K,)`` number of images of each class.
     """
 
     accuracy: float
@@ -27,13 +27,13 @@ class ClassificationScores(NamedTuple):
 
 
 def classification_scores(confusion: ArrayLike) -> ClassificationScores:
-    """Compute the scores of a whole data set.
+    """Compute classification scores of a whole data set.
 
     Args:
-        confusion: ``(K, K)`` counts, rows truth, columns prediction.
+        confusion: ``(K, K)`` counts; rows are the true classes, columns the predicted ones.
 
     Returns:
-        The scores; NaN where nothing was counted.
+        The scores; NaN without images.
     """
     matrix = np.asarray(confusion, np.int64)
     counts, hits = matrix.sum(axis=1), matrix.diagonal()
@@ -47,9 +47,9 @@ def classification_scores(confusion: ArrayLike) -> ClassificationScores:
 
 
 class ClassificationMetric(MulticlassConfusionMatrix):
-    """The confusion matrix of whole images ``(K, K)``, integer counts summed over processes."""
+    """Counts images in a confusion matrix ``(K, K)``, summed over processes."""
 
     def compute(self) -> NDArray[np.int64]:  # type: ignore[override]
-        """The matrix of all processes: rows truth, columns prediction."""
+        """Return the matrix of all processes; rows are the true classes."""
         counts: NDArray[np.int64] = super().compute().cpu().numpy()
         return counts

@@ -1,4 +1,4 @@
-"""One confusion matrix over the data set, and the scores read from it."""
+"""Segmentation: one confusion matrix over the data set, and scores computed from it."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
 
 AbsentClass = Literal["skip", "zero"]
-"""Treatment of a class without labelled pixels: left out of a mean, or counted as 0."""
+"""Treatment of a class without labeled pixels: left out of means, or counted as 0."""
 
 UNKNOWN = 0
-"""Class index of unlabelled pixels, everywhere."""
+"""Class index of unlabeled pixels in all data sets."""
 
 BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
-"""Latitude bands, from north to south. A row whose centre is on the edge of two bands counts in the
-northern one."""
+"""Edges of the latitude bands, from north to south. A row whose center is on an edge belongs to the
+northern band."""
 
 Interval = tuple[float, float]
 """Lower and upper end of a score, shares of 1."""
@@ -39,8 +39,8 @@ class SegmentationScores(NamedTuple):
         miou: Mean of `iou`.
         macc: Mean of `accuracy`.
         iou: ``(K,)`` intersection over union; NaN for absent classes that are skipped.
-        accuracy: ``(K,)`` share of a class's pixels that were found.
-        share: ``(K,)`` share of the labelled pixels that a class has.
+        accuracy: ``(K,)`` share of each class's pixels that were predicted correctly.
+        share: ``(K,)`` each class's share of the labeled pixels.
     """
 
     miou: float
@@ -63,16 +63,16 @@ class SegmentationScores(NamedTuple):
 def segmentation_scores(
     confusion: ArrayLike, absent_class: AbsentClass = "skip"
 ) -> SegmentationScores:
-    """Compute the scores of a whole data set.
+    """Compute segmentation scores of a whole data set.
 
     Args:
-        confusion: ``(K+1, K+1)`` counts or weights, rows truth, columns prediction, class 0 unknown
-            (pixels without ground truth are ignored).
+        confusion: ``(K+1, K+1)`` counts or weights; rows are the true classes, columns the
+            predicted ones. Class 0 is unknown; pixels of this true class are ignored.
         absent_class: `skip` leaves classes absent from the ground truth out of the means; `zero`
-            counts them as 0, as the released code does.
+            counts them as 0, as the paper's released code does.
 
     Returns:
-        The scores; means are NaN when nothing is labelled and absent classes are skipped.
+        The scores; means are NaN if no pixel is labeled and absent classes are skipped.
     """
     sums = np.stack(_class_sums(np.asarray(confusion, np.float64)))
     iou, accuracy = _class_scores(sums, absent_class)
@@ -83,7 +83,7 @@ def segmentation_scores(
 
 
 def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
-    """Labelled pixels, predicted pixels and hits of each class, of an array or a tensor."""
+    """Return labeled pixels, predicted pixels and hits of each class (array or tensor)."""
     known = confusion[1:]
     return known.sum(1), known[:, 1:].sum(0), known[:, 1:].diagonal()
 
@@ -91,7 +91,7 @@ def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
 def _class_scores(
     sums: NDArray[np.float64], absent_class: AbsentClass
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """IoU and accuracy ``(..., K)`` of sums ``(..., 3, K)``."""
+    """Return IoU and accuracy ``(..., K)``, given the sums ``(..., 3, K)``."""
     truth, predicted, hits = np.moveaxis(sums, -2, 0)
     missing = np.nan if absent_class == "skip" else 0.0
     iou = hits / np.maximum(truth + predicted - hits, 1e-300)
@@ -100,7 +100,7 @@ def _class_scores(
 
 
 def _mean_of_classes(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean of the numbers that are not NaN over the last axis; NaN without one."""
+    """Return the mean over the last axis without NaN; NaN if all values are NaN."""
     count = np.sum(~np.isnan(scores), axis=-1)
     total = np.nansum(scores, axis=-1)
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
@@ -114,18 +114,18 @@ def bootstrap_intervals(
 ) -> dict[str, Interval]:
     """Compute 95 % percentile bootstrap intervals of mIoU and mAcc, with images as the unit.
 
-    Every draw takes as many images as there are, with replacement, and scores them as one data set
-    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The order of the
-    images, and the number of processes that counted them, does not matter.
+    Each draw samples as many images as there are, with replacement, and scores them as one data set
+    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The result does not
+    depend on the order of the images or the number of processes.
 
     Args:
-        of_images: Half of `SegmentationCounts.of_images`: pixels or solid angles.
+        of_images: The half of `SegmentationCounts.of_images` for pixels or for solid angles.
         absent_class: Treatment of classes absent from the ground truth of a draw.
         draws: Number of draws.
         seed: Seed of the draws.
 
     Returns:
-        Intervals of ``miou`` and ``macc``; none of a single image, or where nothing is labelled.
+        Intervals of ``miou`` and ``macc``; empty for a single image, or without labeled pixels.
     """
     count = len(of_images)
     if count <= 1:
@@ -149,14 +149,14 @@ def bootstrap_intervals(
 
 
 class SegmentationCounts(NamedTuple):
-    """Confusion matrices of images; rows truth, columns prediction, class 0 unknown.
+    """Confusion matrices of images; rows are the true classes, class 0 is unknown.
 
     Attributes:
         pixels: ``(K+1, K+1)`` pixels of panoramas and photos.
         solid_angle: ``(K+1, K+1)`` steradians of panoramas; all 0 for photos.
         bands: ``(6, K+1, K+1)`` pixels of panoramas in the latitude bands `BAND_EDGES_DEG`.
-        of_images: ``(images, 2, 3, K)``: of each image, in pixels and in steradians, the labelled
-            and the predicted area and the hits of each class. These are enough for its scores.
+        of_images: ``(images, 2, 3, K)`` sums from which each image's scores follow, in pixels and
+            in steradians: labeled area, predicted area and hits of each class.
     """
 
     pixels: Any
@@ -172,14 +172,14 @@ def count_image(
 
     Args:
         prediction: Class indices.
-        truth: Class indices; unknown (0) does not count.
+        truth: Class indices; pixels with 0 (unknown) are ignored.
         num_classes: K + 1, the unknown class 0 included.
 
     Returns:
-        Counts as tensors.
+        The counts as tensors.
 
     Raises:
-        SettingError: The shapes differ or an index is out of range.
+        SettingError: The shapes differ, or a class index is out of range.
     """
     if prediction.shape != truth.shape:
         raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
@@ -189,10 +189,10 @@ def count_image(
     if truth.ndim == _PANORAMA_DIMENSIONS:
         height, width = truth.shape
         rows = known.nonzero()[:, 0]
-        # Integers first, sums of them after: the same figures in any order, on any device.
+        # Integer counts first, so that results do not depend on the order or the device.
         by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k)
         by_row = by_row.reshape(height, k, k)
-        # In degrees, and divided last: a row on the edge of a band is exactly there.
+        # In degrees, with the division last, so that a row on an edge has no rounding error.
         southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
         band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
         bands.index_add_(0, torch.as_tensor(band_of_row, device=truth.device), by_row)
@@ -208,8 +208,8 @@ def count_image(
 class SegmentationMetric(Metric):
     """Counts the pixels of all images of a data set, see `SegmentationCounts`.
 
-    Pixels are integer counts. Equirectangular pixels over-count the poles; the matrix of solid
-    angles weights each pixel by its own. All counts are summed over processes.
+    Pixels are integer counts. Equirectangular pixels over-count the poles; in the matrix of solid
+    angles each pixel has the weight of its solid angle. Counts are summed over processes.
 
     Args:
         num_classes: K + 1, the unknown class 0 included.
@@ -235,7 +235,7 @@ class SegmentationMetric(Metric):
     def reset(self) -> None:
         """Forget all images."""
         super().reset()
-        # Processes without images join the others with a part of the same type and shape.
+        # Processes without images contribute an empty part of the same dtype and shape.
         shape = (0, 2, 3, self.num_classes - 1)
         self.of_images = [torch.zeros(shape, dtype=torch.float64, device=self.device)]
 

@@ -1,7 +1,7 @@
-"""Equirectangular panoramas to tangent images, or the faces of a cube, and back.
+"""Render equirectangular panoramas to tangent images or cube faces, and back.
 
 NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on any device, labels
-by compiled kernels. The geometry of all of them is `tangent_train.geometry`'s.
+by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
 from tangent_train.rendering.applying import apply

@@ -1,7 +1,7 @@
-"""Adding images to a canvas on the CPU, for labels, feathering and mosaics.
+"""Add images to a canvas on the CPU, for labels, feathering and mosaics.
 
-Nearest and feather are two weightings of the same sum: 1 where an image is the owner, or a weight
-that falls to 0 at its borders.
+The blends `nearest` and `feather` are two weightings of the same sum. With `nearest` an image has
+weight 1 where it is the owner; with `feather` its weight falls to 0 at its borders.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ _NO_TOTAL: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 
 NO_OWNERS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
-"""Feather instead of taking each pixel from its owner."""
+"""Given in place of owners, to feather."""
 
 _IN_MEMORY_BYTES = 2**31
 """Sums of more bytes are kept in a temporary file."""
 
 _SPANS = 2**23
-"""Rows times images whose spans are held at once."""
+"""Spans, one per row and image, that are held at once."""
 
 
 def add_to_canvas(
@@ -48,14 +48,14 @@ def add_to_canvas(
     """Add the weighted scores of some images to rows of a canvas.
 
     Args:
-        scores: ``(n, K, h, w)`` of the images.
+        scores: ``(n, K, h, w)`` scores of the images.
         images: Place of the images on the canvas.
         shape: ``(H, W)`` of the canvas.
-        rows: Rows of it, without a step.
-        owner: ``(rows, W)`` owners, weights are 1 there; or `NO_OWNERS`.
+        rows: Rows of the canvas, without a step.
+        owner: ``(rows, W)`` image that owns each pixel; or `NO_OWNERS`.
         total: Sums of these rows, from `zero_sums`, changed.
-        softmax: True to add probabilities: those of owners are of the interpolated scores,
-            feathered ones are interpolated.
+        softmax: True to add probabilities. With owners, scores are interpolated first; with
+            feathering, probabilities are interpolated.
     """
     for band, inner in _bands(rows, len(scores)):
         geometry = images.geometry(shape, band, owner[inner])
@@ -69,13 +69,13 @@ def label_canvas(
     owner: NDArray[np.integer],
     labels: NDArray[Any],
 ) -> None:
-    """Write the best classes of all pixels that some images own, or see where they are feathered.
+    """Write the best class of each pixel that some images own, or cover if they are feathered.
 
     Args:
-        scores: ``(n, K, h, w)`` of the images; of all images, for feathering.
+        scores: ``(n, K, h, w)`` scores of the images; for feathering all images are needed.
         images: Place of the images on the canvas.
-        owner: ``(H, W)`` owners; or `NO_OWNERS`.
-        labels: ``(H, W)``, changed.
+        owner: ``(H, W)`` image that owns each pixel; or `NO_OWNERS`.
+        labels: ``(H, W)`` class indices, changed.
     """
     height, width = labels.shape
     scores = np.ascontiguousarray(scores)
@@ -90,7 +90,7 @@ def label_canvas(
 
 
 def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
-    """Rows whose spans of all images are held at once, and where they are among these rows."""
+    """Yield bands of rows whose spans are held at once, and the same bands relative to `rows`."""
     step = max(64, _SPANS // max(1, images))
     for start in range(rows.start, rows.stop, step):
         stop = min(rows.stop, start + step)
@@ -100,15 +100,15 @@ def _bands(rows: slice, images: int) -> Iterator[tuple[slice, slice]]:
 def zero_sums(
     shape: tuple[int, int], channels: int, spare: NDArray[np.float32] | None = None
 ) -> NDArray[np.float32]:
-    """Sums of channels, 0; beyond 2 GiB in a temporary file without a name.
+    """Return sums of channels set to 0; beyond 2 GiB they are kept in an unnamed temporary file.
 
     Args:
         shape: ``(H, W)``.
-        channels: K.
-        spare: Sums that are no longer used; clearing them is faster than new memory.
+        channels: Number K of channels.
+        spare: Sums that are no longer used; clearing them is faster than allocating memory.
 
     Returns:
-        ``(H, W, Kp)``, see `kernels`.
+        ``(H, W, Kp)`` sums, see `kernels`.
 
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).
@@ -120,9 +120,9 @@ def zero_sums(
             return np.zeros(whole, np.float32)
         spare[:] = 0
         return spare
-    # The file has no name: it is gone with the array, whatever happens.
+    # The file has no name: the system deletes it with the array, even if the process is killed.
     with tempfile.TemporaryFile() as file:
-        try:  # now: of a full disk the system says nothing later, it ends the process
+        try:  # now: writing to a memory map on a full disk later would kill the process
             reserve(file, nbytes)
         except OSError as error:
             raise SettingError(

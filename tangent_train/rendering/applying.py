@@ -1,4 +1,4 @@
-"""Any function of images, applied to a panorama through its tangent images."""
+"""Apply a function of images to a panorama, through its tangent images."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def apply(
 ) -> Pixels:
     """Apply a function of images to a panorama: scores, depth, features, masks.
 
-    The images are rendered a few at a time, as by `equirect_to_tangent`, and their results are
-    added to the panorama as by `tangent_to_equirect`. What is held besides the result is one call;
-    sums of more than 2 GiB are in a temporary file. Without gradients.
+    The images are rendered a few at a time with `equirect_to_tangent`, and their results are
+    rendered back as with `tangent_to_equirect`. Besides the result, only the images of one call are
+    held in memory. Sums of more than 2 GiB are kept in a temporary file. There are no gradients.
 
     Args:
         function: Maps some images of the panorama's kind and dtype to a result of as many pixels:
@@ -53,15 +53,15 @@ def apply(
         grid: The images.
         blend: Blending of results that are floats, as in `tangent_to_equirect`. Whole numbers and
             booleans (labels, masks) need ``nearest``: each pixel is copied from its owner.
-        images_per_call: Images per call of the function; None for 2^20 pixels' worth.
+        images_per_call: Images per call of the function; None for as many as fit into 2^20 pixels.
 
     Returns:
         An array ``(H, W[, K])``, or a tensor ``(H, W)`` or ``(K, H, W)`` on the panorama's device:
-        float32 of floats, else of the function's dtype.
+        float32 if the function returns floats, else the function's dtype.
 
     Raises:
-        SettingError: The panorama or the blend cannot be used, or the function returns something
-            else.
+        SettingError: The panorama or the blend cannot be used, or the function returns results of
+            another kind or shape.
 
     >>> brightness = lambda images: images.mean(axis=-1)
     >>> from tangent_train.geometry import TangentGrid
@@ -95,7 +95,7 @@ def apply(
     else:
         raise SettingError(
             "blend",
-            found=f"{blend!r} of results of {first.dtype}",
+            found=f"{blend!r} for results of {first.dtype}",
             expected="'nearest': labels and masks cannot be averaged",
             remedy="To average numbers, return them as floats.",
         )
@@ -105,7 +105,7 @@ def apply(
 def _results(
     function: Callable[[Pixels], Pixels], panorama: Pixels, grid: PinholeGrid, step: int
 ) -> Iterator[_Part]:
-    """The results for some images after the other, all of the kind of the first."""
+    """Yield the faces and the results of each call; all must be of the kind of the first."""
     first: Any = None
     for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
         images = equirect_to_tangent(panorama, grid, faces)
@@ -116,7 +116,7 @@ def _results(
             raise SettingError(
                 "result of the function",
                 found=f"K = {kind[0]} of {results.dtype} for some images",
-                expected=f"K = {first[0]} of the first ones' kind of numbers",
+                expected=f"K = {first[0]} and the kind of numbers of the first images",
             )
         yield faces, results
 
@@ -128,10 +128,10 @@ def _mean(
     blend: Blend,
     channels: tuple[int, ...],
 ) -> NDArray[np.float32]:
-    """The blended results ``(H, W, *channels)``, in the memory of their sums."""
+    """Return the blended results ``(H, W, *channels)``, written over their sums."""
     (height, width), count, feather = shape, math.prod(channels), blend == "feather"
     owner = NO_OWNERS if feather else owners(grid, shape)
-    sums = zero_sums(shape, count + feather)  # and of the weights
+    sums = zero_sums(shape, count + feather)  # with feathering, the last channel sums the weights
     for faces, results in parts:
         flat = results.reshape(*results.shape[:3], -1)
         images = np.moveaxis(flat, -1, 1).astype(np.float32)
@@ -147,7 +147,7 @@ def _mean(
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
-    """The result of the function for some images, as ``(n, d, d[, K])`` on the CPU."""
+    """Return the function's result for some images as an array ``(n, d, d[, K])``."""
     kind = Tensor if isinstance(images, Tensor) else np.ndarray
     count, side = len(images), images.shape[-1] if kind is Tensor else images.shape[1]
     found = f"a {type(returned).__name__}"
@@ -170,7 +170,7 @@ def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
 
 
 def _like(panorama: Any, array: NDArray[Any]) -> Any:
-    """The result ``(H, W[, K])`` as an array, or as a tensor where the panorama is one."""
+    """Return the result ``(H, W[, K])`` as an array, or as a tensor if the panorama is a tensor."""
     if not isinstance(panorama, Tensor):
         return array
     result = torch.from_numpy(array)

@@ -1,4 +1,4 @@
-"""Rendering tangent images back to the panorama."""
+"""Render tangent images back to the panorama."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from tangent_train.rendering.sampling import (
 from tangent_train.rendering.tables import image_table, owners, tensors_on
 
 _BAND = 2**20
-"""Pixels whose taps or sums are held at once."""
+"""Number of pixels whose taps or sums are held at once."""
 
 
 def tangent_to_equirect(
@@ -50,10 +50,10 @@ def tangent_to_equirect(
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
         blend: ``nearest``: every direction is taken from its owner. ``feather``: the average of
-            all images that see it, weights falling to 0 at the images' borders: no seams; see
-            `blend_of` for images that do not overlap.
-        interpolation: ``bilinear``, or ``nearest`` for labels, masks and depth of any dtype: the
-            owner's pixel whose center is nearest, kept exactly. Only with the blend ``nearest``.
+            all images that cover it, with weights that fall to 0 at the images' borders, so that
+            there are no seams. See `blend_of` for images that do not overlap.
+        interpolation: ``bilinear``; or ``nearest`` for labels, masks and depth of any dtype, which
+            copies the nearest pixel of the owner and needs the blend ``nearest``.
 
     Returns:
         A tensor ``(..., C, H, W)`` or an array ``(H, W[, C])``, of the dtype of the images.
@@ -68,7 +68,7 @@ def tangent_to_equirect(
     if isinstance(images, np.ndarray):
         return _from_arrays(images, grid, shape, blend, interpolation)
     flat = images.movedim(-4, -3).reshape(-1, grid.num_images * grid.dim**2)
-    # Positions are float32 for all dtypes where the nearest pixel is taken, so that all take one.
+    # For the nearest pixel all dtypes use float32 positions, so that all take the same pixel.
     dtype = map_dtype(images.dtype == torch.float64, interpolation)
     bands = []
     for face, u, v, weight in _bands(images.device, grid, shape, blend, dtype):
@@ -83,22 +83,23 @@ def tangent_to_equirect(
 def tangent_to_labels(
     logits: Pixels, grid: PinholeGrid, shape: tuple[int, int], blend: Blend = "nearest"
 ) -> Pixels:
-    """Class of the largest bilinear score at every pixel of the panorama.
+    """Return the class of the largest bilinear score at every pixel of the panorama.
 
-    Rendering and argmax are one step: the scores of the panorama, ``(K, H, W)``, are never held. On
-    the CPU a compiled kernel works in float32; float64 scores and those on a GPU are rendered by
-    torch.
+    Rendering and argmax are one step, so the scores of the panorama, ``(K, H, W)``, are not held in
+    memory. On the CPU a compiled kernel works in float32; float64 scores and scores on a GPU are
+    rendered by torch.
 
     Args:
         logits: ``(..., N, K, d, d)`` floating-point scores of all images of the grid.
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
-        blend: ``nearest``: the owner's scores. ``feather``: the average of all images that see a
-            direction, weighted as in `tangent_to_equirect`; meant for softmax scores.
+        blend: ``nearest``: the owner's scores. ``feather``: the average of all images that cover a
+            direction, weighted as in `tangent_to_equirect`; meant for probabilities.
 
     Returns:
-        ``(..., H, W)`` class indices; of equal scores the first class, and NaN never wins. An int64
-        tensor on the device of the logits, or an array, uint8 up to 256 classes and uint16 above.
+        ``(..., H, W)`` class indices. The first of several equal scores wins, and NaN is ignored.
+        An int64 tensor on the device of the logits, or an array, uint8 up to 256 classes and uint16
+        above.
 
     Raises:
         SettingError: The logits, the shape or the blend cannot be used.
@@ -124,7 +125,7 @@ def tangent_to_labels(
 
 
 def _tensor(array: NDArray[np.generic]) -> Tensor:
-    """A tensor of the same memory; torch warns about arrays that may not be written."""
+    """Return a tensor that shares the array's memory, or a copy if the array is read-only."""
     array = np.ascontiguousarray(array)
     return torch.from_numpy(array if array.flags.writeable else array.copy())
 
@@ -136,7 +137,7 @@ def _from_arrays(
     blend: Blend,
     interpolation: Interpolation,
 ) -> NDArray[Any]:
-    """`tangent_to_equirect` of arrays ``(N, d, d[, C])``; integers are rounded."""
+    """Run `tangent_to_equirect` on arrays ``(N, d, d[, C])``; integer results are rounded."""
     if interpolation == "nearest":
         pixels = images.reshape(-1, *images.shape[3:])
         bands = _bands(torch.device("cpu"), grid, shape, blend, np.dtype(np.float32))
@@ -157,7 +158,7 @@ def _from_arrays(
 def _feathered(
     images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """``(H, W, C)`` average of ``(N, C, d, d)`` images; the sum of the weights is that of ones."""
+    """Feather ``(N, C, d, d)`` images to ``(H, W, C)``; a channel of ones sums the weights."""
     channels, step = images.shape[1], max(1, _BAND // shape[1])
     with_ones = np.ascontiguousarray(np.concatenate([images, np.ones_like(images[:, :1])], axis=1))
     panorama = np.empty((*shape, channels), np.float32)
@@ -177,12 +178,12 @@ def _bands(
     blend: Blend,
     dtype: np.dtype[np.floating],
 ) -> Iterator[tuple[Tensor, ...]]:
-    """Images, columns and rows in them and weights ``(R, pixels)``, bands of rows at a time."""
+    """Yield a table for each band of rows: images, columns, rows and weights ``(R, pixels)``."""
     height, width = shape
     step = max(1, min(height, _BAND // width))
     for start in range(0, height, step):
         rows = slice(start, min(height, start + step))
-        # Tables of feathering are large: those of many bands are not kept.
+        # Feathering needs large tables: if there are several bands, they are not cached.
         kept = blend == "nearest" or step == height
         key = (blend, shape, dtype, rows.start, rows.stop) if kept else None
         build = partial(image_table, grid, shape, dtype, blend, rows)
@@ -193,7 +194,7 @@ def _bands(
 def _torch_labels(
     scores: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, labels: Tensor
 ) -> None:
-    """Labels ``(H W,)`` of ``(N, K, d, d)`` scores of any device and dtype, class by class."""
+    """Write labels ``(H W,)`` of ``(N, K, d, d)`` scores of any device and dtype, by class."""
     num_classes, size = scores.shape[1], grid.dim**2
     flat = scores.reshape(1, -1)
     dtype = map_dtype(scores.dtype == torch.float64, "bilinear")

@@ -1,7 +1,7 @@
-"""The cameras of tangent images as files: ``cameras.json``, and COLMAP's ``rig_config.json``.
+"""Files with the cameras of tangent images: ``cameras.json``, and COLMAP's ``rig_config.json``.
 
-Their world is an ordinary right-handed one: x forward (to the middle column of the panorama),
-y left, z up. `FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
+Their world frame is right-handed: x forward (to the middle column of the panorama), y left, z up.
+`FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_ro
 from tangent_train.registry import Text, check_fields
 
 CAMERAS_FILE = "cameras.json"
-"""The name of the file in a folder of tangent images."""
+"""Name of the file in a folder of tangent images."""
 
 RIG_FILE = "rig_config.json"
-"""The name of the file in a project for COLMAP."""
+"""Name of the file in a COLMAP project."""
 
 _FORMAT = "tangent images"
-_MOST_PIXELS = 2**20  # rows and columns of a panorama, which may be made of this size
+_MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
 _CONVENTIONS = {
-    "pixels": "Pixel centres are whole numbers: (0, 0) is the centre of the upper left pixel, "
+    "pixels": "Pixel centers are whole numbers: (0, 0) is the center of the upper left pixel, "
     "columns count to the right, rows down. matrix (K) takes camera coordinates to (column, row). "
     "For programs that count from pixel corners, add 0.5 to the principal point.",
     "camera_axes": "x right, y down, z forward.",
-    "world_axes": "Right-handed, at the centre of the panorama: x forward, to the middle column of "
+    "world_axes": "Right-handed, at the center of the panorama: x forward, to the middle column of "
     "the panorama; y left, a quarter of the width to the left of it; z up, to the top row.",
     "world_from_camera": "Rotation matrix by rows, determinant +1: a direction d of the camera is "
     "world_from_camera · d in the world. All cameras stand at the origin.",
-    "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null for "
-    "none.",
+    "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null if it "
+    "is not rotated.",
     "fov_deg": "Angle across the middle of an image, from edge to edge.",
 }
 _POSES = {
@@ -48,10 +48,10 @@ _POSES = {
     "z to the top row.",
     "world_from_panorama": "Rotation matrix by rows, determinant +1: the point seen at distance r "
     "in direction d of the panorama is location + r · world_from_panorama · d.",
-    "location": "Centre of the panorama, in the world and the units of COLMAP's model.",
+    "location": "Center of the panorama, in the world and the units of COLMAP's model.",
 }
 _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
-"""Rows of matrices, which are easier to read on one line."""
+"""Matches lists of numbers, which are written on one line."""
 
 _EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
 _KINDS: dict[str, Any] = {
@@ -72,9 +72,9 @@ class CameraFile:
     Attributes:
         source: Name of the panorama.
         shape: ``(H, W)`` of the panorama.
-        grid: The geometry of all images.
-        faces: Indices of its images.
-        files: The files' names, one for each face.
+        grid: Geometry of all images.
+        faces: Indices of the images that have a file.
+        files: File name of each face.
     """
 
     source: str
@@ -88,8 +88,8 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
     """Write a ``cameras.json``.
 
     Args:
-        path: The file.
-        cameras: Its content; its ``conventions`` define the fields.
+        path: File to write.
+        cameras: Content of the file. Its section ``conventions`` explains the fields.
     """
     grid = cameras.grid
     rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
@@ -124,12 +124,12 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
 
 
 def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:
-    """``(3, 3)`` proper rotation from camera axes to the right-handed world of the files."""
+    """Return the ``(3, 3)`` rotation from camera axes to the right-handed world of the files."""
     return np.asarray(FLIP_Y @ grid.world_from_camera[face])
 
 
 def _in_world(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation of the library's frame in the right-handed world, or back."""
+    """Convert a rotation between the library's frame and the right-handed world, either way."""
     return np.asarray(FLIP_Y @ rotation @ FLIP_Y)
 
 
@@ -137,10 +137,10 @@ def read_cameras(path: Path) -> CameraFile:
     """Read a ``cameras.json``.
 
     Args:
-        path: The file.
+        path: File to read.
 
     Raises:
-        DataError: It is missing, or cannot be what `write_cameras` wrote.
+        DataError: The file is missing, or its content is not valid.
     """
     try:
         content = parse_json(path.read_bytes())
@@ -159,9 +159,9 @@ def read_cameras(path: Path) -> CameraFile:
         raise DataError(path, found="an image twice", expected=_EXPECTED)
     try:
         rotation = fields["icosahedron_rotation"]
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are no rotation
-            turn = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
-            grid = TangentGrid(fields["base_level"], fields["level"], fields["dim"], turn)
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
+            in_world = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
+            grid = TangentGrid(fields["base_level"], fields["level"], fields["dim"], in_world)
         grid.face_indices(faces)
     except (ValueError, OverflowError) as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
@@ -173,9 +173,9 @@ class RigFile:
     """Content of a ``rig_config.json``: the images of a panorama as a rig of cameras, for COLMAP.
 
     Attributes:
-        world_from_camera: ``(3, 3)`` rotation of each camera by the prefix of its images' names,
-            ``face_000/``, in the world of `write_cameras`. The first is COLMAP's reference.
-        panoramas: Files of panoramas by what follows the prefix: ``room.png``.
+        world_from_camera: ``(3, 3)`` rotation of each camera in the world of `write_cameras`, by
+            the prefix of its images' names (``face_000/``). The first is COLMAP's reference.
+        panoramas: File of each panorama, by the rest of its images' names (``room.png``).
     """
 
     world_from_camera: Mapping[str, NDArray[np.float64]]
@@ -183,7 +183,7 @@ class RigFile:
 
     @property
     def images(self) -> list[str]:
-        """Names of all images, as COLMAP has them."""
+        """Names of all images, as in COLMAP."""
         return [prefix + name for prefix in self.world_from_camera for name in self.panoramas]
 
 
@@ -192,12 +192,12 @@ def write_rig(
 ) -> None:
     """Write a ``rig_config.json`` for COLMAP 3.12 or later.
 
-    All cameras are PINHOLE, their centre is counted from pixel corners, and none is moved. COLMAP
-    passes over the fields of `RigFile` that are not its own.
+    All cameras have COLMAP's model PINHOLE and the same center; principal points are counted from
+    pixel corners. COLMAP ignores the fields ``world_from_camera`` and ``panoramas``.
 
     Args:
-        path: The file.
-        grid: The images.
+        path: File to write.
+        grid: Geometry of the images.
         faces: Index of the image of each camera, by prefix.
         panoramas: See `RigFile`.
     """
@@ -208,9 +208,9 @@ def write_rig(
     cameras: list[dict[str, Any]] = []
     for prefix, face in faces.items():
         axes = _world_from_camera(grid, face)
-        turn = Rotation.from_matrix(axes.T @ reference)
+        from_rig = Rotation.from_matrix(axes.T @ reference)
         of_rig = {
-            "cam_from_rig_rotation": turn.as_quat(canonical=True, scalar_first=True).tolist(),
+            "cam_from_rig_rotation": from_rig.as_quat(canonical=True, scalar_first=True).tolist(),
             "cam_from_rig_translation": (0, 0, 0),
         }
         cameras.append(
@@ -226,14 +226,14 @@ def write_rig(
 
 
 def read_rig(path: Path) -> RigFile:
-    """Read what `write_rig` wrote.
+    """Read a ``rig_config.json`` that `write_rig` wrote.
 
     Raises:
-        DataError: It is missing, or is another.
+        DataError: The file is missing, or another program wrote it.
     """
     try:
         (rig,) = parse_json(path.read_bytes())
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are no rotation
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
             axes = {
                 str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])
                 for camera in rig["cameras"]
@@ -248,11 +248,11 @@ def read_rig(path: Path) -> RigFile:
 
 
 def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
-    """Write poses of panoramas in a right-handed world as JSON; ``conventions`` defines its fields.
+    """Write poses of panoramas in a right-handed world as JSON.
 
     Args:
-        path: The file.
-        poses: By file of the panorama.
+        path: File to write. Its section ``conventions`` explains the fields.
+        poses: Pose of each panorama, by its file.
     """
     panoramas = [
         {

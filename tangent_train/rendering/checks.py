@@ -15,34 +15,34 @@ from tangent_train.geometry import PinholeGrid
 
 Blend = Literal["nearest", "feather"]
 """``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
-images that see a pixel, with weights that fall to 0 at the borders of the images."""
+images that cover a pixel, with weights that fall to 0 at the borders of the images."""
 
 _MOST_COLORS = 4
-"""Channels of an image of colours."""
+"""Largest number of channels of a color image."""
 
 _COLOR_DIMENSIONS = 3
 
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
-    """Raise SettingError unless the interpolation is known and goes with the blend."""
+    """Raise SettingError unless the interpolation exists and can be combined with the blend."""
     check_choice("interpolation", interpolation, ("bilinear", "nearest"))
     if interpolation == "nearest" and blend != "nearest":
         raise SettingError(
             "interpolation",
             found=f"'nearest' with blend {blend!r}",
             expected="blend='nearest'",
-            remedy="Pixels that are copied cannot be averaged.",
+            remedy="Copied pixels cannot be averaged.",
         )
 
 
 def blend_of(blend: Blend, *, overlapping: bool) -> Blend:
-    """The blend of images: images that do not overlap have nothing to feather.
+    """Return the blend, or ``nearest`` for images that do not overlap.
 
-    Feather weights are 0 on the edges where such images meet: the faces of a cube map without a
-    margin, or the panorama itself. Each pixel is taken from the image that owns it.
+    Images without overlap meet at their edges, where feather weights are 0: the faces of a cube map
+    without a margin, and the panorama itself.
 
     Args:
-        blend: The wanted blend.
+        blend: Requested blend.
         overlapping: True if every pixel is inside an image, not only on its outer edge.
 
     Raises:
@@ -53,13 +53,13 @@ def blend_of(blend: Blend, *, overlapping: bool) -> Blend:
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise SettingError unless a word is one of those allowed."""
+    """Raise SettingError unless a value is one of those allowed."""
     if value not in allowed:
         raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
 
 
 def check_shape(shape: Sequence[int]) -> tuple[int, int]:
-    """``(H, W)`` as two positive integers, or SettingError."""
+    """Return ``(H, W)`` as two integers; raise SettingError unless both are positive."""
     whole = [isinstance(side, int | np.integer) and side > 0 for side in shape]
     if len(whole) != 2 or not all(whole):
         raise SettingError("shape", found=tuple(shape), expected="(height, width), both 1 or more")
@@ -79,21 +79,20 @@ def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> N
 
 
 def _check_layout(image: Tensor | NDArray[np.generic]) -> None:
-    """Raise SettingError where the channels are certainly at the wrong end.
+    """Raise SettingError if the channels are certainly on the wrong axis.
 
-    They would be taken for columns, and the columns for channels: of a panorama of 2048 × 4096
-    pixels, gigabytes.
+    Rows or columns taken for channels need gigabytes for a panorama of 2048 × 4096 pixels.
     """
     if isinstance(image, Tensor):
         wrong = image.shape[-1] <= _MOST_COLORS < image.shape[-2]
         found, expected = "a tensor", "(..., C, H, W), channels before rows and columns"
-        remedy = "Of (H, W, C), .permute(2, 0, 1) makes (C, H, W)."
+        remedy = ".permute(2, 0, 1) turns (H, W, C) into (C, H, W)."
     else:
         channels, height, width = image.shape if image.ndim == _COLOR_DIMENSIONS else (0, 0, 0)
-        tiny = height == 2 * channels  # perhaps a panorama of so few rows, with many channels
+        tiny = height == 2 * channels  # may also be a panorama of 1 to 4 rows with many channels
         wrong = channels <= _MOST_COLORS < height and width == 2 * height and not tiny
         found, expected = "an array", "(H, W) or (H, W, C), channels last"
-        remedy = "Of (C, H, W), .transpose(1, 2, 0) makes (H, W, C)."
+        remedy = ".transpose(1, 2, 0) turns (C, H, W) into (H, W, C)."
     if wrong:
         shape = tuple(image.shape)
         raise SettingError(
@@ -107,13 +106,13 @@ def check_images(
     grid: PinholeGrid,
     interpolation: str = "bilinear",
 ) -> None:
-    """Raise SettingError unless images are all of a grid.
+    """Raise SettingError unless there is an image of the right size for each face of a grid.
 
     Args:
-        name: Their name, for the message.
+        name: Name of the images in the message.
         images: Tensor ``(..., N, C, d, d)`` or array ``(N, d, d[, C])``.
-        grid: Their geometry.
-        interpolation: Interpolation they will be sampled with.
+        grid: Geometry of the images.
+        interpolation: Interpolation that will be used to sample them.
     """
     shape, sides = tuple(images.shape), (grid.num_images, grid.dim, grid.dim)
     if isinstance(images, np.ndarray):

@@ -1,12 +1,12 @@
-"""Loops that numba compiles, and the threads they run on.
+"""Compile loops with numba, and run them on several threads.
 
 Compiled loops are serial and release the GIL; `over_rows` runs them on several threads. Numba's own
-parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, its
-portable layer dies when two threads use it at once.
+parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, and
+its portable layer crashes when two threads use it at once.
 
-Compiled code is cached in a folder of the user that is named after the content of its source file,
-so a loop must not call compiled functions of another file. The cache holds pickles: the folder has
-to be private. Without one, loops are compiled in every process.
+Compiled code is cached in a folder named after a checksum of its source file, so a loop must not
+call compiled functions of another file. The cache contains pickles, so only the user may have
+access to the folder. If that cannot be ensured, loops are compiled in every process.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ config._config_fname = ""  # numba would read .numba_config.yaml here at every c
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SMALLEST_SHARE = 2**15
-"""Pixels for which starting a thread pays."""
+"""Number of pixels from which another thread saves time."""
 
 
 class _Restrict(Compiler):  # type: ignore[misc]
-    """Compiles as C does with ``restrict``: arrays that are written overlap no other argument.
+    """A compiler that assumes, like ``restrict`` in C, that arguments do not overlap in memory.
 
-    Without it, a loop over the scores of one pixel takes longer to check that than to add them.
+    Otherwise a loop over the scores of one pixel spends more time on checking than on adding.
     """
 
     def define_pipelines(self) -> list[Any]:
@@ -47,10 +47,10 @@ class _Restrict(Compiler):  # type: ignore[misc]
 
 
 def cache_folder() -> Path | None:
-    """The folder for compiled code, in ``NUMBA_CACHE_DIR`` or else in the user's cache.
+    """Return the folder for compiled code, in ``NUMBA_CACHE_DIR`` or else in the user's cache.
 
     Returns:
-        None if it cannot be written to, or other users have access to it.
+        The folder; None if it cannot be written, or if other users have access to it.
     """
     with suppress(OSError, RuntimeError):  # no home
         users = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
@@ -82,7 +82,7 @@ def njit_fast(function: Function) -> Function:
 def _compiled(function: Function, **settings: Any) -> Function:
     loop = njit(nogil=True, error_model="numpy", **settings)(function)
     if _CACHE is not None:
-        # Numba unpickles the code of another version before it finds that it is outdated.
+        # A folder for each version of the file: numba unpickles outdated code before it checks it.
         source = Path(function.__code__.co_filename).read_bytes()
         users, config.CACHE_DIR = config.CACHE_DIR, str(_CACHE / f"{crc32(source):08x}")
         loop.enable_caching()
@@ -91,22 +91,23 @@ def _compiled(function: Function, **settings: Any) -> Function:
 
 
 def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: Any) -> None:
-    """Run ``kernel(start, stop, *arguments)`` over all rows, in parallel blocks.
+    """Run ``kernel(start, stop, *arguments)`` on blocks of rows, in parallel.
 
-    Uses as many threads as torch would (`torch.get_num_threads`: one inside a `DataLoader` worker),
-    and none for little work. They end with the call, so processes may fork before and after.
+    Uses as many threads as torch (`torch.get_num_threads`, which is 1 in a `DataLoader` worker),
+    and no threads for small images. The threads end with the call, so that processes may fork
+    before and after it.
 
     Args:
         kernel: A compiled function that releases the GIL.
         rows: Number of rows.
         width: Pixels in a row.
-        *arguments: What the kernel takes besides the rows.
+        *arguments: Other arguments of the kernel.
     """
     threads = min(torch.get_num_threads(), rows, rows * width // _SMALLEST_SHARE)
     if threads <= 1:
         kernel(0, rows, *arguments)
         return
-    # Several blocks per thread: rows near the poles take longer or shorter than others.
+    # Several blocks per thread, because rows near the poles do not take as long as others.
     blocks = min(8 * threads, rows)
     edges = [rows * block // blocks for block in range(blocks + 1)]
     with ThreadPoolExecutor(threads) as pool:

@@ -1,7 +1,7 @@
 """Class scores of a canvas, accumulated by torch on any device.
 
-The same sums as in `kernels`, but the scores of a class lie beside each other: ``(K, H, W)``. What
-an image covers of the canvas is a few rectangles, and every rectangle is sampled in one call.
+The same sums as in `kernels`, but with the classes first: ``(K, H, W)``. Each image covers a few
+rectangles of the canvas, and each rectangle is sampled in one call.
 """
 
 from __future__ import annotations
@@ -23,20 +23,20 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Views
 
 _SCORES_AT_ONCE = 2**25
-"""Scores that are sampled in one call, 128 MiB."""
+"""Number of scores sampled in one call, 128 MiB."""
 
 _PIXELS_AT_ONCE = 2**20
-"""Pixels of sums whose classes are compared at once."""
+"""Number of pixels whose best class is determined at once."""
 
 _SHARE = 4
-"""Sums take this part of the memory of a GPU at most."""
+"""On a GPU, sums take at most a quarter of the memory."""
 
 _BYTES = 2**33
-"""Sums take as many bytes at most on other devices."""
+"""On other devices, sums take at most 8 GiB."""
 
 
 def fits_on(device: torch.device | str, shape: tuple[int, int], num_classes: int) -> bool:
-    """True if sums of a canvas leave most of the memory of a device to the network."""
+    """Return True if the sums of a canvas leave most of a device's memory to the network."""
     limit = _BYTES
     if torch.device(device).type == "cuda" and torch.cuda.is_available():
         limit = torch.cuda.get_device_properties(device).total_memory // _SHARE
@@ -50,10 +50,10 @@ class DeviceSums:
         shape: ``(H, W)`` of the canvas.
         num_classes: K.
         device: A torch device.
-        averaged: True to keep sums; False to keep labels only.
+        averaged: True to keep sums; False to keep only labels.
 
     Attributes:
-        sums: ``(K, H, W)`` float32; ``(0, H, W)`` where they are not kept.
+        sums: ``(K, H, W)`` float32; ``(0, H, W)`` if they are not kept.
     """
 
     def __init__(
@@ -77,7 +77,7 @@ class DeviceSums:
         Args:
             scores: ``(n, K, h, w)`` float32 scores, on the device.
             images: Place of the images on the canvas.
-            owner: ``(H, W)`` owners; None for feathering.
+            owner: ``(H, W)`` image that owns each pixel; None for feathering.
         """
         height, _ = self._shape
         geometry = images.geometry(self._shape, slice(0, height), np.empty((0, 0), np.uint8))
@@ -109,7 +109,7 @@ class DeviceSums:
                     labels.copy_(best.where(is_owner, labels))
 
     def labels(self, min_confidence: float) -> Tensor:
-        """``(H, W)`` indices of the best classes; K where the best is less probable."""
+        """Return ``(H, W)`` indices of the best classes; K where the confidence is too low."""
         if self._averaged:
             step = max(1, _PIXELS_AT_ONCE // self._shape[1])
             for start in range(0, self._shape[0], step):
@@ -123,11 +123,11 @@ class DeviceSums:
 
 
 def _offsets_in(canvas: CanvasGeometry, scores: Tensor) -> Callable[[int, slice, slice], Tensor]:
-    """Positions of pixels of a canvas in images ``(n, K, h, w)``.
+    """Return a function for the positions of canvas pixels in images ``(n, K, h, w)``.
 
     Returns:
-        A function of an image, rows and columns that gives ``(2, rows, columns)`` offsets from the
-        center of the image in half image sides; 2 where it looks away.
+        A function of an image, rows and columns. It returns ``(2, rows, columns)`` offsets from the
+        center of the image in half image sides, and 2 for directions behind the image.
     """
     device, (height, width) = scores.device, scores.shape[-2:]
     dtype = torch.float32 if device.type == "mps" else torch.float64
@@ -149,25 +149,25 @@ def _offsets_in(canvas: CanvasGeometry, scores: Tensor) -> Callable[[int, slice,
 
 
 def _boxes(spans: NDArray[np.int32], width: int, num_classes: int) -> Iterator[tuple[slice, slice]]:
-    """Rows and columns of rectangles that contain spans of an image.
+    """Yield rows and columns of rectangles that contain the spans of an image.
 
     Args:
-        spans: ``(H, 2)`` see `CanvasGeometry`.
-        width: Columns of the canvas.
+        spans: ``(H, 2)`` spans, see `CanvasGeometry`.
+        width: Number of columns of the canvas.
         num_classes: K.
     """
     seen = np.flatnonzero(spans[:, 1])
     if not len(seen):
         return
     rows = np.arange(seen[0], seen[-1] + 1)
-    # All around the sphere in some rows near a pole: bands of about as many columns.
+    # Near a pole an image may span all columns: bands of rows keep the rectangles tight.
     step = max(1, min(-(-len(rows) // 4), _SCORES_AT_ONCE // (num_classes * width)))
     for band in np.split(rows, range(step, len(rows), step)):
         inside = spans[band][spans[band, 1] > 0]
         if not len(inside):
             continue
         first = inside[:, 0].astype(int)
-        # Relative to one of them: other rows may begin on the other side of the seam.
+        # Relative to the first row, because other rows may begin on the other side of the seam.
         before = (first - first[0] + width // 2) % width - width // 2
         start, stop = int(before.min()), int((before + inside[:, 1]).max())
         start, count = int(first[0]) + start, min(stop - start, width)
@@ -183,5 +183,5 @@ def _without_nan(scores: Tensor) -> Tensor:
 
 
 def _softmax(scores: Tensor) -> Tensor:
-    """Softmax over the classes of ``(n, K, h, w)``; scores that are not numbers have none."""
+    """Return the softmax over the classes of ``(n, K, h, w)``; NaN gets probability 0."""
     return _without_nan(scores).softmax(dim=1).nan_to_num_(0.0)

@@ -1,4 +1,4 @@
-"""Rendering panoramas to tangent images, and to rotated panoramas."""
+"""Render panoramas to tangent images, and to rotated panoramas."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from tangent_train.rendering.tables import forward_map, forward_positions, tenso
 Interpolation = Literal["bilinear", "nearest"]
 
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
-"""Tensors are rendered to tensors, arrays to arrays."""
+"""A tensor or an array; results are of the same kind."""
 
 _CHUNK = 2**20
-"""Positions whose taps torch holds at once."""
+"""Number of positions whose taps torch holds at once."""
 
 _TOGETHER = 2**16
-"""Pixels of small images that are sampled in one call: to call for each takes longer than that."""
+"""Number of pixels sampled in one call: small images are grouped, to save calls."""
 
 
 def equirect_to_tangent(
@@ -45,15 +45,15 @@ def equirect_to_tangent(
 ) -> Pixels:
     """Render tangent images from a panorama (paper, section 3.2).
 
-    Longitude wraps and rows reflect at the poles, for every interpolation. A panorama that is not
-    twice as wide as high is treated as the whole sphere, stretched.
+    Longitude wraps and rows reflect at the poles, for every interpolation. A panorama of another
+    aspect ratio than 2:1 is treated as a stretched image of the whole sphere.
 
     Args:
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
-            ``(H, W[, C])``: uint8, uint16 and float32 go through `cv2.remap` (see `sample_map`
-            about its precision), other dtypes are slower.
-        grid: The images, a `TangentGrid` or a `CubeGrid`.
-        faces: Images to render, default all.
+            ``(H, W[, C])``: uint8, uint16 and float32 are sampled by `cv2.remap` (see `sample_map`
+            for its precision), other dtypes are slower.
+        grid: Geometry of the images, a `TangentGrid` or a `CubeGrid`.
+        faces: Indices of the images to render, by default all.
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
 
     Returns:
@@ -64,7 +64,7 @@ def equirect_to_tangent(
     """
     check_panorama(image, interpolation)
     indices = grid.face_indices(faces)
-    # Of random subsets the tables of single images are kept.
+    # For random subsets of images, tables are cached per image: subsets rarely repeat.
     together = faces is None or grid.rotation is not None
     pixels = _CHUNK if isinstance(image, Tensor) else _TOGETHER
     step = max(1, pixels // max(grid.dim**2, 4 * grid.dim)) if together else 1
@@ -94,7 +94,7 @@ def _render_tensor(
     chunks = [image.new_empty((*batch, 0, channels, grid.dim, grid.dim))]
     for start in range(0, len(indices), step):
         faces = tuple(indices[start : start + step].tolist())
-        # On the CPU the map itself is kept already.
+        # On the CPU the map itself is already cached.
         key = None if image.device.type == "cpu" else ("forward", (height, width), faces, dtype)
         build = partial(forward_positions, grid, (height, width), faces, dtype)
         u, v = tensors_on(image.device, grid, key, build)
@@ -107,7 +107,7 @@ def _render_tensor(
 def _sampled(
     source: Tensor, u: Tensor, v: Tensor, shape: tuple[int, int], interpolation: Interpolation
 ) -> Tensor:
-    """``(S, P)`` of a source ``(S, H W)`` at P columns and rows."""
+    """Return values ``(S, P)`` of a source ``(S, H W)`` at P columns and rows."""
     if interpolation == "nearest":
         index = nearest_equirect_index(u, v, shape)
         return source.gather(1, index.expand(len(source), -1))
@@ -120,13 +120,13 @@ def rotate_equirect(
     """Rotate a panorama: direction d of the result shows the input at Rᵀd.
 
     Args:
-        image: An array ``(H, W[, C])`` or a tensor ``(..., C, H, W)``, as `equirect_to_tangent`
-            takes it.
+        image: An array ``(H, W[, C])`` or a tensor ``(..., C, H, W)``, as for
+            `equirect_to_tangent`.
         rotation: ``(3, 3)`` rotation R.
         interpolation: ``bilinear`` or ``nearest``.
 
     Returns:
-        Same shape and dtype.
+        The rotated panorama, of the same shape and dtype.
 
     Raises:
         SettingError: The panorama, the rotation or the interpolation cannot be used.
@@ -136,8 +136,8 @@ def rotate_equirect(
     if isinstance(image, Tensor):
         shape = image.shape[-2], image.shape[-1]
         dtype = map_dtype(image.dtype == torch.float64, interpolation)
-        places = _rotation_map(rotated, shape, dtype).in_panorama()
-        on_device = (torch.from_numpy(line).to(image.device) for line in places)
+        positions = _rotation_map(rotated, shape, dtype).in_panorama()
+        on_device = (torch.from_numpy(line).to(image.device) for line in positions)
         u, v = (torch.split(line, _CHUNK) for line in on_device)
         source = image.reshape(-1, shape[0] * shape[1])
         parts = [_sampled(source, *at, shape, interpolation) for at in zip(u, v, strict=True)]
@@ -153,6 +153,6 @@ def rotate_equirect(
 def _rotation_map(
     rotation: bytes, shape: tuple[int, int], dtype: np.dtype[np.floating]
 ) -> EquirectMap:
-    """Source positions of all directions; kept for the other parts of the same panorama."""
+    """Return source positions of all pixels; cached for the depth and labels of a panorama."""
     inverse = np.frombuffer(rotation).reshape(1, 3, 3).transpose(0, 2, 1)
     return equirect_map(inverse, sphere_rays(shape), shape, dtype)

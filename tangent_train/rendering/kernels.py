@@ -1,11 +1,12 @@
 """Compiled loops that add images to a canvas.
 
-A *canvas* is what images are put together on: a panorama, or a photo made of crops. Its pixels
-look along `sampling.Rays`. An image sees a ray at its pixel (u, v) where ``(u, v, 1)`` is
-proportional to its ``(3, 3)`` matrix times the ray, if the third number is positive.
+A *canvas* is the image on which other images are combined: a panorama, or a photo made of crops.
+Its pixels have the rays of `sampling.Rays`. A ``(3, 3)`` matrix of each image maps rays to its
+homogeneous pixels, proportional to ``(u, v, 1)``; a ray is in front of the image if the third
+number is positive.
 
-Sums are arrays ``(H, W, Kp)``: the scores of a pixel lie beside each other, K of them and zeros up
-to a multiple of `LANES`, which compiles to vector code without a rest.
+Sums are arrays ``(H, W, Kp)``: the K scores of a pixel are adjacent in memory, followed by zeros up
+to a multiple of `LANES`, so that loops over them compile to vector code without a remainder.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from numpy.typing import NDArray
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
 LANES = 16
-"""The number of scores of a pixel is a multiple of this."""
+"""Kp, the number of scores stored per pixel, is a multiple of this."""
 
 _TILE_SCORES = 2**18
-"""Sums of what is added to at once: they stay in the cache."""
+"""Number of sums in a tile: they fit into the processor's cache."""
 
 _ZERO, _HALF, _ONE = np.float32(0), np.float32(0.5), np.float32(1)
 _LN_2, _LOG2_E = np.float32(math.log(2)), np.float32(1 / math.log(2))
@@ -38,14 +39,14 @@ class CanvasGeometry(NamedTuple):
     """Geometry of n images and a canvas of ``(H, W)`` pixels.
 
     Attributes:
-        images: ``(n,)`` their numbers, as they stand in `owner`.
+        images: ``(n,)`` numbers of the images, as in `owner`.
         matrices: ``(n, 3, 3)`` from rays to homogeneous pixels.
-        spans: ``(n, H, 2)`` in every row the first column that may see something of an image, and
-            how many may, across the seam. Not read where there are owners.
+        spans: ``(n, H, 2)`` first column that an image may cover in each row, and number of such
+            columns, which may continue across the seam. Not used if there are owners.
         columns: ``(2, W)`` factors of the rays.
         rows: ``(H, 2)`` factors of the rays.
-        owner: ``(H, W)``: an image has weight 1 where it is the owner, else 0. Empty for feather
-            weights √((1 − a²)(1 − b²)) at offsets a, b in half image sides.
+        owner: ``(H, W)`` owners: an image has weight 1 in the pixels it owns, else 0. Empty for
+            feather weights √((1 − a²)(1 − b²)) at offsets a, b in half image sides.
     """
 
     images: Array
@@ -57,17 +58,17 @@ class CanvasGeometry(NamedTuple):
 
 
 class _TileBuffers(NamedTuple):
-    """Buffers for the pixels of a tile that an image contributes to, and for runs of neighbors.
+    """Buffers for the pixels of a tile that an image contributes to, and for runs of pixels.
 
     Attributes:
-        pixel: Where results of a pixel go.
-        u: Its column in the image.
-        v: Its row in the image.
-        weight: Its weight.
-        column: Whole part of the column.
-        row: Whole part of the row.
-        right: Rest of the column.
-        below: Rest of the row.
+        pixel: Index at which the result of each pixel is stored.
+        u: Column in the image.
+        v: Row in the image.
+        weight: Weight of the image.
+        column: Integer part of the column.
+        row: Integer part of the row.
+        right: Fractional part of the column.
+        below: Fractional part of the row.
         runs: ``(n, 4)`` image, row of the canvas, first column and the one after the last.
     """
 
@@ -83,14 +84,14 @@ class _TileBuffers(NamedTuple):
 
 
 class _Taps(NamedTuple):
-    """The four pixels of a patch around every position, and their weights.
+    """The four pixels of a patch around each position, and their weights.
 
     Attributes:
-        first: Place of the upper left one.
-        a: Weights of the upper left one.
-        b: Of the upper right one.
-        c: Of the lower left one.
-        d: Of the lower right one.
+        first: Index of the upper left pixel.
+        a: Weight of the upper left pixel.
+        b: Weight of the upper right pixel.
+        c: Weight of the lower left pixel.
+        d: Weight of the lower right pixel.
     """
 
     first: Array
@@ -104,7 +105,7 @@ class _Taps(NamedTuple):
 def _project(
     m: Array, row: Array, columns: Array, start: int, stop: int, u: Array, v: Array
 ) -> None:
-    """Project neighbors in a row of the canvas into an image; u is infinite where it looks away.
+    """Project a run of pixels of the canvas into an image; u is infinite for rays behind it.
 
     Args:
         m: ``(3, 3)`` from rays to homogeneous pixels.
@@ -128,7 +129,7 @@ def _project(
 
 @njit_fast
 def _feather(side: tuple[int, int], u: Array, v: Array, weight: Array) -> int:
-    """Write feather weights, 0 outside the image; returns how many are."""
+    """Write feather weights, 0 outside the image; return the number of pixels outside."""
     per_column, per_row, outside = 2 / side[1], 2 / side[0], 0
     for p in range(len(weight)):
         a, b = (u[p] + 0.5) * per_column - 1, (v[p] + 0.5) * per_row - 1
@@ -139,7 +140,7 @@ def _feather(side: tuple[int, int], u: Array, v: Array, weight: Array) -> int:
 
 @njit_fast
 def _tile_buffers(pixels: int) -> _TileBuffers:
-    """Buffers for a tile; one array each, as numba takes the parts of a common one for strided."""
+    """Return buffers for a tile. Separate arrays: numba assumes strides for parts of one array."""
     u, v, weight = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     column, row = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
     right, below = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
@@ -149,34 +150,34 @@ def _tile_buffers(pixels: int) -> _TileBuffers:
 
 @njit_fast
 def _tap_buffers(pixels: int) -> _Taps:
-    """Buffers for the taps of a tile."""
+    """Return buffers for the taps of a tile."""
     a, b = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     c, d = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     return _Taps(np.empty(pixels, np.int32), a, b, c, d)
 
 
 @njit_fast
-def _enough(buffers: Array, size: int) -> Array:
-    """A flat array, or a new one of zeros if it is too small."""
-    return buffers if len(buffers) >= size else np.zeros(size, buffers.dtype)
+def _at_least(buffer: Array, size: int) -> Array:
+    """Return a flat buffer, or a larger one of zeros if it is too small."""
+    return buffer if len(buffer) >= size else np.zeros(size, buffer.dtype)
 
 
 @njit_fast
 def _count(canvas: CanvasGeometry) -> int:
-    """One more than the greatest number of an image."""
+    """Return the largest number of an image plus 1."""
     greatest = canvas.images.max()
     return max(greatest, canvas.owner.max()) + 1 if len(canvas.owner) else greatest + 1
 
 
 @njit_fast
 def _owned_runs(tile: Tile, owner: Array, runs: Array, owns: Array) -> int:
-    """Find neighbors in the rows of a tile that one image owns; returns how many runs there are.
+    """Find runs of pixels in the rows of a tile that have one owner; return their number.
 
     Args:
         tile: The tile.
-        owner: ``(H, W)``.
+        owner: ``(H, W)`` owners.
         runs: ``(n, 4)`` image, row, first column and the one after the last, written.
-        owns: Whether an image owns a pixel, written.
+        owns: True for each image that owns a pixel of the tile, written.
     """
     top, bottom, left, right = tile
     owns[:] = False
@@ -193,8 +194,8 @@ def _owned_runs(tile: Tile, owner: Array, runs: Array, owns: Array) -> int:
 
 
 @njit_fast
-def _seen_runs(tile: Tile, m: int, canvas: CanvasGeometry, runs: Array) -> int:
-    """See `_owned_runs`, of pixels of which image m may see something."""
+def _covered_runs(tile: Tile, m: int, canvas: CanvasGeometry, runs: Array) -> int:
+    """Find runs of pixels of a tile that image m may cover; return their number."""
     top, bottom, left, right = tile
     width, count = canvas.columns.shape[1], 0
     for i in range(top, bottom):
@@ -213,23 +214,23 @@ def _list_pixels(
     m: int,
     side: tuple[int, int],
     canvas: CanvasGeometry,
-    found: int,
+    num_runs: int,
     step: tuple[int, int],
     buffers: _TileBuffers,
 ) -> int:
-    """List the pixels of runs that image m contributes to; returns how many.
+    """List the pixels of runs that image m contributes to; return their number.
 
     Args:
         m: Index of the image in `canvas`.
         side: Rows and columns of the image.
         canvas: Geometry of images and canvas.
-        found: Number of runs, of any images.
-        step: From a row to the next one where results go, and there the place of pixel (0, 0).
-        buffers: Holds the runs; pixels, columns, rows and weights are written.
+        num_runs: Number of runs, which may belong to several images.
+        step: Where results are stored: distance between rows, and index of pixel (0, 0).
+        buffers: Contains the runs; pixels, columns, rows and weights are written.
     """
     pixel, u, v, weight = buffers.pixel, buffers.u, buffers.v, buffers.weight
     count = 0
-    for n in range(found):
+    for n in range(num_runs):
         image, i, start, stop = buffers.runs[n]
         if image != canvas.images[m]:
             continue
@@ -250,30 +251,30 @@ def _list_pixels(
 
 
 @njit_fast
-def _split_axis(places: Array, count: int, whole: Array, rest: Array) -> tuple[int, int]:
-    """Split positions on an axis of `count` pixels, clamped to it, for interpolation.
+def _split_axis(positions: Array, count: int, first: Array, share: Array) -> tuple[int, int]:
+    """Split positions on an axis into pixels and shares for linear interpolation.
 
     Args:
-        places: ``(n,)``.
-        count: Pixels of the axis.
-        whole: ``(n,)`` the first of the two pixels around a position, written.
-        rest: ``(n,)`` share of the second, 0 to 1, written.
+        positions: ``(n,)`` positions, clamped to the axis.
+        count: Number of pixels of the axis.
+        first: ``(n,)`` first of the two pixels around each position, written.
+        share: ``(n,)`` share of the second pixel, 0 to 1, written.
 
     Returns:
-        The first pixel, and how many there are up to the last.
+        The first pixel that is needed, and the number of pixels up to the last one.
     """
     least, greatest = np.int32(count), np.int32(0)
-    for p in range(len(places)):
-        place = min(max(places[p], 0.0), count - 1.0)
-        first = min(np.int32(place), np.int32(count - 2))
-        whole[p], rest[p] = first, place - first
-        least, greatest = min(least, first), max(greatest, first)
+    for p in range(len(positions)):
+        position = min(max(positions[p], 0.0), count - 1.0)
+        pixel = min(np.int32(position), np.int32(count - 2))
+        first[p], share[p] = pixel, position - pixel
+        least, greatest = min(least, pixel), max(greatest, pixel)
     return int(least), int(greatest) - int(least) + 2
 
 
 @njit_fast
 def _split(n: int, side: tuple[int, int], buffers: _TileBuffers) -> tuple[int, int, int, int]:
-    """Split the columns and rows of n pixels; returns first row, first column, rows, columns."""
+    """Split the positions of n pixels; return first row and column, number of rows and columns."""
     left, wide = _split_axis(buffers.u[:n], side[1], buffers.column, buffers.right)
     top, high = _split_axis(buffers.v[:n], side[0], buffers.row, buffers.below)
     return top, left, high, wide
@@ -285,9 +286,9 @@ def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers, taps: _Taps) ->
 
     Args:
         n: Number of pixels.
-        step: Places from a row to the next one, and the place of pixel (0, 0) of the image.
+        step: Distance between rows of the patch, and index of pixel (0, 0) of the image in it.
         buffers: Columns, rows and weights of the pixels.
-        taps: Written.
+        taps: Taps of the pixels, written.
     """
     first, a, b, c, d = taps
     for p in range(n):
@@ -300,10 +301,10 @@ def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers, taps: _Taps) ->
 
 @njit_fast
 def _exp(x: np.float32) -> np.float32:
-    """Exponential of a number up to 0, relative error 3e-7; 0 below −40 and of NaN.
+    """Return e^x for x ≤ 0 with a relative error of 3e-7; 0 for NaN and below −40.
 
-    2^n e^r with r between ± ln(2) / 2, where a Taylor polynomial is enough. Unlike `math.exp` it
-    compiles to vector code, and gives no denormal numbers, with which arithmetic is slow.
+    Computed as 2^n e^r with r between ±ln(2)/2, where a Taylor polynomial is accurate. Unlike
+    `math.exp` it compiles to vector code, and returns no denormal numbers, which are slow.
     """
     n = np.int32(x * _LOG2_E - _HALF)
     r = x - np.float32(n) * _LN_2
@@ -314,12 +315,12 @@ def _exp(x: np.float32) -> np.float32:
 
 @njit_fast
 def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
-    """Softmax over the classes, in place, but for a factor.
+    """Compute the softmax over the classes in place, except for a factor per pixel.
 
     Args:
         lines: ``(K, n)`` scores, changed; NaN gets a probability of 0.
         highest: ``(n,)`` buffer.
-        factor: ``(n,)`` factors that make the sums 1, written.
+        factor: ``(n,)`` factors with which the probabilities add up to 1, written.
     """
     pixels = np.uint64(len(factor))
     highest[:], factor[:] = -np.inf, 0
@@ -338,14 +339,14 @@ def _softmax_lines(lines: Array, highest: Array, factor: Array) -> None:
 
 @njit_fast
 def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array) -> None:
-    """Copy a part of the ``(K, h, w)`` scores of an image, scores of a pixel beside each other.
+    """Copy a part of an image's scores so that the scores of each pixel are adjacent.
 
     Args:
-        scores: Of the image.
+        scores: ``(K, h, w)`` scores of the image.
         left: First column of the part.
         top: First row of the part.
-        softmax: Whether to copy probabilities.
-        patch: ``(height, width, Kp)``, written but for the zeros at the end of each pixel.
+        softmax: True to copy probabilities.
+        patch: ``(height, width, Kp)`` copy, written except for the zeros after each pixel's scores.
     """
     num_classes, width = len(scores), patch.shape[1]
     lines = np.empty((num_classes, width), np.float32)
@@ -353,9 +354,9 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
     for y in range(len(patch)):
         pixels = patch[y]
         for k in range(num_classes):
-            line, there = lines[k], scores[k, top + y]
+            line, source = lines[k], scores[k, top + y]
             for x in range(np.uint64(width)):
-                line[x] = there[np.uint64(left) + x]
+                line[x] = source[np.uint64(left) + x]
         if softmax:
             _softmax_lines(lines, highest, factor)
         for k in range(np.uint64(num_classes)):
@@ -371,11 +372,11 @@ def _add_samples(
 
     Args:
         patch: Scores of a part of an image, flat.
-        width: Pixels in a row of it.
-        blocks: ``Kp / LANES``: the compiler has to know that there is no rest.
-        taps: Of n pixels.
-        pixel: ``(n,)`` where their sums are.
-        sums: ``(h, w, Kp)``, flat, changed.
+        width: Pixels in a row of the patch.
+        blocks: ``Kp / LANES``, so that the compiler can rely on a multiple of `LANES`.
+        taps: Taps of n pixels.
+        pixel: ``(n,)`` index of each pixel's sums.
+        sums: ``(h, w, Kp)`` sums, flat, changed.
     """
     classes = np.uint64(LANES) * np.uint64(blocks)
     below = classes * np.uint64(width)
@@ -396,11 +397,11 @@ def _add_probabilities(
 
     Args:
         tile: The tile.
-        covered: Whether an image is among those that were added.
-        owner: ``(H, W)``.
+        covered: True for each image whose scores were added.
+        owner: ``(H, W)`` owners.
         num_classes: K.
         sums: ``(height, width, Kp)`` scores of the tile.
-        total: ``(H, W, Kp)``, changed.
+        total: ``(H, W, Kp)`` totals, changed.
     """
     top, bottom, left, right = tile
     width = right - left
@@ -422,7 +423,14 @@ def _add_probabilities(
 
 @njit_fast
 def _tiles(start: int, stop: int, canvas: CanvasGeometry, pixels: int) -> list[Tile]:
-    """Tiles of `pixels` or fewer, about square on the sphere, that cover rows ``start:stop``."""
+    """Return tiles that cover rows ``start:stop``, about square on the sphere.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        canvas: Geometry of the canvas.
+        pixels: Largest number of pixels of a tile.
+    """
     tiles, bottom, width = [], start, canvas.columns.shape[1]
     while bottom < stop:
         top, remaining = bottom, stop - bottom
@@ -436,19 +444,19 @@ def _tiles(start: int, stop: int, canvas: CanvasGeometry, pixels: int) -> list[T
 
 @njit_fast
 def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -> None:
-    """Write classes of the largest sums of the pixels of a row: of equal ones the first, never NaN.
+    """Write the class of the largest sum of each pixel in a row; the first of equal ones, no NaN.
 
     Args:
-        sums: ``(w, Kp)``.
+        sums: ``(w, Kp)`` sums.
         num_classes: K.
-        least: Share of the sum of all classes that the largest must have, else the class is K.
-        labels: ``(w,)``, written.
+        least: Share of the sum of all classes that the largest must reach, else the class is K.
+        labels: ``(w,)`` class indices, written.
     """
     for x in range(len(labels)):
         highest, best = np.float32(-np.inf), np.int32(0)
         for k in range(np.uint64(num_classes)):
             score = sums[x, k]
-            # A sum, not a choice: that would be compiled to a branch, slow where classes change.
+            # Arithmetic, because a condition compiles to a branch, which is slow at class borders.
             best += (np.int32(k) - best) * np.int32(score > highest)
             highest = score if score > highest else highest
         unsure = least > 0 and highest < least * sums[x, :num_classes].sum()
@@ -464,35 +472,35 @@ def _add_to_tile(
 
     Args:
         tile: The tile.
-        scores: ``(n, K, h, w)``.
+        scores: ``(n, K, h, w)`` scores of the images.
         canvas: Geometry of the images and the canvas.
-        softmax: Whether to add probabilities.
+        softmax: True to add probabilities.
         step: See `_list_pixels`.
-        owns: Buffer for all images, true at first.
+        owns: Buffer for all images, True at first.
         buffers: Buffers for the tile's pixels.
         taps: Buffers for the taps.
         patch: Buffer for a part of an image.
-        sums: ``(h, w, Kp)``, changed.
+        sums: ``(h, w, Kp)`` sums, changed.
 
     Returns:
         The buffer for a part of an image, or a larger one.
     """
-    side, classes, found = (scores.shape[2], scores.shape[3]), sums.shape[2], 0
+    side, classes, num_runs = (scores.shape[2], scores.shape[3]), sums.shape[2], 0
     owned = len(canvas.owner) > 0
     if owned:
-        found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
+        num_runs = _owned_runs(tile, canvas.owner, buffers.runs, owns)
     for m in range(len(scores)):
         if not owns[canvas.images[m]]:
             continue
         if not owned:
-            found = _seen_runs(tile, m, canvas, buffers.runs)
-        n = _list_pixels(m, side, canvas, found, step, buffers)
+            num_runs = _covered_runs(tile, m, canvas, buffers.runs)
+        n = _list_pixels(m, side, canvas, num_runs, step, buffers)
         if n == 0:
             continue
         top, left, high, wide = _split(n, side, buffers)
         _weigh(n, (wide, -top * wide - left), buffers, taps)
         size = high * wide * classes
-        patch = _enough(patch, size)
+        patch = _at_least(patch, size)
         part, blocks = patch[:size], classes // LANES
         _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
         _add_samples(part, wide, blocks, taps, buffers.pixel[:n], sums.reshape(-1))
@@ -511,18 +519,18 @@ def add_images(
 ) -> None:
     """Add weighted scores of images to rows ``start:stop`` of a canvas, or write best classes.
 
-    Works tile by tile: the part of an image that a tile sees is copied.
+    Works tile by tile; the part of each image that the tile needs is copied first.
 
     Args:
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
         canvas: Geometry of these images and the canvas.
-        softmax: Whether to add probabilities: those of owners are of the interpolated scores,
-            feathered ones are interpolated.
-        total: ``(H, W, Kp)`` sums, changed. Empty where only labels are wanted, for which all
-            images of a pixel have to come at once.
-        labels: ``(H, W)`` classes of the largest sums, written where `total` is empty.
+        softmax: True to add probabilities. With owners, scores are interpolated first; with
+            feathering, probabilities are interpolated.
+        total: ``(H, W, Kp)`` sums, changed. Empty to write only labels; then all images of a pixel
+            have to be added in one call.
+        labels: ``(H, W)`` classes of the largest sums, written if `total` is empty.
     """
     num_classes, width = scores.shape[1], canvas.columns.shape[1]
     classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(canvas.owner) > 0
@@ -537,7 +545,7 @@ def add_images(
         sums, step = total, (width, 0)
         if afterwards or len(total) == 0:
             high, wide = bottom - top, right - left
-            of_tile = _enough(of_tile, pixels * classes)
+            of_tile = _at_least(of_tile, pixels * classes)
             sums = of_tile[: high * wide * classes].reshape((high, wide, classes))
             sums[:] = 0
             step = wide, -top * wide - left
@@ -552,20 +560,21 @@ def add_images(
 
 @njit_fast
 def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Array) -> None:
-    """Best classes of a part of the ``(K, h, w)`` scores of an image.
+    """Write the best classes of a part of an image's scores.
 
     Args:
-        scores: Of the image.
+        scores: ``(K, h, w)`` scores of the image.
         left: First column of the part.
         top: First row of the part.
         highest: ``(width,)`` buffer.
-        best: ``(height, width)``, written; −1 where no score is finite and the largest.
+        best: ``(height, width)`` class indices, written; −1 where the largest score is infinite or
+            all scores are NaN.
     """
     width = best.shape[1]
     for y in range(len(best)):
         highest[:], of_row = -np.inf, best[y]
         of_row[:] = 0
-        # Two classes at once, of an odd number the last one twice: half as much is written.
+        # Two classes at once halve the writes; the last of an odd number is compared twice.
         for k in range(0, len(scores), 2):
             after = min(k + 1, len(scores) - 1)
             first, second = scores[k, top + y], scores[after, top + y]
@@ -585,14 +594,14 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
 def _interpolated_classes(
     scores: Array, count: int, taps: _Taps, highest: Array, best: Array
 ) -> None:
-    """Classes of the largest interpolated scores: of equal ones the first, and never NaN.
+    """Write classes of the largest interpolated scores; the first of equal ones, no NaN.
 
     Args:
-        scores: ``(K, h, w)`` of an image.
+        scores: ``(K, h, w)`` scores of an image.
         count: Number of pixels n.
-        taps: Of the pixels, in the image.
+        taps: Taps of the pixels, in the image.
         highest: Buffer.
-        best: Of the pixels, written.
+        best: Class indices of the pixels, written.
     """
     right, below = np.uint64(1), np.uint64(scores.shape[2])
     highest[:count], best[:count] = -np.inf, 0
@@ -611,31 +620,31 @@ def _interpolated_classes(
 def _write_alike(
     n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array
 ) -> int:
-    """Write labels of pixels around which all four pixels of the image have the same best class.
+    """Write labels of pixels whose four taps in the image have the same best class.
 
     Args:
-        n: How many pixels there are.
-        best: From `_best_of_part`.
+        n: Number of pixels.
+        best: Best classes of a part of the image, from `_best_of_part`.
         corner: Row and column of the part in the image.
-        buffers: The pixels; the others are moved to the front.
-        labels: Flat, written.
+        buffers: The pixels; remaining pixels are moved to the front.
+        labels: Labels of the canvas, flat, written.
 
     Returns:
-        How many others there are.
+        Number of remaining pixels, which have to be interpolated.
     """
     flat, below = best.reshape(-1), np.uint64(best.shape[1])
-    others, right = 0, np.uint64(1)
+    remaining, right = 0, np.uint64(1)
     for p in range(n):
         at = np.uint64((buffers.row[p] - corner[0]) * best.shape[1] + buffers.column[p] - corner[1])
         label = flat[at]
         if label == flat[at + right] == flat[at + below] == flat[at + below + right] >= 0:
             labels[buffers.pixel[p]] = label
             continue
-        buffers.pixel[others] = buffers.pixel[p]
-        buffers.column[others], buffers.row[others] = buffers.column[p], buffers.row[p]
-        buffers.right[others], buffers.below[others] = buffers.right[p], buffers.below[p]
-        others += 1
-    return others
+        buffers.pixel[remaining] = buffers.pixel[p]
+        buffers.column[remaining], buffers.row[remaining] = buffers.column[p], buffers.row[p]
+        buffers.right[remaining], buffers.below[remaining] = buffers.right[p], buffers.below[p]
+        remaining += 1
+    return remaining
 
 
 @njit_fast
@@ -644,15 +653,15 @@ def label_images(
 ) -> None:
     """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
 
-    Where the four pixels of an image around a position have the same best class, so has the
-    interpolated score: others are not interpolated.
+    Where the four taps of a position have the same best class, it is also the best class of the
+    interpolated scores. Only the other positions are interpolated.
 
     Args:
         start: First row.
         stop: One past the last row.
         scores: ``(n, K, h, w)`` float32, h and w at least 2.
         canvas: Geometry of these images and the canvas, with owners.
-        labels: ``(H, W)``, written.
+        labels: ``(H, W)`` class indices, written.
     """
     side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
     buffers, taps, owns = (
@@ -663,13 +672,13 @@ def label_images(
     highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
     for tile in _tiles(start, stop, canvas, pixels):
-        found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
+        num_runs = _owned_runs(tile, canvas.owner, buffers.runs, owns)
         for m in range(len(scores)):
             if not owns[canvas.images[m]]:
                 continue
-            n = _list_pixels(m, side, canvas, found, (width, 0), buffers)
+            n = _list_pixels(m, side, canvas, num_runs, (width, 0), buffers)
             top, left, high, wide = _split(n, side, buffers)
-            best = _enough(best, high * wide)
+            best = _at_least(best, high * wide)
             part = best[: high * wide].reshape((high, wide))
             _best_of_part(scores[m], left, top, highest[:wide], part)
             n = _write_alike(n, part, (top, left), buffers, flat)
@@ -683,7 +692,16 @@ def label_images(
 def best_classes(
     start: int, stop: int, total: Array, num_classes: int, min_confidence: float, labels: Array
 ) -> None:
-    """Classes of the largest totals of `add_images`, rows ``start:stop``; see `_write_classes`."""
+    """Write the classes of the largest totals in rows ``start:stop``, see `_write_classes`.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        total: ``(H, W, Kp)`` totals of `add_images`.
+        num_classes: K.
+        min_confidence: Smallest share of the largest total, else the class is K.
+        labels: ``(H, W)`` class indices, written.
+    """
     for i in range(start, stop):
         _write_classes(total[i], num_classes, min_confidence, labels[i])
 
@@ -693,32 +711,32 @@ def seen_table(
     start: int, stop: int, side: tuple[int, int], canvas: CanvasGeometry,
     count: Array, face: Array, u: Array, v: Array, weight: Array,
 ) -> None:  # fmt: skip
-    """All images that contribute to a pixel, for the rows ``start:stop``.
+    """List the images that contribute to each pixel of the rows ``start:stop``.
 
     Args:
         start: First row.
         stop: One past the last row.
         side: Rows and columns of the images.
         canvas: Geometry of images and canvas.
-        count: ``(H, W)`` how many images there are, 0 before, written.
-        face: ``(R, H, W)`` images, written; with R = 0 they are only counted.
+        count: ``(H, W)`` number of images, 0 at first, written.
+        face: ``(R, H, W)`` images, written; if R is 0, images are only counted.
         u: ``(R, H, W)`` columns in the images, written.
         v: ``(R, H, W)`` rows in the images, written.
         weight: ``(R, H, W)`` weights, written.
     """
     width = canvas.columns.shape[1]
     owned, owns = len(canvas.owner) > 0, np.ones(_count(canvas), np.bool_)
-    buffers, found = _tile_buffers(width), 0
+    buffers, num_runs = _tile_buffers(width), 0
     for i in range(start, stop):
         tile = i, i + 1, 0, width
         if owned:
-            found = _owned_runs(tile, canvas.owner, buffers.runs, owns)
+            num_runs = _owned_runs(tile, canvas.owner, buffers.runs, owns)
         for m in range(len(canvas.matrices)):
             if not owns[canvas.images[m]]:
                 continue
             if not owned:
-                found = _seen_runs(tile, m, canvas, buffers.runs)
-            for p in range(_list_pixels(m, side, canvas, found, (0, 0), buffers)):
+                num_runs = _covered_runs(tile, m, canvas, buffers.runs)
+            for p in range(_list_pixels(m, side, canvas, num_runs, (0, 0), buffers)):
                 j = buffers.pixel[p]
                 rank = count[i, j]
                 count[i, j] += 1

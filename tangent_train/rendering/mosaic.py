@@ -1,11 +1,11 @@
 """Class scores of one panorama or photo, accumulated image by image.
 
-`tangent_to_labels` takes the scores of all images at once: 5 GB for 13 classes at level 11. Here
-they arrive a few images at a time, from any number of grids, and are not kept. Without averaging,
-only the labels are kept.
+`tangent_to_labels` takes the scores of all images at once: 5 GB for 13 classes at level 11. A
+mosaic takes a few images at a time, from one or more grids, and does not keep their scores. Unless
+probabilities are averaged, it keeps only labels.
 
-Two backends give the same results: compiled kernels on the CPU (`accumulate`), torch on any device
-(`device_mosaic`).
+There are two backends with the same results: compiled kernels on the CPU (`accumulate`), and torch
+on any device (`device_mosaic`).
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ class ScoreMosaic:
     """Scores of K classes at every pixel of a panorama or photo.
 
     Args:
-        shape: ``(H, W)``.
+        shape: ``(H, W)`` of the panorama or photo.
         num_classes: K.
         blend: ``nearest``: a pixel takes the scores of the image that owns it, as in
             `tangent_to_labels`. ``feather``: the weighted average of the probabilities of all
-            images that see it; see `blend_of`.
-        averaged: True to keep sums of probabilities: always with ``feather``; with ``nearest``
-            for more than one set of images, or when the probabilities are wanted. They take 4 K
-            bytes a pixel; on the CPU K is rounded up to 16s, and beyond 2 GiB they are in a
-            temporary file (of the folder TMPDIR).
-        min_confidence: Probability from which the best class is certain, see `labels`; above 0,
-            sums are kept.
+            images that cover it; see `blend_of`.
+        averaged: True to keep sums of probabilities. ``feather`` always keeps them; ``nearest``
+            needs them for several sets of images and for `probabilities`. They take 4 K bytes per
+            pixel; on the CPU K is rounded up to a multiple of 16, and sums beyond 2 GiB are kept in
+            a temporary file (in the folder TMPDIR).
+        min_confidence: Confidence below which a pixel has no class, see `labels`; above 0, sums are
+            kept.
         device: Device of the mosaic; sums that are too large for it are kept on the CPU.
-        backend: ``numba`` on the CPU, or ``torch``; None for the one that suits the device.
+        backend: ``numba`` on the CPU, or ``torch``; None to choose by device.
         spare: `sums` of a mosaic that is no longer used, to reuse its memory.
 
     Attributes:
-        shape: As given.
-        blend: As given.
-        sums: Sums of probabilities on the CPU, from `zero_sums`; empty where they are not kept.
+        shape: ``(H, W)`` of the panorama or photo.
+        blend: Blend of the images.
+        sums: Sums of probabilities on the CPU, from `zero_sums`; empty if they are not kept.
 
     Raises:
         SettingError: The temporary file for the sums does not fit on the disk.
@@ -89,7 +89,7 @@ class ScoreMosaic:
             self.sums = zero_sums(shape, num_classes, spare)
 
     def add(self, scores: Tensor, views: Views) -> None:
-        """Add some views of a set; every view of the set must be added once.
+        """Add some views of a set; each view of the set must be added once.
 
         Args:
             scores: ``(n, K, h, w)`` scores, not probabilities.
@@ -108,7 +108,7 @@ class ScoreMosaic:
             label_canvas(array, images, owner, self._labels)
 
     def labels(self) -> Tensor:
-        """``(H, W)`` indices of the best classes, of equal ones the first; K where unsure."""
+        """Return ``(H, W)`` indices of the best classes (the first of equals); K where unsure."""
         if self._on_device is not None:
             return self._on_device.labels(self._min_confidence)
         if self._averaged:
@@ -117,7 +117,7 @@ class ScoreMosaic:
         return torch.from_numpy(self._labels)
 
     def probabilities(self, rows: slice | NDArray[np.intp]) -> Tensor:
-        """``(h, W, K)`` probabilities of some rows, which add up to 1; only where averaged."""
+        """Return ``(h, W, K)`` probabilities of some rows, which add up to 1; needs `averaged`."""
         if self._on_device is not None:
             index = rows if isinstance(rows, slice) else rows.tolist()
             total = self._on_device.sums[:, index].movedim(0, -1)
@@ -126,7 +126,7 @@ class ScoreMosaic:
         return total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)
 
     def _owners(self, images: Views) -> Any:
-        """Owner of each pixel, kept until images of another set are added."""
+        """Return the owner of each pixel, cached until images of another set are added."""
         if blend_of(self.blend, overlapping=images.overlapping) == "feather":
             return NO_OWNERS
         if self._owned[0] is not images.all_images:

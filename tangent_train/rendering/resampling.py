@@ -1,7 +1,7 @@
-"""Images of another size: whole panoramas, and crops of photos.
+"""Resize whole panoramas, and crops of photos.
 
-Arrays are resized by OpenCV and Pillow, on the CPU. Tensors are resized on their device by the same
-filters, as products with one matrix of weights for the rows and one for the columns.
+Arrays are resized by OpenCV and Pillow, on the CPU. Tensors are resized on their device with the
+same filters, by products with one matrix of weights for the rows and one for the columns.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
     Args:
         image: An array ``(H, W[, C])``, or a tensor ``(C, H, W)``.
         shape: Rows and columns of the result.
-        interpolation: ``bilinear`` averages where the image shrinks; ``nearest`` takes the pixels
-            at the centers.
+        interpolation: ``bilinear``, which averages areas if the image becomes smaller; ``nearest``
+            takes the pixel at the center of each pixel of the result.
     """
     height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
     if (height, width) == shape:
@@ -38,7 +38,7 @@ def resize(image: Pixels, shape: tuple[int, int], interpolation: Interpolation) 
             (2 * np.arange(after) + 1) * before // (2 * after)
             for after, before in zip(shape, (height, width), strict=True)
         )
-        return _taken(image, rows, columns)
+        return _pick(image, rows, columns)
     smaller = shape[0] < height
     if isinstance(image, Tensor):
         whole = np.array((0.0, 0.0, width, height))
@@ -52,18 +52,19 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
     """Cut out a part of an image and resize it.
 
     Args:
-        image: An array ``(H, W[, C])``, for ``bilinear`` of uint8; or a tensor ``(C, H, W)``.
-        box: The part.
+        image: An array ``(H, W[, C])``, uint8 for ``bilinear``; or a tensor ``(C, H, W)``.
+        box: Position of the part.
         shape: Rows and columns of the result.
-        interpolation: ``bilinear`` antialiases where the part shrinks: a triangle filter two pixels
-            of the result wide. ``nearest`` takes the pixels at the centers.
+        interpolation: ``bilinear``, with antialiasing if the part becomes smaller: a triangle
+            filter two pixels of the result wide. ``nearest`` takes the pixel at the center of each
+            pixel of the result.
     """
     if interpolation == "nearest":
         columns, rows = (
             np.linspace(near, far, 2 * count + 1)[1::2].astype(np.intp)
             for near, far, count in zip(box[:2], box[2:], shape[::-1], strict=True)
         )
-        return _taken(image, rows, columns)
+        return _pick(image, rows, columns)
     if isinstance(image, Tensor):
         return _filtered(image, box, shape, "triangle")
     corners = tuple(box.tolist())
@@ -72,7 +73,7 @@ def crop(image: Pixels, box: Box, shape: tuple[int, int], interpolation: Interpo
     return result
 
 
-def _taken(image: Pixels, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Pixels:
+def _pick(image: Pixels, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Pixels:
     if isinstance(image, np.ndarray):
         return image[rows][:, columns]
     down, across = (torch.from_numpy(index).to(image.device) for index in (rows, columns))
@@ -85,7 +86,7 @@ def _filtered(
     shape: tuple[int, int],
     kind: Literal["area", "linear", "triangle"],
 ) -> Tensor:
-    """A part of ``(C, H, W)`` resized."""
+    """Resize a part of ``(C, H, W)``."""
     down, across = (
         torch.from_numpy(_weights(image.shape[axis - 2], near, far, count, kind)).to(image.device)
         for axis, (near, far, count) in enumerate(
@@ -99,7 +100,7 @@ def _filtered(
 def _weights(
     before: int, near: float, far: float, after: int, kind: Literal["area", "linear", "triangle"]
 ) -> NDArray[np.float32]:
-    """``(after, before)`` weights of the pixels of an axis, whose part from near to far is seen."""
+    """Return ``(after, before)`` weights that resample an axis from `near` to `far`."""
     scale = (far - near) / after
     centers = near + (np.arange(after)[:, None] + 0.5) * scale
     pixels = np.arange(before) + 0.5

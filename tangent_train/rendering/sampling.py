@@ -27,18 +27,18 @@ Rays = tuple[Array, Array]
 """``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 
 _REMAP_LIMIT = 32767
-"""cv2.remap takes images whose sides are below SHRT_MAX."""
+"""cv2.remap requires sides below SHRT_MAX."""
 _REMAP_BILINEAR = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 _SAME_SIZE = {1: np.uint8, 2: np.uint16, 4: np.float32, 8: np.float64}
-"""Nearest sampling moves bytes: any dtype goes as one of its size."""
+"""Nearest sampling copies bytes: a dtype of the same size stands for every other."""
 _BLOCK = 2**18
-"""Positions sampled at once where cv2 cannot be used."""
+"""Number of positions sampled at once where cv2 cannot be used."""
 _COPIED = 36
-"""Bytes of a part of a panorama for each position, at most: to copy more does not pay."""
+"""Largest part of a panorama that is copied, in bytes per position: copying more takes longer."""
 
 
 def sphere_rays(shape: tuple[int, int]) -> Rays:
-    """Unit directions of a panorama's pixels: cos λ, sin λ and cos φ, sin φ."""
+    """Return the rays of a panorama, unit directions: cos λ, sin λ and cos φ, sin φ."""
     height, width = shape
     lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
     lat = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
@@ -46,26 +46,29 @@ def sphere_rays(shape: tuple[int, int]) -> Rays:
 
 
 def plane_rays(shape: tuple[int, int]) -> Rays:
-    """``(j, 1, i)`` of the pixels of an image: its homogeneous pixels in another order."""
+    """Return the rays ``(j, 1, i)`` of an image: homogeneous pixels in another order."""
     height, width = shape
     columns = np.stack([np.arange(width, dtype=np.float64), np.ones(width)])
     return columns, np.stack([np.ones(height), np.arange(height, dtype=np.float64)], -1)
 
 
 def map_dtype(exact: bool, interpolation: str) -> np.dtype[np.floating]:
-    """Precision of positions: float64 where `exact`, except that nearest is the same for all."""
+    """Return the dtype of positions: float64 if `exact` and bilinear, else float32.
+
+    Nearest sampling uses the same positions for all dtypes.
+    """
     return np.dtype(np.float64 if exact and interpolation == "bilinear" else np.float32)
 
 
 class EquirectMap(NamedTuple):
-    """Positions in an ERP, given in the part of it that is around them.
+    """Positions in an ERP, relative to the part of it that contains them.
 
     Attributes:
         u: ``(h, w)`` columns in the part, float32 or float64.
         v: ``(h, w)`` rows in the part, same dtype.
         polar: Flat indices of positions between a pole and the row next to it.
-        part: First row, row after the last, first column and column after the last, int64; columns
-            from W on lie beyond the seam.
+        part: First row, row after the last, first column and column after the last, int64. Columns
+            W and higher are beyond the seam.
     """
 
     u: NDArray[np.floating]
@@ -77,7 +80,7 @@ class EquirectMap(NamedTuple):
     def of(
         cls, u: NDArray[np.floating], v: NDArray[np.floating], shape: tuple[int, int]
     ) -> EquirectMap:
-        """Find the part around positions.
+        """Find the part that contains some positions.
 
         Args:
             u: ``(h, w)`` columns in [−½, W − ½], float32 or float64.
@@ -86,10 +89,10 @@ class EquirectMap(NamedTuple):
         """
         height, width = shape
         polar = np.flatnonzero((v < 0) | (v > height - 1))
-        # Columns of the left half are rounded alike in every part: as they are beyond the seam.
+        # Columns of the left half are rounded as if beyond the seam, so that all parts agree.
         beyond, left_half = u + u.dtype.type(width), u < width / 2
         u = np.where(left_half, beyond - u.dtype.type(width), u)
-        # Even, for of two nearest pixels the even one is sampled.
+        # An even offset keeps the choice between two equally near pixels, which is the even one.
         top, left = (int(line.min()) // 2 * 2 for line in (v, u))
         bottom, right = min(height, int(v.max()) + 2), int(u.max()) + 2
         if u.min() < 0 or right - left > width / 2:
@@ -105,7 +108,7 @@ class EquirectMap(NamedTuple):
     def in_panorama(
         self, chosen: NDArray[np.intp] | slice = slice(None)
     ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """``(P,)`` columns, some beyond the seam, and rows in the ERP of the chosen positions."""
+        """Return columns, some beyond the seam, and rows ``(P,)`` in the ERP of some positions."""
         top, _, left, _ = self.part.astype(self.u.dtype)
         return self.u.reshape(-1)[chosen] + left, self.v.reshape(-1)[chosen] + top
 
@@ -116,13 +119,13 @@ def equirect_map(
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Positions of rays in an ERP, of several canvases one below the other.
+    """Return the positions in an ERP of the rays of n canvases, stacked vertically.
 
     Args:
         matrices: ``(n, 3, 3)`` from the rays of each canvas to directions of any length.
-        rays: Of a canvas of ``(h, w)`` pixels, see `Rays`.
+        rays: Rays of a canvas of ``(h, w)`` pixels.
         shape: ``(H, W)`` of the ERP.
-        dtype: float32 or float64; computed in float64 either way.
+        dtype: float32 or float64; the computation is float64 in both cases.
 
     Returns:
         Positions ``(n h, w)``.
@@ -138,7 +141,7 @@ def equirect_positions(
     start: int, stop: int, matrices: Array, columns: Array, rows: Array,
     height: int, width: int, u: Array, v: Array,
 ) -> None:  # fmt: skip
-    """ERP positions of the rays of canvases, one below the other, rows ``start:stop``.
+    """Write ERP positions of the rays of stacked canvases, rows ``start:stop``.
 
     Args:
         start: First row.
@@ -170,11 +173,11 @@ def sample_map(
     interpolation: str,
     out: NDArray[np.generic],
 ) -> None:
-    """Sample a panorama, longitude wrapped and poles reflected.
+    """Sample a panorama; longitude wraps, and rows reflect at the poles.
 
-    uint8, uint16 and float32, and the nearest pixel of anything, are sampled by `cv2.remap`. OpenCV
-    4 may round positions to 1/32 pixel, which is invisible in 8-bit images; OpenCV 5 does not. All
-    other sampling is exact.
+    `cv2.remap` samples uint8, uint16 and float32 bilinearly, and the nearest pixel of all dtypes.
+    OpenCV 4 may round positions to 1/32 pixel, which is invisible in 8-bit images; OpenCV 5 does
+    not. Other dtypes are sampled without rounding.
 
     Args:
         table: Positions ``(h, w)``.
@@ -191,7 +194,7 @@ def sample_map(
         _gather(table, image, nearest, out, np.arange(table.u.size))
         return
     _remap(table, image, nearest, out)
-    if not nearest and len(table.polar):  # cv2 would go on at the other pole
+    if not nearest and len(table.polar):  # cv2 would continue at the other pole
         _gather(table, image, nearest, out, table.polar)
 
 
@@ -202,7 +205,7 @@ def _remap(
     part = image[top:bottom, left:right]
     if right > image.shape[1]:
         part = np.concatenate([part, image[top:bottom, : right - image.shape[1]]], axis=1)
-    # To copy the part row by row takes less time than to wait for memory at every position.
+    # Copying the part row by row takes less time than waiting for memory at every position.
     copied = image.dtype.itemsize < 4 and part.nbytes <= _COPIED * table.u.size
     u, v = (line.astype(np.float32, copy=False) for line in table[:2])
     if nearest and len(table.polar):
@@ -214,7 +217,7 @@ def _remap(
         part = np.ascontiguousarray(part) if copied else part
         cv2.remap(part, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
         return
-    # cv2 is fastest with 4 channels. Other numbers it refuses, or samples at rounded positions.
+    # cv2 is fastest with 4 channels. It refuses more than 4, or rounds their positions.
     several = 3 if channels % 3 == 0 else 1
     for first in range(0, channels, several):
         group = part[..., first : first + several]
@@ -233,7 +236,7 @@ def _gather(
     out: NDArray[np.generic],
     chosen: NDArray[np.intp],
 ) -> None:
-    """Sample the chosen positions, with any dtype and size."""
+    """Sample chosen positions with torch, for dtypes and sizes that cv2 does not support."""
     shape = image.shape[0], image.shape[1]
     source = image.reshape(shape[0] * shape[1], -1)
     target = out.reshape(table.u.size, -1)
@@ -249,11 +252,11 @@ def _gather(
 
 
 class Taps(NamedTuple):
-    """Sources and weights of P values.
+    """Sources and weights of P values, each a sum of T terms.
 
     Attributes:
         source: ``(T, P)`` int64, flat indices into the source.
-        weight: ``(T, P)`` floating point.
+        weight: ``(T, P)`` floating-point weights.
     """
 
     source: Tensor
@@ -261,10 +264,10 @@ class Taps(NamedTuple):
 
 
 def bilinear_equirect_taps(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Taps:
-    """Taps at positions in an ERP; beyond a pole the row reflects with a half-turn.
+    """Return bilinear taps at positions in an ERP.
 
-    With an odd width the half-turn falls between two columns, so the two rows have their own
-    columns and fractions.
+    Beyond a pole the row reflects, rotated by half a revolution. With an odd width that falls
+    between two columns, so the two rows have separate columns and weights.
 
     Args:
         u: ``(P,)`` columns, any real number.
@@ -281,16 +284,16 @@ def bilinear_equirect_taps(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Taps
         reflected = torch.where(
             row < 0, -1 - row, torch.where(row < height, row, 2 * height - 1 - row)
         )
-        turned = torch.where(reflected == row, u, u + width / 2)
-        left = turned.floor()
+        column = torch.where(reflected == row, u, u + width / 2)
+        left = column.floor()
         start = reflected.long() * width
         indices += [start + left.long() % width, start + (left.long() + 1) % width]
-        weights += [row_weight * (1 - (turned - left)), row_weight * (turned - left)]
+        weights += [row_weight * (1 - (column - left)), row_weight * (column - left)]
     return Taps(torch.stack(indices), torch.stack(weights))
 
 
 def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
-    """The pixel center nearest to positions in an ERP; half-way between two, the even one.
+    """Return the nearest pixel at positions in an ERP; half-way between two, the even one.
 
     Args:
         u: ``(P,)`` columns, any real number.
@@ -308,15 +311,15 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
 def image_taps(
     face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor, image_size: int
 ) -> Taps:
-    """Bilinear taps in tangent images; positions beyond the outermost pixel centers are clamped.
+    """Return bilinear taps in tangent images, clamped to the outermost pixel centers.
 
     Args:
-        face: ``(R, P)`` images, any integer dtype.
+        face: ``(R, P)`` indices of images, any integer dtype.
         u: ``(R, P)`` columns in the images.
         v: ``(R, P)`` rows in the images.
         dim: Side d of the images.
         weight: ``(R, P)`` weights of the images.
-        image_size: Values between the starts of two images in the flat source.
+        image_size: Number of values from one image to the next in the flat source.
 
     Returns:
         4 R taps per position, weights of the dtype of `u`.
@@ -332,10 +335,10 @@ def image_taps(
 
 
 def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:
-    """The pixel center nearest to positions in tangent images; half-way between two, the even one.
+    """Return the nearest pixel at positions in images; half-way between two, the even one.
 
     Args:
-        face: ``(P,)`` images, any integer dtype.
+        face: ``(P,)`` indices of images, any integer dtype.
         u: ``(P,)`` columns in the images.
         v: ``(P,)`` rows in the images.
         dim: Side d of the images.
@@ -348,14 +351,15 @@ def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:
 
 
 def sample(source: Tensor, taps: Taps) -> Tensor:
-    """Weighted sums of the taps, differentiable with respect to the source.
+    """Return weighted sums of taps, differentiable with respect to the source.
 
     Args:
-        source: ``(S, M)``; taps index its columns.
+        source: ``(S, M)`` values; taps index the columns.
         taps: T taps for P positions.
 
     Returns:
-        ``(S, P)`` of the dtype of the source; sums are taken in the wider of the two dtypes.
+        ``(S, P)`` sums of the dtype of the source, computed in the wider dtype of values and
+        weights.
     """
     # gather, not index_select: its gradient is ten times faster on a CPU.
     size = (len(source), taps.source.shape[1])

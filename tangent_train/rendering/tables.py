@@ -1,4 +1,4 @@
-"""Tables of positions per grid and panorama size, kept in a bounded cache."""
+"""Tables of positions per grid and panorama size, in a cache of limited size."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ Value = TypeVar("Value", bound=tuple[Any, ...])
 
 
 class TableCache:
-    """The most recently used tables, as many as fit into a number of bytes.
+    """A cache of the most recently used tables, limited by their bytes.
 
-    Two threads that miss a table at once both build it, outside of the lock; one is kept.
+    If two threads need a missing table at once, both build it, outside of the lock; one is kept.
 
     Args:
-        limit: Maximum number of bytes held.
+        limit: Maximum number of bytes in the cache.
     """
 
     def __init__(self, limit: int) -> None:
@@ -46,17 +46,17 @@ class TableCache:
         register_at_fork(after_in_child=self._new_lock)
 
     def get(self, key: Hashable, build: Callable[[], Value]) -> Value:
-        """The table of a key, built if it is not held.
+        """Return the table of a key, and build it if it is not in the cache.
 
         Args:
-            key: Everything the table depends on.
-            build: Makes the table, a tuple of arrays or tensors.
+            key: All values that the table depends on.
+            build: Function that builds the table, a tuple of arrays or tensors.
         """
         with self._lock:
-            held: Any = self._tables.get(key)
-            if held is not None:
+            cached: Any = self._tables.get(key)
+            if cached is not None:
                 self._tables.move_to_end(key)
-                return held
+                return cached
         table = build()
         with self._lock:
             size = _nbytes(table)
@@ -67,7 +67,7 @@ class TableCache:
         return table
 
     def set_limit(self, limit: int) -> None:
-        """Change the limit, dropping what no longer fits."""
+        """Change the limit and drop tables that no longer fit."""
         with self._lock:
             self.limit = limit
             self._drop(limit)
@@ -77,7 +77,7 @@ class TableCache:
             self.nbytes -= _nbytes(self._tables.popitem(last=False)[1])
 
     def _new_lock(self) -> None:
-        """A process that was forked while another thread held the lock would wait forever."""
+        """Replace the lock in a forked process: it may have been locked by another thread."""
         self._lock = Lock()
 
 
@@ -88,17 +88,18 @@ def _nbytes(table: tuple[Any, ...]) -> int:
 TABLES = TableCache(limit=512 * 2**20)
 _ROTATED_SHARE = 16
 _ROTATED = TableCache(limit=TABLES.limit // _ROTATED_SHARE)
-"""Of rotated grids, for depth and labels after RGB: random rotations would evict all others."""
+"""Tables of rotated grids, reused for depth and labels after RGB. They have a separate cache,
+because random rotations would evict all other tables."""
 
 
 def set_table_cache_limit(nbytes: int) -> None:
-    """Bound the memory of the rendering tables of this process, 512 MiB at first.
+    """Limit the memory of the rendering tables of this process; the default is 512 MiB.
 
-    At level 10 and base level 1 the tables take 168 MB for panorama to images and, in PyTorch,
-    117 MB back. Tables on a GPU count too; those of rotated grids have another sixteenth.
+    At level 10 and base level 1 the tables take 168 MB from panorama to images and, for tensors,
+    117 MB back. Tables on a GPU count too. Tables of rotated grids may use another sixteenth.
 
     Args:
-        nbytes: Maximum number of bytes held; 0 disables the cache.
+        nbytes: Maximum number of bytes in the cache; 0 disables it.
 
     Raises:
         SettingError: The number is negative.
@@ -119,13 +120,13 @@ def forward_map(
     faces: Sequence[int] | NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
-    """Positions of the pixels of tangent images in the ERP, one image below the other.
+    """Return positions in the ERP of the pixels of tangent images, stacked vertically.
 
     Args:
-        grid: The images.
+        grid: Geometry of the images.
         shape: ``(H, W)`` of the ERP.
-        faces: The images.
-        dtype: float32 or float64; computed in float64 either way.
+        faces: Indices of the images.
+        dtype: float32 or float64; the computation is float64 in both cases.
     """
     chosen = tuple(map(int, faces))
 
@@ -140,12 +141,12 @@ def forward_map(
 def forward_positions(
     grid: PinholeGrid, shape: tuple[int, int], faces: Sequence[int], dtype: np.dtype[np.floating]
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """The columns and rows of `forward_map` in the whole ERP, flat."""
+    """Return the columns and rows of `forward_map` in the whole ERP, flat."""
     return forward_map(grid, shape, faces, dtype).in_panorama()
 
 
 def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
-    """``(H, W)`` the owner of every ERP pixel, in the smallest dtype that torch can index with."""
+    """Return the owner of every ERP pixel, ``(H, W)``, in the smallest integer dtype that fits."""
 
     def build() -> tuple[NDArray[np.integer]]:
         kinds = (np.uint8, np.int16, np.int32)
@@ -160,7 +161,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
 
 
 def _inner_cosine(grid: PinholeGrid) -> float:
-    """Cosine of half the angle between the nearest two centers: nearer to one is the nearest."""
+    """Return the cosine of half the smallest angle between two centers."""
     centers, around = grid.centers_xyz, grid.neighbors
     cosines = np.einsum("nkc,nc->nk", centers[around], centers)
     others = around != np.arange(grid.num_images)[:, None]
@@ -174,17 +175,17 @@ def find_owners(
 ) -> None:  # fmt: skip
     """Find the image with the nearest center, for the ERP rows ``start:stop``.
 
-    Steps to ever nearer centers, starting from the owner of the previous pixel.
+    Starting from the owner of the previous pixel, the search steps to ever nearer neighbors.
 
     Args:
         start: First row.
         stop: One past the last row.
         centers: ``(N, 3)`` directions of the images' centers.
         neighbors: ``(N, k)`` images around every image.
-        inner: Cosine of half the angle between the nearest two centers: a center nearer than that
-            is the nearest.
-        columns: From `sphere_rays`.
-        rows: From `sphere_rays`.
+        inner: Cosine of half the smallest angle between two centers: a center within that angle is
+            the nearest one.
+        columns: ``(2, W)`` factors from `sphere_rays`.
+        rows: ``(H, 2)`` factors from `sphere_rays`.
         face: ``(H, W)`` owners, written.
     """
     nearest = 0
@@ -212,19 +213,19 @@ def image_table(
     blend: str,
     rows: slice,
 ) -> tuple[NDArray[Any], ...]:
-    """The images that contribute to the ERP pixels of some rows, and the positions in them.
+    """Return the images that contribute to the ERP pixels of some rows, and positions in them.
 
     Args:
-        grid: The images.
+        grid: Geometry of the images.
         shape: ``(H, W)`` of the ERP.
-        dtype: Of positions and weights, float32 or float64; computed in float64 either way.
-        blend: ``nearest``: the owner of every pixel, R = 1. ``feather``: R is the largest number of
-            images that see a pixel.
-        rows: The rows, without a step.
+        dtype: dtype of positions and weights, float32 or float64; they are computed in float64.
+        blend: ``nearest``: the owner of every pixel, R = 1. ``feather``: all images that cover a
+            pixel; R is the largest number of them.
+        rows: Rows of the ERP, without a step.
 
     Returns:
-        ``(R, rows, W)`` each: images, int16 or int32; columns and rows in them; and weights that
-        add up to 1.
+        Four arrays ``(R, rows, W)``: indices of images, int16 or int32; columns and rows in the
+        images; and weights that add up to 1.
     """
     part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
     geometry = canvas_geometry(grid, grid.face_indices(), shape, rows, part)
@@ -239,7 +240,7 @@ def image_table(
         return table
 
     count, face, u, v, weight = fill(1 if blend == "nearest" else int(fill(0)[0].max()))
-    # Pixels that fewer images see take their first one again, with weight 0.
+    # Pixels covered by fewer than R images repeat the first one with weight 0.
     unused = np.arange(len(face))[:, None, None] >= count
     face, u, v = (np.where(unused, line[:1], line) for line in (face, u, v))
     return face, u, v, weight / weight.sum(axis=0)
@@ -252,14 +253,14 @@ def canvas_geometry(
     rows: slice,
     owner: NDArray[np.integer],
 ) -> kernels.CanvasGeometry:
-    """Geometry of images of a grid and rows of a panorama, for the kernels.
+    """Return the geometry of images of a grid and rows of a panorama, for the kernels.
 
     Args:
         grid: Geometry of all images.
-        faces: ``(n,)`` numbers of the images.
+        faces: ``(n,)`` indices of the images.
         shape: ``(H, W)`` of the panorama.
         rows: Rows of the panorama, without a step.
-        owner: Owners of these rows; empty for feathering.
+        owner: ``(rows, W)`` owners; empty for feathering.
     """
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
@@ -271,7 +272,14 @@ def canvas_geometry(
 def find_spans(
     grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int], rows: slice
 ) -> NDArray[np.int32]:
-    """``(n, rows, 2)`` spans, see `kernels.CanvasGeometry`; arguments as of `canvas_geometry`."""
+    """Return ``(n, rows, 2)`` spans, see `kernels.CanvasGeometry`.
+
+    Args:
+        grid: Geometry of all images.
+        faces: ``(n,)`` indices of the images.
+        shape: ``(H, W)`` of the panorama.
+        rows: Rows of the panorama, without a step.
+    """
 
     def build() -> tuple[NDArray[np.int32]]:
         spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)
@@ -289,7 +297,7 @@ def find_spans(
 
 @njit_exact
 def _inside(normals: Array, x: float, y: float, z: float) -> bool:
-    """Whether a ray is on the inner side of planes, but for rounding."""
+    """Return True if a ray is on the inner side of all planes, with a tolerance for rounding."""
     inside = True
     for nx, ny, nz in normals:
         inside &= nx * x + ny * y + nz * z > -1e-6
@@ -298,18 +306,18 @@ def _inside(normals: Array, x: float, y: float, z: float) -> bool:
 
 @njit_exact
 def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
-    """Find the columns of ERP rows ``start:stop`` that may see something of images.
+    """Find the columns of ERP rows ``start:stop`` that images may cover.
 
-    An image is seen between four planes through the center of the sphere. What a row sees of it
-    begins and ends where the row crosses one of them between the others.
+    An image covers the directions between four planes through the center of the sphere. Its part of
+    a row begins and ends where the row crosses one of the planes between the others.
 
     Args:
         start: First row.
         stop: One past the last row.
-        edges: ``(n, 4, 3)`` normals of the planes, inwards.
-        rows: From `sphere_rays`.
-        width: W.
-        spans: ``(n, H, 2)`` see `kernels.CanvasGeometry`, written.
+        edges: ``(n, 4, 3)`` normals of the planes, pointing inwards.
+        rows: ``(H, 2)`` factors from `sphere_rays`.
+        width: Number W of columns.
+        spans: ``(n, H, 2)`` spans, see `kernels.CanvasGeometry`, written.
     """
     for m in range(len(edges)):
         forward = edges[m, 0] + edges[m, 1]
@@ -329,7 +337,7 @@ def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, sp
                     if _inside(edges[m], x, y, z):
                         angle = math.atan2(x0 * y - y0 * x, x0 * x + y0 * y)
                         least, most = min(least, angle), max(most, angle)
-            # Opposite of its middle an image is seen only beyond a pole that it contains.
+            # An image covers the longitude opposite to its middle only if it contains a pole.
             if _inside(edges[m], -r * x0, -r * y0, z):
                 least, most = -math.pi, math.pi
             spans[m, i] = 0
@@ -345,13 +353,13 @@ def tensors_on(
     key: tuple[Hashable, ...] | None,
     build: Callable[[], tuple[NDArray[Any], ...]],
 ) -> tuple[Tensor, ...]:
-    """Tables as tensors, kept; on the CPU they share the memory of the arrays.
+    """Return tables as tensors, cached; on the CPU they share the memory of the arrays.
 
     Args:
         device: Device of the tables.
-        grid: Their grid.
-        key: Everything else they depend on; None for tables that are not cached.
-        build: Gives the arrays.
+        grid: Geometry of the images.
+        key: All other values that the tables depend on; None for tables that are not cached.
+        build: Function that returns the arrays.
     """
 
     def tensors() -> tuple[Tensor, ...]:

@@ -51,7 +51,9 @@ def test_classes_that_a_map_lacks_are_missed_or_never_win(
         arguments = [network, *ROOMS, rooms, given, f"unmapped={unmapped}"]
         arguments += ["representation.blend=nearest"]  # averages may change other classes, too
         run("evaluate", *arguments, f"hydra.run.dir={unmapped}")
-    summary = "ceiling ← bright; floor ← dark; never given: beam, board, bookcase, chair, clutter, "
+    summary = (
+        "ceiling ← bright; floor ← dark; not predicted: beam, board, bookcase, chair, clutter, "
+    )
     assert summary in capsys.readouterr().out
     matrices = {name: _confusion(tmp_path / name) for name in ("unknown", "never")}
     floor, ceiling = (1 + CLASSES.index(name) for name in ("floor", "ceiling"))

@@ -203,7 +203,10 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("classes=escapes.json",), r"escapes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),
-        (("unknown_classes=[sky]",), "unknown_classes: found sky; expected of background, dark"),
+        (
+            ("unknown_classes=[sky]",),
+            "unknown_classes: found sky; expected names among background, dark",
+        ),
         (("unknown_classes=[background,dark,green,bright]",), "unknown_classes: found all classes"),
         (("scores=softmax",), "scores: found softmax; expected"),
         (("output=ours.ckpt",), r"output: found ours\.ckpt; expected .*\.onnx"),

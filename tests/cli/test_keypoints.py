@@ -154,6 +154,6 @@ def test_settings_that_cannot_work_are_named(
 def test_pycolmap_is_missed_before_any_work(run: Run, tmp_path: Path, monkeypatch: Patch) -> None:
     monkeypatch.setitem(sys.modules, "pycolmap", None)
     (tmp_path / "in").mkdir()
-    with pytest.raises(SystemExit, match=re.escape("tangent-train[keypoints]")):
+    with pytest.raises(SystemExit, match=re.escape("pip install -e '.[keypoints]'")):
         run("input=in", "output=out")
     assert [path.name for path in tmp_path.iterdir()] == ["in"]

@@ -208,7 +208,7 @@ def test_videos_that_cannot_be_used(
     monkeypatch.setitem(__import__("sys").modules, "av", None)
     with pytest.raises(SystemExit, match="1 of 1 images"):
         predict(input=good, output="other")
-    assert "pip install 'tangent-train[video]'" in " ".join(capsys.readouterr().out.split())
+    assert "pip install -e '.[video]'" in " ".join(capsys.readouterr().out.split())
 
 
 def test_a_shard_has_whole_videos(tmp_path: Path, predict: Predict) -> None:

@@ -231,7 +231,7 @@ def test_earlier_images_are_kept_without_overwrite(
     again = {"input": room, "output": tmp_path / "tan", "overwrite": True, "format": "jpg"}
     (folder / "notes.txt").write_text("mine")
     before = contents(folder)
-    assert "notes.txt, which is" in refused(base_level=0, **again)
+    assert "notes.txt, which is not a tangent image" in refused(base_level=0, **again)
     assert contents(folder) == before
     (folder / "notes.txt").unlink()
     render_with(base_level=0, **again)

@@ -218,7 +218,9 @@ def test_earlier_projects_are_kept_without_overwrite(
     before = contents(project)
     assert "project, which exists" in refused(**settings)
     (project / "database.db").write_text("mine")
-    assert "project/database.db, which is" in refused(overwrite=True, **settings)
+    assert "project/database.db, which is not a tangent image" in refused(
+        overwrite=True, **settings
+    )
     (project / "database.db").unlink()
     assert contents(project) == before
     render_with(overwrite=True, faces=[3], **settings)

@@ -28,13 +28,13 @@ GPANO_TAGS = {
 
 
 def write_png(path: Path, image: NDArray[Any]) -> None:
-    """Write an image in OpenCV's order of colours."""
+    """Write an image in OpenCV's order of colors."""
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), image)
 
 
 def read_png(path: Path) -> NDArray[Any]:
-    """Read an image as it is stored, in OpenCV's order of colours."""
+    """Read an image as it is stored, in OpenCV's order of colors."""
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert image is not None
     return image
@@ -66,8 +66,8 @@ def exif_orientation(orientation: int) -> bytes:
     return b"MM\0*\0\0\0\x08\0\x01" + struct.pack(">HHIHHI", 274, 3, 1, orientation, 0, 0)
 
 
-def turned(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Pixels as displayed: where EXIF has the first row and the first column (CIPA DC-008)."""
+def as_displayed(stored: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Return pixels as displayed, by EXIF position of first row and column (CIPA DC-008)."""
     row_side, column_side = ("tl", "tr", "br", "bl", "lt", "rt", "rb", "lb")[orientation - 1]
     shown = stored if row_side in "tb" else stored.swapaxes(0, 1)
     if "r" in (row_side, column_side):

@@ -1,7 +1,7 @@
 """Perspective cameras against the equations of the paper's supplement, section 2.1.
 
-The paper counts pixels from the corner of the image (c' = W'/2); ours are counted from the centre
-of the first pixel, so that ``c_paper = c + ½``.
+The paper counts pixels from the corner of the image (c' = W'/2); here they are counted from the
+center of the first pixel, so that ``c_paper = c + ½``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from tests.geometry.paper_camera import normalizing_homography
 SIZE = (480, 760)  # height, width: not square, mistake 5 of the released code swaps them
 K = np.array([[560.0, 0, 370.25], [0, 520.0, 244.0], [0, 0, 1]])
 CORNER = np.array([[1.0, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
-"""From pixels counted from centres to pixels counted from corners."""
+"""Converts pixels counted from centers to pixels counted from corners."""
 
 
 def paper_shift_range(
@@ -96,7 +96,7 @@ def test_impossible_fields_of_view_are_refused(fov_deg: float) -> None:
         camera_matrix_from_fov(fov_deg, (4, 4))
 
 
-def test_a_camera_matrix_has_focal_lengths_a_centre_and_nothing_else() -> None:
+def test_a_camera_matrix_consists_of_focal_lengths_and_a_center() -> None:
     assert is_camera_matrix(K)
     for place, value in (
         *(((0, 0), 0), ((1, 1), -520), ((0, 1), 1), ((1, 0), 1), ((2, 0), 1), ((2, 1), 1)),
@@ -110,7 +110,7 @@ def test_a_camera_matrix_has_focal_lengths_a_centre_and_nothing_else() -> None:
     assert not is_camera_matrix(np.eye(4))
 
 
-def test_perspective_directions_hit_their_own_pixel() -> None:
+def test_perspective_directions_project_to_their_pixel() -> None:
     directions = perspective_directions(K, SIZE)
     assert directions.shape == (*SIZE, 3)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=-1), 1)

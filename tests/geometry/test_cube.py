@@ -1,4 +1,4 @@
-"""The faces of a cube: where their corners are, that they meet, who owns what."""
+"""Faces of a cube: positions of corners, common edges, owners."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
 
 
-def test_integers_of_numpy_are_integers() -> None:
+def test_numpy_integers_are_accepted() -> None:
     grid = CubeGrid(np.int64(9), margin=np.int32(1))  # type: ignore[arg-type]
     assert (type(grid.dim), grid.pitch) == (int, 2 / 7)
     for dim in (True, 9.0):
@@ -42,13 +42,13 @@ def test_integers_of_numpy_are_integers() -> None:
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
-def test_every_direction_is_seen_by_its_owner_alone(
+def test_only_the_owner_contains_a_direction(
     rotation: NDArray[np.float64] | None,
 ) -> None:
     grid = CubeGrid(9, rotation)
     directions = random_directions(5000)
-    places = grid.project(directions, np.arange(6)[:, None])
-    seen = (np.abs(places - 4) < 4.5).all(axis=-1)
+    positions = grid.project(directions, np.arange(6)[:, None])
+    seen = (np.abs(positions - 4) < 4.5).all(axis=-1)
     np.testing.assert_array_equal(seen.sum(axis=0), 1)
     np.testing.assert_array_equal(grid.owners(directions), seen.argmax(axis=0))
     # The face of the largest coordinate, by hand.
@@ -73,7 +73,7 @@ def test_a_margin_shows_what_is_beyond_the_face() -> None:
 @pytest.mark.parametrize(
     "grid", [CubeGrid(5, ROTATION.T), CubeGrid(9, ROTATION.T, 2), TangentGrid(0, 4, 20, ROTATION.T)]
 )
-def test_a_rotation_replaces_the_grids_own(grid: CubeGrid | TangentGrid) -> None:
+def test_a_rotation_replaces_that_of_the_grid(grid: CubeGrid | TangentGrid) -> None:
     rotated = grid.with_rotation(ROTATION)
     assert type(rotated) is type(grid)
     assert rotated != grid

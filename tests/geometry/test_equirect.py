@@ -39,7 +39,7 @@ def test_levels_begin_with_two_rows() -> None:
         ((3.5, 1.5), (180, -90)),
     ],
 )
-def test_pixels_of_a_panorama_of_two_rows(
+def test_pixels_of_a_panorama_of_two_rows_have_known_positions(
     pixel: tuple[float, float], lonlat_deg: tuple[float, float]
 ) -> None:
     lonlat = np.radians(lonlat_deg)
@@ -48,7 +48,7 @@ def test_pixels_of_a_panorama_of_two_rows(
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_directions_are_those_of_the_pixel_centres(shape: Shape) -> None:
+def test_directions_are_those_of_the_pixel_centers(shape: Shape) -> None:
     height, width = shape
     rows, columns = np.mgrid[:height, :width]
     pixels = np.stack([columns, rows], axis=-1)

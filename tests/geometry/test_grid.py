@@ -49,7 +49,7 @@ def test_impossible_levels_are_refused(base_level: int, level: int) -> None:
         TangentGrid(base_level, level)
 
 
-def test_sizes_that_take_for_ever_are_refused() -> None:
+def test_very_large_sizes_are_refused() -> None:
     assert TangentGrid(0, 30).dim == TangentGrid(0, 5, 2**30).dim == 2**30
     with pytest.raises(SettingError, match="level: found 31; expected at most 30"):
         TangentGrid(0, 31)
@@ -57,7 +57,7 @@ def test_sizes_that_take_for_ever_are_refused() -> None:
         TangentGrid(0, 5, 2**30 + 1)
 
 
-def test_grids_are_values() -> None:
+def test_grids_are_compared_by_value() -> None:
     different = [
         TangentGrid(0, 5),
         TangentGrid(1, 5),

@@ -13,13 +13,13 @@ from tests.rendering import reference
 
 @pytest.mark.parametrize("level", [0, 1, 2, 3, 4])
 def test_subdivision_is_trimeshs_loop_subdivision(level: int) -> None:
-    ours, theirs = icosphere(level), reference.subdivided_icosahedron(level)
-    centers = ours.vertices[ours.faces].mean(axis=1), theirs.triangles_center
-    for points, others in ((ours.vertices, theirs.vertices), centers):
+    mesh, expected = icosphere(level), reference.subdivided_icosahedron(level)
+    centers = mesh.vertices[mesh.faces].mean(axis=1), expected.triangles_center
+    for points, others in ((mesh.vertices, expected.vertices), centers):
         distance, match = cKDTree(others).query(points)
         assert distance.max() < 1e-12
         assert len(set(match.tolist())) == len(others) == len(points)
-    triple = np.linalg.det(ours.vertices[ours.faces])
+    triple = np.linalg.det(mesh.vertices[mesh.faces])
     assert (triple * triple[0] > 0).all(), "all faces have one winding"
 
 

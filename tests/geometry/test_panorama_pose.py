@@ -12,8 +12,8 @@ from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation, xyz_to
 
 def posed(seed: int, mirrored: bool) -> PanoramaPose:
     rng = np.random.default_rng(seed)
-    turn = random_rotation(rng)
-    return PanoramaPose(turn @ FLIP_Y if mirrored else turn, rng.normal(size=3) * 4)
+    rotation = random_rotation(rng)
+    return PanoramaPose(rotation @ FLIP_Y if mirrored else rotation, rng.normal(size=3) * 4)
 
 
 def test_a_panorama_in_a_right_handed_room() -> None:
@@ -23,7 +23,7 @@ def test_a_panorama_in_a_right_handed_room() -> None:
     np.testing.assert_allclose(pose.points_m(ahead, 2), (3, 6, 1.5), atol=1e-15)
     np.testing.assert_allclose(pose.points_m(right, 2), (3, 4, 3.5), atol=1e-15)
     np.testing.assert_allclose(pose.points_m(up, 2), (1, 4, 1.5), atol=1e-15)
-    direction, distance = pose.seen((3, 4 - 1, 1.5 + np.sqrt(3)))
+    direction, distance = pose.project((3, 4 - 1, 1.5 + np.sqrt(3)))
     np.testing.assert_allclose(np.degrees(xyz_to_lonlat(direction)), (120, 0), atol=1e-12)
     assert distance == pytest.approx(2)
 
@@ -45,7 +45,7 @@ def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> Non
 
 
 @pytest.mark.parametrize(
-    ("matrix", "place", "message"),
+    ("matrix", "location_m", "message"),
     [
         (np.eye(3) * 2, np.zeros(3), "3×3 rotation matrix"),
         (np.eye(4), np.zeros(3), "3×3 rotation matrix"),
@@ -53,13 +53,13 @@ def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> Non
         (np.eye(3), np.array([0, np.inf, 0]), "expected 3 finite numbers"),
     ],
 )
-def test_what_is_no_pose(
-    matrix: NDArray[np.float64], place: NDArray[np.float64], message: str
+def test_invalid_poses_are_refused(
+    matrix: NDArray[np.float64], location_m: NDArray[np.float64], message: str
 ) -> None:
     with pytest.raises(SettingError, match=message):
-        PanoramaPose(matrix, place)
+        PanoramaPose(matrix, location_m)
 
 
-def test_worlds_must_be_the_same() -> None:
+def test_relative_poses_need_the_same_world() -> None:
     with pytest.raises(SettingError, match="same world"):
         posed(1, mirrored=True).relative_to(posed(1, mirrored=False))

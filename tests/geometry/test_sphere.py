@@ -40,17 +40,19 @@ latitudes = st.floats(-math.pi / 2, math.pi / 2)
         (45, 30, (math.sqrt(3 / 8), math.sqrt(3 / 8), 0.5)),
     ],
 )
-def test_axes(lon_deg: float, lat_deg: float, xyz: tuple[float, float, float]) -> None:
+def test_axes_have_the_documented_directions(
+    lon_deg: float, lat_deg: float, xyz: tuple[float, float, float]
+) -> None:
     np.testing.assert_allclose(lonlat_to_xyz(np.radians([lon_deg, lat_deg])), xyz, atol=1e-15)
 
 
 @given(longitudes, latitudes)
-def test_lonlat_survives_the_way_through_xyz(lon: float, lat: float) -> None:
+def test_lonlat_is_recovered_from_xyz(lon: float, lat: float) -> None:
     xyz = lonlat_to_xyz([lon, lat])
     lon_back, lat_back = xyz_to_lonlat(7 * xyz)
     assert np.linalg.norm(xyz) == pytest.approx(1, abs=1e-14)
     assert lat_back == pytest.approx(lat, abs=1e-12)
-    # Near a pole longitude means little: compare what it moves on the sphere.
+    # Near a pole longitude is imprecise: compare the distance on the sphere.
     assert math.cos(lat) * math.sin((lon_back - lon) / 2) == pytest.approx(0, abs=1e-12)
     assert -math.pi <= lon_back <= math.pi
 
@@ -94,7 +96,7 @@ def test_impossible_rotations_are_refused(take: Any, rotation: NDArray[np.float6
         take(rotation)
 
 
-def test_rotations_written_with_seven_digits_are_taken() -> None:
+def test_rotations_written_with_seven_digits_are_accepted() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         matrix = random_rotation(rng)

@@ -1,4 +1,4 @@
-"""Class maps: those of this package against the published lists, and what they compute."""
+"""Class maps: names against published lists, and the computed probabilities."""
 
 from __future__ import annotations
 
@@ -115,11 +115,11 @@ def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
     trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))
     assert trained.trained.class_names == ("unknown", "wall", "sofa", "floor")
     assert trained.trained.groups == [[0], [], [1]]
-    with pytest.raises(SettingError, match="target classes wall; expected of floor, sofa"):
+    with pytest.raises(SettingError, match="target classes wall; expected names among floor, sofa"):
         map_classes(_trained(["wall"]), given, targets=("floor", "sofa"))
 
 
-def test_a_map_of_a_map() -> None:
+def test_a_map_can_follow_a_map() -> None:
     """Scores of the innermost network, with its image size."""
     first = ClassMap("m", None, {"indoor": ["bed", "wall"], "outdoor": ["sky"]})
     names = ["bed", "wall", "sky", "tree"]
@@ -142,7 +142,7 @@ def test_a_map_of_a_map() -> None:
         ({"classes": {"wall": ["wall", "mirror"], "glass": ["Mirror"]}}, "found mirror more than"),
     ],
 )
-def test_unusable_files(content: Any, message: str, tmp_path: Path) -> None:
+def test_unusable_files_are_refused(content: Any, message: str, tmp_path: Path) -> None:
     path = tmp_path / "map.json"
     path.write_text(json.dumps(content))
     with pytest.raises(DataError, match=message) as caught:

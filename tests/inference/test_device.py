@@ -69,7 +69,7 @@ def test_only_the_image_goes_to_the_device_and_only_labels_come_back(
     assert set(transfers) == {"from {'cpu'} to {'cuda'}"}
 
 
-def test_up_is_judged_on_the_device() -> None:
+def test_up_is_estimated_on_the_device() -> None:
     trained, image, _ = _case("cube")
     with fake_gpu(trained.network) as transfers, pytest.raises(RuntimeError, match="numpy"):
         NetworkJudge(trained, "cuda")(image, np.eye(3))  # the doubts of the first come back
@@ -77,7 +77,7 @@ def test_up_is_judged_on_the_device() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_tensors_are_rendered_as_arrays_are(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensors_are_rendered_like_arrays(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Images of 0 to 255, up to the precision of positions of OpenCV, and the other inputs."""
     trained, image, views = _case(name)
 

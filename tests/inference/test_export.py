@@ -1,4 +1,4 @@
-"""Exported networks compute the same, say all that is needed to use them, or are not written."""
+"""Exported networks compute the same scores and contain all settings; else they are not written."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_only_a_safetensors_file_can_be_exported_again(
     ("network", "size", "fixed"),
     [("Tied", (9, 7), None), ("OneSize", (24, 40), (24, 40)), ("TwoSizes", (20, 40), (20, 40))],
 )
-def test_networks_that_are_hard_to_export(
+def test_networks_that_are_hard_to_export_are_exported(
     network: str,
     size: tuple[int, int],
     fixed: tuple[int, int] | None,
@@ -130,7 +130,7 @@ def test_networks_that_are_hard_to_export(
     tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """Tied tensors, one size only, sizes that cannot be dynamic in ONNX: the file says so."""
+    """Tied tensors; one size only; sizes that cannot be dynamic in ONNX are in the file."""
     image_size = fixed or (32, 32)
     trained = small_trained(config_section(network), image_size=image_size)
     path = tmp_path / f"net{suffix}"
@@ -166,7 +166,7 @@ def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
         ("Tracing", "its scores differ from PyTorch's"),
     ],
 )
-def test_what_would_compute_something_else_is_refused(
+def test_files_that_compute_other_scores_are_refused(
     network: str, message: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     trained = small_trained(config_section(network))

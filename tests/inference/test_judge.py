@@ -1,4 +1,4 @@
-"""Which way is up by a network that is sure of its images only where they are upright."""
+"""Evidence for up from a network that is confident only on upright images."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8
 
 
 @pytest.mark.parametrize("height", [64, 200])
-def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
+def test_the_network_is_most_confident_on_upright_views(height: int) -> None:
     ups = AXES @ random_rotation(np.random.default_rng(height)).T
     judge = _judge()
     for true in range(6):
@@ -68,12 +68,12 @@ def test_the_network_is_surest_of_what_is_upright(height: int) -> None:
         # Upside down nothing fits, and both classes are equally likely everywhere.
         assert likely.argmin() == (true + 3) % 6
         np.testing.assert_allclose(likely.min(), 12 * np.log(2), atol=0.4)
-        # Lying on a side, two views see the border upright (half of each fits), two one colour.
+        # Lying on a side, two views see the border upright (half of each fits), two one color.
         others = np.delete(likely, [true, (true + 3) % 6])
         np.testing.assert_allclose(others, 12 * np.log(4), atol=0.4)
 
 
-def test_who_is_told_where_up_is_does_not_judge() -> None:
+def test_networks_with_elevation_give_no_evidence() -> None:
     judge = _judge(inputs=("rgb", "elevation"))
     np.testing.assert_array_equal(judge(InputImage(_bright_above(AXES[1])), AXES), np.zeros(6))
 
@@ -87,7 +87,7 @@ def test_who_is_told_where_up_is_does_not_judge() -> None:
         (WholeSky(), {}, 32, 20),
     ],
 )
-def test_images_are_such_as_the_network_takes(
+def test_views_have_a_size_that_the_network_takes(
     network: Sky, changes: dict[str, Any], side: int, count: int
 ) -> None:
     likely = _judge(network, **changes)(InputImage(_bright_above(AXES[2])), AXES)

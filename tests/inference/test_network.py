@@ -195,7 +195,7 @@ def test_images_of_pillow_get_what_their_files_get(
         np.testing.assert_array_equal(network.labels(opened, fov=60), expected)
 
 
-def test_a_network_says_what_it_is(network: Network) -> None:
+def test_a_network_has_a_description(network: Network) -> None:
     assert repr(network) == (
         "<Network of 3 classes (dark, green, bright), inputs rgb, trained at level 4 on 16×16 "
         "images of TangentRepresentation, on cpu>"
@@ -210,7 +210,7 @@ def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> Non
     assert (on_gpu.cpu() == network.labels(panorama)).double().mean() > 0.99
 
 
-def test_no_more_images_than_asked_for_are_in_memory(tmp_path: Path) -> None:
+def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=7)
     counts: list[int] = []
     network.trained.network.register_forward_pre_hook(
@@ -220,7 +220,7 @@ def test_no_more_images_than_asked_for_are_in_memory(tmp_path: Path) -> None:
     assert counts == [7, 7, 6]
 
 
-def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
+def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
     """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
     panorama = sphere(32)
@@ -236,13 +236,15 @@ def test_depth_is_in_metres(tmp_path: Path, predicted: Predicted) -> None:
     assert (network.labels(panorama, depth=depth_m * 0) != expected).any()
     for wrong in (None, depth_m[:16], steps):
         with pytest.raises(
-            SettingError, match=r"depth: .*expected floats in metres, 64 × 32 \(width × height\)"
+            SettingError, match=r"depth: .*expected floats in meters, 64 × 32 \(width × height\)"
         ):
             network.labels(panorama, depth=wrong)
 
 
 @pytest.mark.parametrize("unmapped", ["unknown", "never"])
-def test_classes_of_another_data_set(tmp_path: Path, predicted: Predicted, unmapped: Any) -> None:
+def test_class_maps_convert_labels_and_scores(
+    tmp_path: Path, predicted: Predicted, unmapped: Any
+) -> None:
     checkpoint = write_checkpoint(tmp_path / "net.ckpt")
     (tmp_path / "map.json").write_text('{"classes": {"light": ["bright"], "shade": ["dark"]}}')
     network = tt.load(checkpoint, class_map=tmp_path / "map.json", unmapped=unmapped)
@@ -268,7 +270,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "room.jpg: found .*No such file"),
-        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colours"),
+        (Image.new("F", (32, 16)), r"image: found float32 .*; expected colou?rs"),
         ([[0]], "found list; expected RGB"),
     ],
 )
@@ -278,7 +280,7 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
 
 
 @pytest.mark.parametrize("count", [0, -1, 1.5])
-def test_a_network_sees_at_least_one_image_at_a_time(count: Any, tmp_path: Path) -> None:
+def test_images_per_forward_is_at_least_one(count: Any, tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=f"images_per_forward: found {count}; .* 1 or more"):
         tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=count)
 
@@ -300,7 +302,7 @@ def test_photos_have_no_rotations(tmp_path: Path) -> None:
         ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
         ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),
-        ({"depth": np.zeros((16, 32))}, "None: the network sees rgb"),
+        ({"depth": np.zeros((16, 32))}, "None: the network's inputs are rgb"),
         ({"mask": "none.png"}, "none.png: found no such file"),
         ({"mask": _RGB[..., 0].T}, r"mask: found 16 × 32 .*expected a whole panorama"),
         ({"mask": Path()}, r"\.png: found no such file; expected a mask .* of each panorama"),

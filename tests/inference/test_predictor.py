@@ -1,4 +1,4 @@
-"""Scores of panoramas and photos: those of an evaluation, at any size, wherever the views are."""
+"""Scores of panoramas and photos: those of an evaluation, at any size, for all kinds of views."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_images_share_memory_only_one_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("in_memory", [True, False])
-def test_memory_of_another_size_or_on_a_disk_is_given_back(
+def test_memory_of_another_size_or_on_a_disk_is_released(
     in_memory: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not in_memory:
@@ -184,7 +184,7 @@ def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
 def test_panoramas_of_any_size_get_labels_of_their_size(
     representation: dict[str, Any], height: int
 ) -> None:
-    """Smooth colours: the labels are those of a network that sees every pixel."""
+    """Smooth colors: the labels are those of a network that sees every pixel."""
     rgb = sphere(height)
     labels = _labels(trained_network(representation), InputImage(rgb))
     assert labels.shape == (height, 2 * height)
@@ -193,7 +193,7 @@ def test_panoramas_of_any_size_get_labels_of_their_size(
 
 
 def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
-    """A checkerboard finer than the network's pixels is grey to it."""
+    """A checkerboard finer than the network's pixels looks gray."""
     board = (np.indices((128, 256)).sum(axis=0) % 2 * 255).astype(np.uint8)
     rgb = cv2.cvtColor(board, cv2.COLOR_GRAY2RGB)
     trained = trained_network(TANGENT)
@@ -201,7 +201,7 @@ def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
     np.testing.assert_array_equal(_labels(trained, InputImage(rgb)), expected)
 
 
-def test_unsure_is_unknown_of_networks_that_know_nothing_too() -> None:
+def test_pixels_of_low_confidence_are_unknown() -> None:
     groups = [[0], [1], [2]]  # of which the last means nothing
     names = ("unknown", "dark", "green")
     trained = trained_network(TANGENT, class_names=names, groups=groups)
@@ -253,7 +253,7 @@ def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
         ("feather", 3, (7, 9)),
     ],
 )
-def test_photos_with_the_networks_pixels_are_labelled_pixel_by_pixel(
+def test_photos_with_the_networks_pixels_are_labeled_pixel_by_pixel(
     blend: str, channels: int, size: tuple[int, int]
 ) -> None:
     """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""
@@ -303,7 +303,7 @@ def test_a_photo_of_a_telescope_needs_little_memory() -> None:
     assert labels[0, 0] != labels[0, -1]
 
 
-# What cannot work.
+# Invalid settings.
 
 
 def test_impossible_settings_are_refused() -> None:

@@ -26,7 +26,7 @@ PERSPECTIVE = {"_target_": _RENDERING + "PerspectiveRepresentation", "level": 6,
 
 
 def sphere(height: int) -> NDArray[np.uint8]:
-    """Colours that are smooth on the sphere."""
+    """Colors that are smooth on the sphere."""
     x, y, z = np.moveaxis(equirect_directions((height, 2 * height)), -1, 0)
     return np.stack([128 + 120 * x, 128 + 120 * y * z, 128 + 120 * z], axis=-1).astype(np.uint8)
 

@@ -34,7 +34,7 @@ def two_views(
     points_m[:4] = special[:count]
     left = PanoramaPose(random_rotation(rng) @ FLIP_Y, np.zeros(3))
     right = PanoramaPose(random_rotation(rng) @ FLIP_Y, baseline_m * unit(rng.normal(size=3)))
-    left_xyz, right_xyz = (pose.seen(points_m)[0] for pose in (left, right))
+    left_xyz, right_xyz = (pose.project(points_m)[0] for pose in (left, right))
     order = rng.permutation(count)  # the special points are not the wrong ones
     left_xyz, right_xyz = left_xyz[order], right_xyz[order]
     right_xyz[:wrong] = unit(rng.normal(size=(wrong, 3)))

@@ -22,15 +22,15 @@ CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     points_m = random_directions(250, 4) * rng.uniform(1.5, 5, (250, 1))
-    found, places, pairs = [], [], {}
+    found, positions, pairs = [], [], {}
     for left in range(3):
         pose = PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3) * 0.6)
         order = rng.permutation(250)
-        seen_xyz = pose.seen(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
+        seen_xyz = pose.project(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
         found.append(keypoints_at(unit(seen_xyz)))
-        places.append(np.argsort(order))
+        positions.append(np.argsort(order))
         for right in range(left):  # the order of names and of images differ
-            matches = np.stack([places[left], places[right]], axis=1)
+            matches = np.stack([positions[left], positions[right]], axis=1)
             both = found[left], found[right]
             rays = (side.directions_xyz[k] for side, k in zip(both, matches.T, strict=True))
             pairs[left, right] = matches, estimate_two_view(*rays)
@@ -64,7 +64,7 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["PANORAMIC", "DEGENERATE"])
-def test_pairs_without_translation(tmp_path: Path, kind: str) -> None:
+def test_pairs_without_translation_have_another_kind(tmp_path: Path, kind: str) -> None:
     rotated = kind == "PANORAMIC"
     rotation = random_rotation(np.random.default_rng(1)) if rotated else None
     two_view = TwoView(np.full(9, rotated), rotation)

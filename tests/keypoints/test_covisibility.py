@@ -1,4 +1,4 @@
-"""Areas that two panoramas both see, against rooms whose rays are traced in closed form."""
+"""Areas visible in two panoramas, against rooms whose rays are traced in closed form."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ SHAPE = (128, 256)
 
 
 class Room(NamedTuple):
-    """A box seen from inside, with boxes in it; corners as (low, high) in metres."""
+    """A box seen from inside, with boxes in it; corners as (low, high) in meters."""
 
     walls: tuple[Array, Array]
     boxes: tuple[tuple[Array, Array], ...] = ()
 
-    def distance_m(self, centre: Array, rays: Array) -> Array:
+    def distance_m(self, center: Array, rays: Array) -> Array:
         """Distance to the first surface along unit rays ``(…, 3)``, by the slab method."""
-        distance = _slabs(centre, rays, *self.walls)[1]
+        distance = _slabs(center, rays, *self.walls)[1]
         for low, high in self.boxes:
-            near, far = _slabs(centre, rays, low, high)
+            near, far = _slabs(center, rays, low, high)
             distance = np.where((near <= far) & (near > 0), np.minimum(near, distance), distance)
         return distance
 
@@ -47,15 +47,15 @@ class Room(NamedTuple):
         return DepthView(self.distance_m(pose.location_m, rays).astype(np.float32), pose)
 
     def hidden(self, pose: PanoramaPose, points_m: Array) -> Array:
-        """How far behind what is seen from a place points are, in metres: 0 if visible."""
-        way = points_m - pose.location_m
-        away = np.linalg.norm(way, axis=-1)
-        return away - self.distance_m(pose.location_m, way / away[..., None])
+        """Distance in meters of points behind the first surface seen from a pose: 0 if visible."""
+        offset = points_m - pose.location_m
+        away = np.linalg.norm(offset, axis=-1)
+        return away - self.distance_m(pose.location_m, offset / away[..., None])
 
 
-def _slabs(centre: Array, rays: Array, low: Array, high: Array) -> tuple[Array, Array]:
+def _slabs(center: Array, rays: Array, low: Array, high: Array) -> tuple[Array, Array]:
     with np.errstate(divide="ignore"):
-        first, second = ((corner - centre) / rays for corner in (low, high))
+        first, second = ((corner - center) / rays for corner in (low, high))
     return np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
 
 
@@ -85,7 +85,7 @@ LEFT, RIGHT = upright((-1.8, 0.2, 1.5), 20), upright((1.6, -0.4, 1.4), 170)
         (upright((-0.1, 0.1, 2.5)), upright((0.5, 0.1, 0.7), 45)),
     ],
 )
-def test_what_a_box_hides(left: PanoramaPose, right: PanoramaPose) -> None:
+def test_points_behind_a_box_are_hidden(left: PanoramaPose, right: PanoramaPose) -> None:
     views = ROOM.view(left), ROOM.view(right)
     directions = equirect_directions(SHAPE).reshape(-1, 3)
     shares = []
@@ -103,14 +103,14 @@ def test_what_a_box_hides(left: PanoramaPose, right: PanoramaPose) -> None:
     assert fov_overlap(*views) == pytest.approx(np.mean(shares), abs=0.015)
 
 
-def test_missing_depth() -> None:
+def test_missing_depth_hides_nothing_and_is_not_counted() -> None:
     left, right = ROOM.view(LEFT), ROOM.view(RIGHT)
     directions = equirect_directions(SHAPE).reshape(-1, 3)
     full = visible_from(directions, left, right)
     holes = np.random.default_rng(2).random(SHAPE) < 0.3
     part = DepthView(np.where(holes, np.nan, left.distance_m), LEFT)
     blind = DepthView(np.full(SHAPE, np.nan), RIGHT)
-    # Without a place not counted; nothing known to hide it: counted.
+    # A point without depth is not counted; missing depth in the target does not hide it.
     np.testing.assert_array_equal(visible_from(directions, part, right), full & ~holes.reshape(-1))
     assert visible_from(directions, left, blind).all()
     assert not visible_from(directions, blind, left).any()
@@ -123,7 +123,7 @@ def test_missing_depth() -> None:
 
 def test_distances_between_pixels_of_a_wall_are_exact() -> None:
     view = Room(WALLS).view(LEFT)
-    # All around the seam and both poles, between pixel centres.
+    # All around the seam and both poles, between pixel centers.
     lonlat = np.stack([np.linspace(-np.pi, np.pi, 500), np.linspace(-1.57, 1.57, 500)], axis=-1)
     rays = lonlat_to_xyz(lonlat)
     expected = Room(WALLS).distance_m(LEFT.location_m, rays @ LEFT.world_from_panorama.T)
@@ -151,7 +151,7 @@ def test_matches_of_the_same_point_are_correct() -> None:
     points_m = left.pose.points_m(
         rays, ROOM.distance_m(LEFT.location_m, rays @ LEFT.world_from_panorama.T)
     )
-    seen, _ = right.pose.seen(points_m)
+    seen, _ = right.pose.project(points_m)
     visible = ROOM.hidden(right.pose, points_m) < 1e-6
     truth = correct_matches(rays[visible], seen[visible], left, right)
     assert truth.known.all()

@@ -29,8 +29,8 @@ DOG = 2 ** (1 / 6)
 # The panorama.
 
 
-def test_a_panorama_has_no_seam() -> None:
-    """Rolled, it has the same keypoints, rolled: at ±180° as anywhere else."""
+def test_keypoints_do_not_depend_on_the_seam() -> None:
+    """A rolled panorama has the same keypoints, rolled, also at ±180°."""
     image, columns = texture(SHAPE), 200
     roll = rotation_about([0, 0, 1], columns / SHAPE[1] * 2 * np.pi)
     left = rotated(detect_on_equirect(image), roll)
@@ -59,7 +59,7 @@ def test_a_blob_is_found_once_wherever_it_is(lon_deg: float, lat_deg: float) -> 
 
 
 @pytest.mark.parametrize("tangent", [False, True])
-def test_a_blank_panorama_has_none_and_colour_is_grey(tangent: bool) -> None:
+def test_blank_panoramas_have_no_keypoints_and_color_is_converted(tangent: bool) -> None:
     def found(image: NDArray[np.uint8]) -> SphericalKeypoints:
         if tangent:
             return detect_on_tangent_images(image, TangentGrid(0, 5, dim=29), 21)
@@ -116,7 +116,7 @@ def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
 
 # At base level 2 two keypoints of this texture are found on both sides of a border.
 @pytest.mark.parametrize("base_level", [0, 2])
-def test_every_keypoint_is_owned_by_its_image_and_there_once(base_level: int) -> None:
+def test_every_keypoint_is_owned_by_its_image_and_occurs_once(base_level: int) -> None:
     points = found_on_texture(base_level)
     grid = TangentGrid(base_level, LEVEL)
     np.testing.assert_array_equal(grid.owners(points.directions_xyz), points.images)

@@ -40,7 +40,7 @@ def skewed_maps(count: int = 40) -> NDArray[np.float64]:
 def test_orientations_are_those_of_the_gradient_on_the_sphere() -> None:
     jacobian = skewed_maps()
     rng = np.random.default_rng(2)
-    # Grey values of slope g on the sphere have the slope Jᵀg in the image.
+    # Gray values of slope g on the sphere have the slope Jᵀg in the image.
     on_sphere = np.einsum("nci,ni->nc", jacobian, rng.normal(size=(len(jacobian), 2)))
     in_image = np.einsum("nc,nci->ni", on_sphere, jacobian)
     angles = np.arctan2(in_image[:, 1], in_image[:, 0])

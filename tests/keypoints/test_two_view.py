@@ -29,10 +29,10 @@ def differences(found: TwoView, scene: Scene) -> tuple[float, float]:
     return rotation, float(angle_deg(found.translation, scene.translation_m))
 
 
-# Where a match may lie.
+# Errors of matches.
 
 
-def test_errors_are_the_distances_to_the_rays_as_they_appear() -> None:
+def test_errors_are_angles_to_projected_rays() -> None:
     rng = np.random.default_rng(1)
     rotation, t = random_rotation(rng), unit(rng.normal(size=3))
     left, right = unit(rng.normal(size=(2, 60, 3)))
@@ -58,7 +58,7 @@ def test_along_the_baseline_errors_are_finite(sign: int) -> None:
     assert errors[0 if sign == 1 else 1] == pytest.approx(0, abs=1e-12)
 
 
-# What a fit proves.
+# Significance of a fit.
 
 
 @pytest.mark.parametrize("inliers", [2, 3, 4, 5, 9])
@@ -81,7 +81,7 @@ def test_chance_of_a_rotation_is_that_of_caps(inliers: int) -> None:
 
 
 @pytest.mark.parametrize(("noise_deg", "wrong"), [(0, 0), (0.1, 300), (0.1, 480)])
-def test_noise_and_wrong_matches(noise_deg: float, wrong: int) -> None:
+def test_motion_is_found_among_noise_and_wrong_matches(noise_deg: float, wrong: int) -> None:
     scene = two_views(600, wrong=wrong, noise_deg=noise_deg, seed=2)
     found = estimated(scene)
     rotation, translation = differences(found, scene)

@@ -1,4 +1,4 @@
-"""Panoramas of closed forms: rotated ones are computed, not resampled."""
+"""Panoramas in closed form: rotated panoramas are computed, not resampled."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.geometry.directions import angle_deg
 def texture(
     shape: tuple[int, int], rotation: ArrayLike | None = None, seed: int = 0
 ) -> NDArray[np.uint8]:
-    """A sphere cut out of random grey volumes, isotropic; rotated, direction d shows Rᵀd."""
+    """A sphere cut out of random gray volumes, isotropic; rotated, direction d shows Rᵀd."""
     directions = equirect_directions(shape)
     if rotation is not None:
         directions = directions @ np.asarray(rotation)
@@ -28,27 +28,27 @@ def texture(
 def volume_texture(
     points_xyz: NDArray[np.float64], cells: Sequence[int], seed: int = 0
 ) -> NDArray[np.uint8]:
-    """Grey values of random volumes, of so many cells along a side, in the unit ball."""
+    """Gray values of random volumes, of so many cells along a side, in the unit ball."""
     rng = np.random.default_rng(seed)
-    grey = np.zeros(points_xyz.shape[:-1])
+    gray = np.zeros(points_xyz.shape[:-1])
     for side in cells:
         volume = rng.standard_normal((side + 4,) * 3)
         places = np.moveaxis((points_xyz + 1) / 2 * side + 1.5, -1, 0)
-        grey += map_coordinates(volume, places, order=3) * side**-0.25
-    return _as_bytes(127 + 75 * grey)
+        gray += map_coordinates(volume, places, order=3) * side**-0.25
+    return _as_bytes(127 + 75 * gray)
 
 
 def blob(
     shape: tuple[int, int], center_xyz: NDArray[np.float64], sigma_rad: float
 ) -> NDArray[np.uint8]:
-    """A bright Gaussian blob on grey: 60 + 150 exp(−angle² / 2σ²)."""
+    """A bright Gaussian blob on gray: 60 + 150 exp(−angle² / 2σ²)."""
     chord = ((equirect_directions(shape) - center_xyz) ** 2).sum(axis=-1)
     angle = 2 * np.arcsin(np.sqrt(chord) / 2)
     return _as_bytes(60 + 150 * np.exp(-(angle**2) / (2 * sigma_rad**2)))
 
 
-def _as_bytes(grey: NDArray[np.float64]) -> NDArray[np.uint8]:
-    return np.rint(grey.clip(0, 255)).astype(np.uint8)
+def _as_bytes(gray: NDArray[np.float64]) -> NDArray[np.uint8]:
+    return np.rint(gray.clip(0, 255)).astype(np.uint8)
 
 
 def rotated(points: SphericalKeypoints, rotation: ArrayLike) -> SphericalKeypoints:
@@ -62,13 +62,13 @@ def rotated(points: SphericalKeypoints, rotation: ArrayLike) -> SphericalKeypoin
 
 
 class Agreement:
-    """Keypoints of a panorama and of the rotated one, each with the most similar one near.
+    """Pairs keypoints of two panoramas: each with the most similar one nearby.
 
     Attributes:
-        share: Of all keypoints, those with another of similar size within 1°.
-        error_deg: Median angle between those.
+        share: Share of keypoints that have another of similar size within 1°.
+        error_deg: Median angle between such pairs.
         size_ratio: Median ratio of their sizes.
-        size_spread: Median of |log| of it.
+        size_spread: Median of the absolute logarithm of this ratio.
         turn_deg: Median angle between their orientations.
     """
 

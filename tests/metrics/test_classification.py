@@ -19,8 +19,8 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     for batch in (slice(7), slice(7, 8), slice(8, None)):
         metric.update(prediction[batch], truth[batch])
     matrix = metric.compute()
-    for place in np.ndindex(CLASSES, CLASSES):
-        assert matrix[place] == ((truth == place[0]) & (prediction == place[1])).sum()
+    for cell in np.ndindex(CLASSES, CLASSES):
+        assert matrix[cell] == ((truth == cell[0]) & (prediction == cell[1])).sum()
     scores = classification_scores(matrix)
     overall = MulticlassAccuracy(CLASSES, average="micro")(prediction, truth)
     assert scores.accuracy == pytest.approx(float(overall))
@@ -31,7 +31,7 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     assert scores.counts.sum() == 38
 
 
-def test_nothing_counted_has_no_scores() -> None:
+def test_scores_without_images_are_nan() -> None:
     scores = classification_scores(np.zeros((3, 3), np.int64))
     assert np.isnan([scores.accuracy, scores.class_accuracy, *scores.of_class]).all()
     assert scores.counts.tolist() == [0, 0, 0]

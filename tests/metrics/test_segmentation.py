@@ -50,15 +50,15 @@ def test_scores_equal_plain_numpy_over_the_whole_data_set() -> None:
 
 
 @pytest.mark.parametrize(("absent", "mean"), [("skip", (1 + 0.5) / 2), ("zero", (1 + 0.5 + 0) / 3)])
-def test_absent_classes(absent: str, mean: float) -> None:
+def test_absent_classes_are_skipped_or_count_as_zero(absent: str, mean: float) -> None:
     confusion = np.zeros((4, 4))
     confusion[1, 1] = 10
     confusion[2, 2], confusion[2, 3] = 5, 5
-    confusion[0, 3] = 100  # unknown truth counts for nothing
+    confusion[0, 3] = 100  # unknown truth is ignored
     assert segmentation_scores(confusion, absent).miou == pytest.approx(mean)  # type: ignore[arg-type]
 
 
-def test_nothing_labelled() -> None:
+def test_scores_without_labels_are_nan_or_zero() -> None:
     empty = np.zeros((4, 4))
     scores = segmentation_scores(empty)
     assert np.isnan(scores.miou)
@@ -69,7 +69,7 @@ def test_nothing_labelled() -> None:
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e9])
-def test_scores_are_of_shares_however_little_there_is(scale: float) -> None:
+def test_scores_do_not_depend_on_the_scale_of_counts(scale: float) -> None:
     # One pixel of class 3; as solid angles, pixels are small fractions of a steradian.
     confusion = np.array([[0, 5, 0, 0], [1, 8, 1, 0], [0, 2, 6, 0], [0, 0, 0, 1.0]])
     scores = segmentation_scores(confusion * scale)
@@ -78,7 +78,7 @@ def test_scores_are_of_shares_however_little_there_is(scale: float) -> None:
     np.testing.assert_allclose(scores.share, [10 / 19, 8 / 19, 1 / 19], rtol=1e-12)
 
 
-def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
+def test_solid_angles_give_the_area_on_the_sphere() -> None:
     height, width = 64, 128
     truth = torch.ones(height, width, dtype=torch.int64)
     truth[: height // 4] = 2  # above 45°: (1 − sin 45°)/2 of the sphere, a quarter of the rows
@@ -91,7 +91,7 @@ def test_solid_angle_weighs_a_hemisphere_as_half_whatever_its_rows() -> None:
 
 
 def test_latitude_bands_go_from_north_to_south() -> None:
-    # Rows of 1°: their centres are half a degree from the edges of the bands.
+    # Rows of 1°: their centers are half a degree from the edges of the bands.
     truth = torch.arange(1, 7).repeat_interleave(30)[:, None].expand(180, 4)
     metric = SegmentationMetric(7)
     metric.update(truth, truth)
@@ -102,7 +102,7 @@ def test_latitude_bands_go_from_north_to_south() -> None:
 
 
 def test_a_row_on_the_edge_of_two_bands_counts_in_the_northern_one() -> None:
-    """Row i of H has its centre at 90° − (2i + 1) · 90°/H, here in whole numbers of H-ths."""
+    """Row i of H has its center at 90° − (2i + 1) · 90°/H, here in whole numbers of H-ths."""
     for height in range(1, 64):
         expected = np.zeros(6, np.int64)
         for row in range(height):
@@ -128,7 +128,7 @@ def test_large_counts_stay_exact() -> None:
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method .* was called before")
 def test_processes_together_count_every_image_once() -> None:
-    """Of three processes, one with two panoramas, one with a third, one without any."""
+    """Three processes: with two panoramas, with one, and without."""
     whole = _counted(_panoramas()).compute()
     parts = [_counted(_panoramas()[:2]), _counted(_panoramas()[2:]), SegmentationMetric(CLASSES)]
     states = [[dim_zero_cat(getattr(p, name)) for p in parts] for name in parts[0]._reductions]
@@ -149,10 +149,10 @@ def test_every_image_is_kept_until_the_next_evaluation() -> None:
     matrices = metric.compute()
     for k, pair in enumerate(pairs):
         alone = _counted([pair]).compute()
-        for own, matrix in zip(
+        for sums, matrix in zip(
             matrices.of_images[k], (alone.pixels, alone.solid_angle), strict=True
         ):
-            truth, predicted, hits = own
+            truth, predicted, hits = sums
             np.testing.assert_allclose(truth, matrix[1:].sum(axis=1), rtol=1e-12)
             np.testing.assert_allclose(predicted, matrix[:, 1:].sum(axis=0), rtol=1e-12)
             np.testing.assert_allclose(hits, matrix.diagonal()[1:], rtol=1e-12)
@@ -203,7 +203,7 @@ def test_draws_without_labels_are_left_out() -> None:
     assert with_one == bootstrap_intervals(of_images.repeat(2, axis=0))
 
 
-def test_there_is_no_interval_of_one_image_or_of_nothing_labelled() -> None:
+def test_intervals_need_several_images_and_labels() -> None:
     _, of_images = _random_images(1)
     assert bootstrap_intervals(of_images) == {}
     assert bootstrap_intervals(of_images[:0]) == {}

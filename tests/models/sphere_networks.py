@@ -16,7 +16,7 @@ STAGE = "downs.1"
 
 
 def small_unet() -> UNet:
-    """Of stride 4; `STAGE` is its deepest."""
+    """Return a UNet of stride 4, whose deepest stage is `STAGE`."""
     return UNet(3, 3, (4, 6, 8))
 
 

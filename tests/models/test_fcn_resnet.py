@@ -1,4 +1,4 @@
-"""FCN-ResNet against torchvision's own, with fabricated weights in all the forms of files."""
+"""FCN-ResNet against torchvision's tensors, with fabricated weights in all the forms of files."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ def test_all_that_the_file_has_but_the_last_layer_is_loaded(
     state = published.state_dict()
     torch.save(_resnet(published) if form == "resnet" else state, tmp_path / "x.pth")
     network = FCNResNet(3, 21, 50, weights=tmp_path / "x.pth").eval()
-    own = {n: t for n, t in network.state_dict().items() if "num_batches_tracked" not in n}
-    same = {name for name, tensor in own.items() if torch.equal(tensor, state[name])}
-    head = set() if form == "resnet" else {n for n in own if n.startswith("classifier.")}
-    assert same >= {n for n in own if n.startswith("backbone.")} | head - set(LAST)
+    tensors = {n: t for n, t in network.state_dict().items() if "num_batches_tracked" not in n}
+    same = {name for name, tensor in tensors.items() if torch.equal(tensor, state[name])}
+    head = set() if form == "resnet" else {n for n in tensors if n.startswith("classifier.")}
+    assert same >= {n for n in tensors if n.startswith("backbone.")} | head - set(LAST)
     assert not same & {LAST[0]}
     if head:
         network.load_state_dict({n: state[n] for n in LAST}, strict=False)
@@ -62,8 +62,8 @@ def test_published_weights_come_from_the_cache_or_the_internet(
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     url = ResNet50_Weights.IMAGENET1K_V1.url
 
-    def refuse(asked: str, *_: Any, **__: Any) -> None:
-        assert asked == url
+    def refuse(wanted: str, *_: Any, **__: Any) -> None:
+        assert wanted == url
         raise URLError("no route to host")
 
     with monkeypatch.context() as patch:
@@ -73,9 +73,9 @@ def test_published_weights_come_from_the_cache_or_the_internet(
             FCNResNet(3, 14, 50, weights="imagenet")
     torch.save(_resnet(published), tmp_path / "hub" / "checkpoints" / url.rpartition("/")[2])
     stem = published.get_parameter("backbone.conv1.weight")
-    own = FCNResNet(4, 14, 50, weights="imagenet").get_parameter("backbone.conv1.weight")
-    assert torch.equal(own[:, :3], stem)
-    assert not own[:, 3].any(), "depth changes nothing before the first step"
+    tensors = FCNResNet(4, 14, 50, weights="imagenet").get_parameter("backbone.conv1.weight")
+    assert torch.equal(tensors[:, :3], stem)
+    assert not tensors[:, 3].any(), "depth changes nothing before the first step"
 
 
 @pytest.mark.parametrize(

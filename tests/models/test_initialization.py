@@ -158,7 +158,7 @@ def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize(
-    ("now", "places", "told"),
+    ("now", "places", "change"),
     [
         ("RGBE", [0, 1, 2, None], "starts at zero: E; left out: D"),
         ("RGBED", [0, 1, 2, None, 3], "starts at zero: E"),
@@ -166,19 +166,19 @@ def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> Non
     ],
 )
 def test_filters_go_by_the_names_of_their_channels(
-    tmp_path: Path, now: str, places: list[int | None], told: str | None
+    tmp_path: Path, now: str, places: list[int | None], change: str | None
 ) -> None:
     rgbd, network = _network(4), _network(len(now))
     torch.save(rgbd.state_dict(), tmp_path / "rgbd.pt")
     origins = initialize(network, tmp_path / "rgbd.pt", (tuple("RGBD"), tuple(now)))
-    assert origins.adapted == ({} if told is None else {"0.weight": told})
+    assert origins.adapted == ({} if change is None else {"0.weight": change})
     before, after = rgbd.state_dict()["0.weight"], network.state_dict()["0.weight"]
     for channel, place in enumerate(places):
         expected = torch.zeros_like(before[:, 0]) if place is None else before[:, place]
         torch.testing.assert_close(after[:, channel], expected, rtol=0, atol=0)
 
 
-def test_what_does_not_fit_at_all_is_refused(tmp_path: Path) -> None:
+def test_a_file_without_a_fitting_tensor_is_refused(tmp_path: Path) -> None:
     torch.save({"head.weight": torch.zeros(3)}, tmp_path / "other.pt")
     with pytest.raises(DataError, match=r"other\.pt: found no tensor that fits, but head\.weight"):
         initialize(_network(), tmp_path / "other.pt")

@@ -69,7 +69,7 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     with pytest.raises(DataError, match=r"outputs \['a', 'b'\]; .* the only output"):
         OnnxNetwork(_linear(tmp_path / "two.onnx", outputs=("a", "b")))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(SettingError, match=r"onnxruntime.*pip install 'tangent-train\[export\]'"):
+    with pytest.raises(SettingError, match=r"onnxruntime.*pip install -e '\.\[export\]'"):
         OnnxNetwork(whole)
 
 
@@ -148,7 +148,7 @@ def test_outputs_without_an_axis_of_images_are_of_files_for_one(
             network(images[:1])
 
 
-def test_what_is_no_network_of_photos_is_refused(tmp_path: Path) -> None:
+def test_other_onnx_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"found images as tensor\(int64\); expected tensor"):
         OnnxNetwork(write_onnx(tmp_path / "whole.onnx", IDENTITY, kind=TensorProto.INT64))
     flat = helper.make_node("Flatten", ["images"], ["scores"])

@@ -12,7 +12,7 @@ from tests.tasks.small_networks import with_statistics
 
 
 def test_parameters_are_those_of_the_released_code() -> None:
-    """Of the other width the docstring counts them."""
+    """The docstring's example counts those of the other width."""
     assert sum(p.numel() for p in ShapeClassifier(6, 40, width=32).parameters()) == 5_135_880
 
 
@@ -37,7 +37,7 @@ def test_scores_are_of_the_mean_over_views_and_positions() -> None:
         (nn.Linear(3, 2), "first convolution of Linear: found none"),
     ],
 )
-def test_what_cannot_be_widened_is_refused(network: nn.Module, message: str) -> None:
+def test_other_first_convolutions_are_refused(network: nn.Module, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         widen_stem(network, 6)
     with pytest.raises(SettingError, match=r"network\.in_channels: found 2; expected 3 or more"):

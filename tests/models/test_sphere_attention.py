@@ -19,8 +19,8 @@ from tests.models.sphere_networks import awake, sphere_rays
 
 def _inputs() -> tuple[Tensor, Tensor]:
     """Tokens of two spheres of five images, and directions that differ from sphere to sphere."""
-    turn = torch.tensor(random_rotation(np.random.default_rng(1)), dtype=torch.float32)
-    rays = torch.cat([sphere_rays(5), turn @ sphere_rays(5).roll(1, 1)])
+    rotation = torch.tensor(random_rotation(np.random.default_rng(1)), dtype=torch.float32)
+    rays = torch.cat([sphere_rays(5), rotation @ sphere_rays(5).roll(1, 1)])
     return torch.randn(2, 5, 12, 2, 3), token_directions(rays, 2, 3)
 
 
@@ -55,8 +55,8 @@ def _slow(mixer: SphereAttention, tokens: Tensor, directions: Tensor) -> Tensor:
                     for j in range(len(places))
                 ]
                 odds = np.exp(logits)
-                own = odds * [other[0] == place[0] for other in places]
-                share = odds / odds.sum() - own / own.sum()
+                same_image = odds * [other[0] == place[0] for other in places]
+                share = odds / odds.sum() - same_image / same_image.sum()
                 heads.append(torch.tensor(share) @ v[:, head])
             out[place[0], :, place[1], place[2]] = weights["output.weight"] @ torch.cat(heads)
     assert result.shape[2] == channels

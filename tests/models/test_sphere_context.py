@@ -59,8 +59,8 @@ class Averaging(nn.Module):
         return mean.expand_as(tokens) * self.scale[:, None, None]
 
 
-def test_features_get_what_the_mixer_says() -> None:
-    """At the stage: here all that the network does."""
+def test_the_mixers_result_is_added_to_the_features() -> None:
+    """The stage is the whole network here."""
     network = nn.Sequential(nn.Conv2d(3, 4, 3, padding=1))
     context = SphereContext(network, "0", Averaging, in_channels=3, tokens=2)
     images, rays = torch.randn(3, 3, 12, 10), sphere_rays(3)
@@ -92,7 +92,7 @@ def test_tokens_look_along_the_middle_of_their_pixels(size: tuple[int, int]) -> 
     torch.testing.assert_close(found[0], middle, rtol=0, atol=1e-12)
 
 
-def test_copies_are_on_their_own_and_the_network_by_itself_is_as_before() -> None:
+def test_copies_are_independent_and_the_inner_network_is_unchanged() -> None:
     network, images, rays = small_unet().eval(), torch.randn(2, 3, 16, 16), sphere_rays(2)
     plain = network(images)
     context = small_context(network).eval()
@@ -242,7 +242,7 @@ def test_scores_and_gradients_on_a_gpu_are_those_of_the_cpu() -> None:
 
 @GPU
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
-def test_half_precision(dtype: torch.dtype) -> None:
+def test_half_precision_is_close_to_single(dtype: torch.dtype) -> None:
     context = small_context().cuda().eval()
     images, rays = torch.randn(4, 3, 16, 16).cuda(), sphere_rays(4).cuda()
     with torch.no_grad():
@@ -256,7 +256,7 @@ def test_only_one_chunk_is_kept_for_the_gradient() -> None:
     context, images, rays = small_context().train(), torch.randn(16, 3, 32, 32), sphere_rays(16)
 
     def kept_bytes(size: int | None) -> int:
-        """Of tensors that the graph holds between the forward and the backward pass."""
+        """Return the bytes of tensors that the graph holds between forward and backward pass."""
         storages: dict[int, int] = {}
 
         def pack(tensor: Tensor) -> Tensor:

@@ -48,9 +48,7 @@ def test_channels_are_found_by_running_a_copy(
 @pytest.mark.parametrize(
     ("network", "stage"), [(small_unet(), "downs.9"), (_Twice(), "shared"), (_Twice(), "pool")]
 )
-def test_what_is_no_stage_is_refused_and_those_there_are_named(
-    network: nn.Module, stage: str
-) -> None:
+def test_other_submodules_are_refused_and_stages_are_named(network: nn.Module, stage: str) -> None:
     names = "stem, downs, downs.0, downs.1" if stage.startswith("downs") else "shared, last"
     message = rf"stage: found '{stage}' of {type(network).__name__}; expected .* There are: {names}"
     with pytest.raises(SettingError, match=message):

@@ -1,4 +1,4 @@
-"""A room drawn by its equations: independent of everything that is tested with it."""
+"""A room drawn by equations, independent of the code that is tested with it."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ _HIGH = np.array([2.4, 3.6, 1.2])
 _GRAY = np.array([[150, 120], [170, 95], [80, 225]])  # of the lower and upper side of each axis
 
 
-def draw_room(shape: tuple[int, int], turn: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """A panorama inside a box: doors and pictures on its walls, tiles below, a bright ceiling.
+def draw_room(shape: tuple[int, int], rotation: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Draw a panorama inside a box: doors and pictures on its walls, tiles below, a bright ceiling.
 
     Args:
         shape: ``(H, W)``.
-        turn: ``(3, 3)`` rotation; what stands upright is seen along ``turn @ (0, 0, 1)``.
+        rotation: ``(3, 3)``; up in the room is the direction ``rotation @ (0, 0, 1)``.
 
     Returns:
-        ``(H, W, 3)``.
+        ``(H, W, 3)`` uint8.
     """
     height, width = 2 * shape[0], 2 * shape[1]  # four rays per pixel
     latitude = np.pi * (0.5 - (np.arange(height) + 0.5) / height)[:, None]
     longitude = np.pi * ((np.arange(width) + 0.5) / width * 2 - 1)[None]
     x, y = np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude)
-    rays = np.stack([x, y, np.sin(latitude) + 0 * longitude], axis=-1) @ turn
+    rays = np.stack([x, y, np.sin(latitude) + 0 * longitude], axis=-1) @ rotation
     with np.errstate(divide="ignore"):
         distances = np.where(rays > 0, _HIGH, _LOW) / rays
     axis = distances.argmin(axis=-1)
@@ -38,7 +38,7 @@ def draw_room(shape: tuple[int, int], turn: NDArray[np.float64]) -> NDArray[np.u
 
 
 def _decoration(points: NDArray[Any], axis: NDArray[Any], upper: NDArray[Any]) -> NDArray[Any]:
-    """Grey added to walls and floor at points in metres."""
+    """Gray added to walls and floor at points in meters."""
     x, y, z = np.moveaxis(points, -1, 0)
     along = np.where(axis == 0, y, x)
     doors = (np.floor(along / 0.7) % 2 == 0) & (z < 0.55)

@@ -1,9 +1,8 @@
-"""Tangent images once more: slow, float64, written from the paper (section 3.2).
+"""A slow float64 reference for tangent images, written from the paper (section 3.2).
 
-No line here is shared with the library, which is tested against it. The mesh is trimesh's; the rest
-goes through longitude and latitude and the textbook formulas of the gnomonic projection (Snyder
-1987, chapter 22), where the library works with camera matrices. Faces come in an order of their
-own: `ReferenceGrid.order` matches them by their centres.
+It shares no code with the library, which is tested against it. The mesh comes from trimesh. Instead
+of camera matrices it uses longitude, latitude and the textbook formulas of the gnomonic projection
+(Snyder 1987, chapter 22). Faces are in another order: `ReferenceGrid.order` matches their centers.
 """
 
 from __future__ import annotations
@@ -57,7 +56,7 @@ def to_lonlat(xyz: Array) -> Array:
 
 
 def panorama_lonlat(shape: tuple[int, int]) -> Array:
-    """``(H, W, 2)`` of the pixel centres."""
+    """``(H, W, 2)`` of the pixel centers."""
     height, width = shape
     result = np.empty((height, width, 2))
     for row in range(height):
@@ -68,7 +67,7 @@ def panorama_lonlat(shape: tuple[int, int]) -> Array:
 
 
 def panorama_position(lonlat: Array, shape: tuple[int, int]) -> tuple[Array, Array]:
-    """Row and column, pixel centres at integers."""
+    """Row and column, pixel centers at integers."""
     height, width = shape
     row = (math.pi / 2 - lonlat[..., 1]) / math.pi * height - 0.5
     return row, (lonlat[..., 0] + math.pi) / (2 * math.pi) * width - 0.5
@@ -99,7 +98,7 @@ def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
 
 
 def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
-    """``(N, d, d, C)`` bilinear; off the outermost pixel centres their values continue."""
+    """``(N, d, d, C)`` bilinear; off the outermost pixel centers their values continue."""
     dim = images.shape[1]
     row, column = np.clip(row, 0, dim - 1), np.clip(column, 0, dim - 1)
     top = np.minimum(np.floor(row), dim - 2).astype(int)
@@ -122,7 +121,7 @@ class ReferenceGrid:
 
     @cached_property
     def centers_lonlat(self) -> Array:
-        """``(N, 2)`` barycentres of the faces, not rotated."""
+        """``(N, 2)`` barycenters of the faces, not rotated."""
         centers = subdivided_icosahedron(self.base_level).triangles_center
         return to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
 
@@ -132,12 +131,12 @@ class ReferenceGrid:
         return vertex_resolution(self.base_level - 1) / 2 ** (self.level - self.base_level)
 
     def order(self, centers_xyz: ArrayLike) -> NDArray[np.int64]:
-        """For each given centre the face here that has it."""
-        own = to_xyz(self.centers_lonlat) @ self.rotation.T
-        closeness = np.asarray(centers_xyz) @ own.T
+        """Return the face of this grid for each center."""
+        centers = to_xyz(self.centers_lonlat) @ self.rotation.T
+        closeness = np.asarray(centers_xyz) @ centers.T
         order = closeness.argmax(axis=1)
-        if closeness.max(axis=1).min() < 1 - 1e-12 or len(set(order.tolist())) != len(own):
-            raise AssertionError("the centres of the faces differ")
+        if closeness.max(axis=1).min() < 1 - 1e-12 or len(set(order.tolist())) != len(centers):
+            raise AssertionError("the centers of the faces differ")
         return order
 
     def lonlat(self, face: int) -> Array:
@@ -159,7 +158,7 @@ class ReferenceGrid:
         return np.stack([sample_panorama(image, self.lonlat(f), interpolation) for f in faces])
 
     def nearness(self, shape: tuple[int, int]) -> Array:
-        """``(H, W, N)`` cosine of the angle from every panorama pixel to every centre."""
+        """``(H, W, N)`` cosine of the angle from every panorama pixel to every center."""
         return self._resting(shape) @ to_xyz(self.centers_lonlat).T
 
     def _resting(self, shape: tuple[int, int]) -> Array:
@@ -170,15 +169,15 @@ class ReferenceGrid:
         lonlat = to_lonlat(self._resting(shape))
         lon, lat = lonlat[..., 0], lonlat[..., 1]
         lon_0, lat_0 = self.centers_lonlat[face, 0], self.centers_lonlat[face, 1]
-        turn = np.cos(lon - lon_0)
-        cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * turn
+        cosine = np.cos(lon - lon_0)
+        cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * cosine
         x = np.cos(lat) * np.sin(lon - lon_0) / cos_c
-        y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * turn) / cos_c
+        y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * cosine) / cos_c
         middle = (self.dim - 1) / 2
         return middle - y / self.pitch, middle + x / self.pitch
 
     def backward(self, images: Array, shape: tuple[int, int]) -> Array:
-        """``(N, d, d, C)`` -> ``(H, W, C)`` from the image with the nearest centre."""
+        """``(N, d, d, C)`` -> ``(H, W, C)`` from the image with the nearest center."""
         owner = self.nearness(shape).argmax(axis=-1)
         return sample_images(images, owner, *self.positions(shape, owner))
 
@@ -201,7 +200,7 @@ class ReferenceGrid:
         return total / weights
 
     def clear(self, shape: tuple[int, int]) -> NDArray[np.bool_]:
-        """Panorama pixels that are not half-way between two centres: their owner is certain."""
+        """Panorama pixels that are not half-way between two centers: their owner is certain."""
         return certain_labels(self.nearness(shape), margin=1e-9)
 
 

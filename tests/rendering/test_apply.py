@@ -23,7 +23,7 @@ def _smooth(height: int) -> NDArray[np.float32]:
 
 
 def _features(images: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Five features of every pixel and its neighbours."""
+    """Five features of every pixel and its neighbors."""
     blurred = (images + np.roll(images, 1, axis=2)) / 2
     return np.concatenate([blurred, np.sin(3 * images[..., :2])], axis=-1).astype(np.float64)
 
@@ -44,11 +44,11 @@ def test_results_are_those_of_all_images_at_once(
 
 
 @pytest.mark.parametrize(
-    ("grid", "asked", "expected"),
+    ("grid", "images_per_call", "expected"),
     [(TangentGrid(1, 5), 32, [32, 32, 16]), (TangentGrid(0, 9), None, [4] * 5)],  # 4 · 512² = 2^20
 )
-def test_images_come_in_order_and_no_more_than_asked_for(
-    grid: TangentGrid, asked: int | None, expected: list[int]
+def test_images_are_passed_in_order_and_in_limited_number(
+    grid: TangentGrid, images_per_call: int | None, expected: list[int]
 ) -> None:
     counts, seen = [], []
 
@@ -58,7 +58,7 @@ def test_images_come_in_order_and_no_more_than_asked_for(
         return np.zeros(images.shape[:3], np.float32)
 
     panorama = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
-    apply(noted, panorama, grid, images_per_call=asked)
+    apply(noted, panorama, grid, images_per_call=images_per_call)
     assert counts == expected
     np.testing.assert_array_equal(np.concatenate(seen), equirect_to_tangent(panorama, grid))
 
@@ -125,7 +125,7 @@ _ARRAY = np.zeros((8, 16, 3), np.float32)
         (lambda images: images.astype(complex), "complex128; expected a ndarray of numbers"),
         (torch.from_numpy, "found a Tensor"),
         (lambda _: None, "found a NoneType"),
-        (lambda images: images.astype(np.uint8), "blend: found 'feather' of results of uint8"),
+        (lambda images: images.astype(np.uint8), "blend: found 'feather' for results of uint8"),
         (
             _other_after_the_first([(10, 16, 16, 2), (10, 16, 16, 3)], [float, float]),
             r"found K = \(3,\)",
@@ -147,7 +147,7 @@ def test_other_results_are_refused(function: Function, message: str) -> None:
         (_ARRAY, {"images_per_call": 0}, "images_per_call: found 0"),
     ],
 )
-def test_what_cannot_be_rendered_is_refused(
+def test_unusable_arguments_are_refused(
     panorama: Any, settings: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(SettingError, match=message):

@@ -1,4 +1,4 @@
-"""Tangent images back to panoramas."""
+"""Render tangent images back to panoramas."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_arrays_that_float32_cannot_hold_are_exact(blend: Any, value: Any) -> No
 
 
 @pytest.mark.parametrize(("base_level", "shape"), [(0, (31, 63)), (1, (32, 64)), (3, (31, 63))])
-def test_one_class_everywhere(base_level: int, shape: tuple[int, int]) -> None:
+def test_one_class_covers_the_whole_panorama(base_level: int, shape: tuple[int, int]) -> None:
     """No other value anywhere: not at the poles, not at the seam, not between images."""
     grid = TangentGrid(base_level, base_level + 4)
     panorama = np.full(shape, 3, np.uint8)
@@ -39,7 +39,7 @@ def test_one_class_everywhere(base_level: int, shape: tuple[int, int]) -> None:
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize("blend", BLENDS)
-def test_equal_infinite_and_nan_scores(dtype: Any, blend: Any) -> None:
+def test_equal_infinite_and_nan_scores_have_defined_labels(dtype: Any, blend: Any) -> None:
     grid = TangentGrid(0, 4)
     scores = np.zeros((20, 18, 16, 16), dtype)
     assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
@@ -57,7 +57,7 @@ def test_equal_infinite_and_nan_scores(dtype: Any, blend: Any) -> None:
 
 @pytest.mark.parametrize("num_classes", [1, 15, 16, 40, 257])
 @pytest.mark.parametrize("shape", [(9, 20), (70, 141)])
-def test_any_number_of_classes(num_classes: int, shape: tuple[int, int]) -> None:
+def test_every_number_of_classes_works(num_classes: int, shape: tuple[int, int]) -> None:
     """The compiled kernel pads to 16; images may be finer or coarser than the panorama."""
     grid = TangentGrid(0, 4)
     size = (grid.num_images, num_classes, grid.dim, grid.dim)
@@ -87,7 +87,7 @@ def test_arrays_agree_with_tensors(dtype: Any, channels: tuple[int, ...], way: A
 
 
 @pytest.mark.parametrize("arguments", [{"blend": "feather"}, {"interpolation": "cubic"}])
-def test_nearest_errors(arguments: dict[str, Any]) -> None:
+def test_nearest_is_not_feathered(arguments: dict[str, Any]) -> None:
     settings = {"interpolation": "nearest"} | arguments
     with pytest.raises(SettingError, match="interpolation: found"):
         tangent_to_equirect(np.zeros((20, 16, 16)), TangentGrid(0, 4), (8, 16), **settings)
@@ -105,7 +105,7 @@ def test_batches_and_dtypes_are_kept() -> None:
 
 
 @pytest.mark.parametrize("blend", BLENDS)
-def test_gradients(blend: Any) -> None:
+def test_gradients_agree_with_finite_differences(blend: Any) -> None:
     grid = TangentGrid(0, 3)
     images = torch.rand(20, 1, 8, 8, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(
@@ -125,6 +125,8 @@ def test_gradients(blend: Any) -> None:
     ],
 )
 @pytest.mark.parametrize("render", [tangent_to_equirect, tangent_to_labels])
-def test_errors(render: Any, images: Any, shape: Any, blend: Any, message: str) -> None:
+def test_unusable_arguments_are_refused(
+    render: Any, images: Any, shape: Any, blend: Any, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         render(images, TangentGrid(0, 4), shape, blend)

@@ -1,4 +1,4 @@
-"""The cameras that are written say where the pixels of the images are: read by hand here."""
+"""Files of cameras contain the positions of pixels; here they are read by other code."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _cameras(grid: TangentGrid, faces: tuple[int, ...] = FACES) -> CameraFile:
 
 
 def _world_panorama(height: int) -> NDArray[np.float64]:
-    """``(H, 2H, 3)``: every pixel holds its place in the world of the files: y is to the left."""
+    """``(H, 2H, 3)``: each pixel contains its direction in the world of the files (y is left)."""
     left = np.pi - (np.arange(2 * height) + 0.5) / height * np.pi
     up = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
     left, up = np.meshgrid(left, up)
@@ -39,7 +39,7 @@ def _world_panorama(height: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_pixels_are_where_the_file_says(grid: TangentGrid, tmp_path: Path) -> None:
+def test_pixels_are_at_the_positions_in_the_file(grid: TangentGrid, tmp_path: Path) -> None:
     path, cameras = tmp_path / "new folder" / "cameras.json", _cameras(grid)
     write_cameras(path, cameras)
     assert read_cameras(path) == cameras
@@ -72,7 +72,9 @@ def test_pixels_are_where_the_file_says(grid: TangentGrid, tmp_path: Path) -> No
         ({"images": [{"file": "a.png", "face": 1}, {"file": "b.png", "face": 1}]}, "twice"),
     ],
 )
-def test_files_that_cannot_be_right(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+def test_inconsistent_files_are_refused(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
     path = tmp_path / "cameras.json"
     write_cameras(path, _cameras(GRIDS[0]))
     content = json.loads(path.read_text()) | changes
@@ -93,7 +95,7 @@ def test_files_that_cannot_be_right(changes: dict[str, Any], message: str, tmp_p
         b'[{"cameras": [{"image_prefix": "a/", "world_from_camera": [1, 2]}], "panoramas": {}}]',
     ],
 )
-def test_other_files(read: Any, content: bytes | None, tmp_path: Path) -> None:
+def test_other_files_are_refused(read: Any, content: bytes | None, tmp_path: Path) -> None:
     if content is not None:
         (tmp_path / "other.json").write_bytes(content)
     with pytest.raises(DataError, match=r"other\.json.*tangent-render"):

@@ -1,4 +1,4 @@
-"""Cube maps: where their faces meet and the poles; the rest is what tangent images do."""
+"""Cube maps: edges between faces, and poles; the rest is tested with tangent images."""
 
 from __future__ import annotations
 
@@ -12,10 +12,8 @@ from tangent_train.rendering import tangent_to_equirect, tangent_to_labels
 
 @pytest.mark.parametrize("shape", [(6, 12), (33, 67)])
 @pytest.mark.parametrize("dim", [2, 9, 16])
-def test_up_to_the_edge_a_pixel_takes_the_values_of_its_owner_alone(
-    dim: int, shape: tuple[int, int]
-) -> None:
-    """Beyond the outermost pixel centres, the outermost pixels go on: no mixing, no NaN."""
+def test_pixels_up_to_the_edge_only_use_their_owner(dim: int, shape: tuple[int, int]) -> None:
+    """Beyond the outermost pixel centers, pixels are repeated: no mixing, no NaN."""
     grid = CubeGrid(dim)
     images = torch.arange(1.0, 7.0)[:, None, None, None].expand(6, 1, dim, dim)
     panorama = tangent_to_equirect(images, grid, shape)[0].numpy()

@@ -28,7 +28,7 @@ def _random(*shape: int) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_to_tangent_images(interpolation: Interpolation) -> None:
+def test_tangent_images_equal_those_on_the_cpu(interpolation: Interpolation) -> None:
     panorama = _random(2, 3, *SHAPE)
     expected = equirect_to_tangent(panorama, GRID, [0, 7], interpolation)
     on_gpu = equirect_to_tangent(panorama.cuda(), GRID, [0, 7], interpolation)
@@ -37,7 +37,7 @@ def test_to_tangent_images(interpolation: Interpolation) -> None:
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-7), (torch.float32, 1e-4)])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_to_the_panorama_and_its_gradient(
+def test_panoramas_and_gradients_equal_those_on_the_cpu(
     blend: Blend, dtype: torch.dtype, tolerance: float
 ) -> None:
     images = _random(GRID.num_images, 2, GRID.dim, GRID.dim)
@@ -54,9 +54,11 @@ def test_to_the_panorama_and_its_gradient(
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
 @pytest.mark.parametrize("classes", [1, 13, 300])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_labels_of_any_precision(blend: Blend, classes: int, dtype: torch.dtype) -> None:
+def test_labels_of_each_precision_equal_those_on_the_cpu(
+    blend: Blend, classes: int, dtype: torch.dtype
+) -> None:
     scores = _random(GRID.num_images, classes, GRID.dim, GRID.dim).to(dtype)
-    if blend == "nearest":  # feathered, NaN spreads to all neighbours
+    if blend == "nearest":  # feathered, NaN spreads to all neighbors
         scores[0], scores[1], scores[2, 0] = torch.nan, -torch.inf, torch.nan
     expected = tangent_to_labels(scores.double(), GRID, SHAPE, blend)
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
@@ -65,7 +67,7 @@ def test_labels_of_any_precision(blend: Blend, classes: int, dtype: torch.dtype)
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_functions_of_images(blend: Blend) -> None:
+def test_applied_functions_equal_those_on_the_cpu(blend: Blend) -> None:
     panorama = _random(3, *SHAPE)
     expected = apply(torch.sin, panorama, GRID, blend)
     on_gpu = apply(torch.sin, panorama.cuda(), GRID, blend)
@@ -73,7 +75,7 @@ def test_functions_of_images(blend: Blend) -> None:
     torch.testing.assert_close(on_gpu.cpu(), expected)
 
 
-def test_confusion_matrices() -> None:
+def test_confusion_matrices_equal_those_on_the_cpu() -> None:
     prediction, truth = (_random(2, *SHAPE).abs() * 2).long().clamp(max=4)
     on_cpu, on_gpu = SegmentationMetric(5), SegmentationMetric(5).cuda()
     on_cpu.update(prediction, truth)

@@ -78,7 +78,7 @@ def _scores(sets: Any, classes: int) -> list[torch.Tensor]:
 @pytest.mark.parametrize("name", SETS)
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 @pytest.mark.parametrize("settings", [{}, {"averaged": True}, {"min_confidence": 0.3}])
-def test_torch_gives_the_results_of_the_compiled_kernels(
+def test_torch_agrees_with_the_compiled_kernels(
     name: str, blend: Blend, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(device_mosaic, "_SCORES_AT_ONCE", 2**15)

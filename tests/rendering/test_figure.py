@@ -1,4 +1,4 @@
-"""The figure: every image once, from north to south, showing what it looks at."""
+"""The figure shows each image once, from north to south."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ TOP = 800
 
 
 @pytest.mark.parametrize("base_level", [0, 1, 3])
-def test_parts_are_in_their_places(base_level: int) -> None:
-    """Colours are directions: by them, every place of the montage shows another image."""
+def test_images_are_at_their_positions(base_level: int) -> None:
+    """Colors encode directions, which identify the image at each position."""
     rotation = random_rotation(np.random.default_rng(1)) if base_level == 1 else None
     grid = TangentGrid(base_level, base_level + 4, rotation=rotation)
     panorama = np.rint((equirect_directions((64, 128)) + 1) * 127.5).astype(np.uint8)
@@ -39,7 +39,7 @@ def test_parts_are_in_their_places(base_level: int) -> None:
     assert (z[:-1].min(axis=1) >= z[1:].max(axis=1) - 1e-6).all()
 
 
-def test_grey_of_16_bits_and_numbers() -> None:
+def test_gray_of_16_bits_is_drawn_with_numbers() -> None:
     page = tangent_figure(np.full((32, 64), 100 * 257, np.uint16), TangentGrid(0, 4))
     assert page[TOP + 6, 6].tolist() == [100, 100, 100]
     # Images of 156 px every 160; in the middle of each its number, white on black.
@@ -51,11 +51,13 @@ def test_grey_of_16_bits_and_numbers() -> None:
 @pytest.mark.parametrize(
     ("panorama", "base_level", "message"),
     [
-        (np.zeros((32, 64), np.float32), 0, "grey or colours"),
-        (np.zeros((32, 64, 4), np.uint8), 0, "grey or colours"),
+        (np.zeros((32, 64), np.float32), 0, "gray or colors"),
+        (np.zeros((32, 64, 4), np.uint8), 0, "gray or colors"),
         (np.zeros((32, 64), np.uint8), 4, "base_level: found 4"),
     ],
 )
-def test_errors(panorama: NDArray[Any], base_level: int, message: str) -> None:
+def test_unusable_panoramas_are_refused(
+    panorama: NDArray[Any], base_level: int, message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         tangent_figure(panorama, TangentGrid(base_level, base_level + 4))

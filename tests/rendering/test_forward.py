@@ -1,4 +1,4 @@
-"""Panoramas to tangent images."""
+"""Render panoramas to tangent images."""
 
 from __future__ import annotations
 
@@ -49,7 +49,9 @@ def test_colors_equal_exact_values_everywhere(shape: tuple[int, int], dtype: Any
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 @pytest.mark.parametrize("left", [31.0, 57.5, 62.5, -0.5])
 @pytest.mark.parametrize("top", [-0.5, 7.0, 22.5])
-def test_parts_of_panoramas(top: float, left: float, dtype: Any, channels: tuple[int, ...]) -> None:
+def test_parts_of_panoramas_are_found_across_seam_and_poles(
+    top: float, left: float, dtype: Any, channels: tuple[int, ...]
+) -> None:
     """Ten pixels around, across the seam (63.5 or −0.5), up to a pole, half-way between pixels."""
     image = _random((32, 64, *channels), dtype)
     v, u = top + np.mgrid[0:9.125:0.125, 0:9.125:0.125]
@@ -70,7 +72,7 @@ def test_nearest_wraps_at_the_seam(monkeypatch: pytest.MonkeyPatch, remap: int) 
 
 @pytest.mark.parametrize("base_level", [0, 1])
 def test_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
-    """They were, in the released code."""
+    """In the paper's released code they were unknown."""
     grid = TangentGrid(base_level, base_level + 4)
     height, width = equirect_shape(grid.level)
     labels = np.full((height, width), 3, np.uint8)  # 0 would be unknown
@@ -87,7 +89,7 @@ def test_labels_at_the_seam_are_never_unknown(base_level: int) -> None:
 
 @pytest.mark.parametrize("width", [32766, 32767, 32768, 65537])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_nearest_columns_beyond_the_limit_of_opencv(width: int, dtype: Any) -> None:
+def test_nearest_columns_beyond_the_limit_of_opencv_are_found(width: int, dtype: Any) -> None:
     image = _random((2, width), np.float64).astype(np.float32)
     image = image if dtype == np.float32 else (image * np.iinfo(dtype).max).astype(dtype)
     columns = np.arange(width)
@@ -98,7 +100,7 @@ def test_nearest_columns_beyond_the_limit_of_opencv(width: int, dtype: Any) -> N
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
-def test_panoramas_too_large_for_opencv(
+def test_panoramas_too_large_for_opencv_are_rendered(
     monkeypatch: pytest.MonkeyPatch, interpolation: Any, dtype: Any
 ) -> None:
     image, grid = _random((32, 64, 3), dtype), TangentGrid(0, 4)
@@ -111,7 +113,7 @@ def test_panoramas_too_large_for_opencv(
 
 
 @pytest.mark.parametrize("grid", [TangentGrid(0, 5), TURNED])
-def test_only_the_asked_faces_in_their_order(
+def test_only_the_requested_faces_are_rendered_in_order(
     grid: TangentGrid, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     image = _random((64, 128, 6), np.uint8)
@@ -124,7 +126,7 @@ def test_only_the_asked_faces_in_their_order(
     assert equirect_to_tangent(torch.rand(2, 3, 8, 16), grid, []).shape == (2, 0, 3, 32, 32)
 
 
-def test_views_of_memory_and_read_only_arrays() -> None:
+def test_strided_and_read_only_arrays_are_rendered() -> None:
     image, grid = _random((64, 128, 4), np.uint8), TangentGrid(0, 5)
     view = image[::-1, :, 1::2]
     view.setflags(write=False)
@@ -144,7 +146,7 @@ def test_tensors_keep_batch_dtype_and_chunks(monkeypatch: pytest.MonkeyPatch) ->
 
 
 @pytest.mark.parametrize("shape", [(6, 12), (5, 11)])
-def test_gradients(shape: tuple[int, int]) -> None:
+def test_gradients_agree_with_finite_differences(shape: tuple[int, int]) -> None:
     image = torch.rand(1, *shape, dtype=torch.float64, requires_grad=True)
     grid = TangentGrid(0, 3)
     assert torch.autograd.gradcheck(lambda x: equirect_to_tangent(x, grid, [0, 12]), image)
@@ -167,7 +169,9 @@ def test_gradients(shape: tuple[int, int]) -> None:
         (np.zeros((3, 16, 32)), {}, r"array of shape \(3, 16, 32\).*transpose\(1, 2, 0\)"),
     ],
 )
-def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
+def test_unusable_arguments_are_refused(
+    image: Any, arguments: dict[str, Any], message: str
+) -> None:
     with pytest.raises(SettingError, match=message):
         equirect_to_tangent(image, TangentGrid(0, 4), **arguments)
 
@@ -176,5 +180,5 @@ def test_errors(image: Any, arguments: dict[str, Any], message: str) -> None:
     "image",
     [torch.zeros(5, 2, 4), torch.zeros(9, 4, 4), np.zeros((4, 8, 16)), np.zeros((4, 9, 3))],
 )
-def test_tiny_panoramas_are_no_wrong_layouts(image: Any) -> None:
+def test_tiny_panoramas_are_not_taken_for_wrong_layouts(image: Any) -> None:
     assert len(equirect_to_tangent(image, TangentGrid(0, 4))) == 20

@@ -125,7 +125,7 @@ def test_infinite_and_nan_scores_have_no_probability(blend: Blend, backend: Any)
     assert not _labels(_added(nothing, scores * torch.nan, grid)).any()
 
 
-def test_large_sums_live_in_a_file_and_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_sums_are_in_a_file_and_equal(monkeypatch: pytest.MonkeyPatch) -> None:
     grid, shape = GRIDS[0]
     scores = _scores(grid)
     expected = _probabilities(_added(ScoreMosaic(shape, 7, "feather"), scores, grid))

@@ -51,7 +51,7 @@ class Case(NamedTuple):
 CASES = [
     Case(0, 4, None, (50, 100)),  # the paper's extent
     Case(0, 5, 24, (63, 126)),  # cropped to the least; odd rows: one on the equator
-    Case(0, 3, 12, (33, 67), rotated=True),  # with a margin; half a revolution is no whole column
+    Case(0, 3, 12, (33, 67), rotated=True),  # a margin; half a revolution is not a whole column
     Case(1, 4, None, (50, 100), rotated=True),
     Case(1, 5, 13, (63, 126)),
     Case(2, 5, None, (32, 64)),
@@ -59,10 +59,10 @@ CASES = [
 
 
 class Pair(NamedTuple):
-    """Ours, the reference, and which face there each of ours is."""
+    """A grid, its reference, and the face of the reference for each face of the grid."""
 
-    ours: TangentGrid
-    theirs: ReferenceGrid
+    grid: TangentGrid
+    reference: ReferenceGrid
     order: NDArray[np.int64]
 
 
@@ -75,9 +75,9 @@ def case(request: pytest.FixtureRequest) -> Case:
 @lru_cache
 def pair_of(case: Case) -> Pair:
     rotation = ROTATION if case.rotated else np.eye(3)
-    ours = TangentGrid(case.base_level, case.level, case.dim, ROTATION if case.rotated else None)
-    theirs = ReferenceGrid(case.base_level, case.level, ours.dim, rotation)
-    return Pair(ours, theirs, theirs.order(ours.centers_xyz))
+    grid = TangentGrid(case.base_level, case.level, case.dim, ROTATION if case.rotated else None)
+    reference = ReferenceGrid(case.base_level, case.level, grid.dim, rotation)
+    return Pair(grid, reference, reference.order(grid.centers_xyz))
 
 
 def noise(*shape: int, seed: int = 0) -> Array:
@@ -93,10 +93,10 @@ def waves(shape: tuple[int, int]) -> Array:
 
 
 def certain_pixels(pair: Pair, case: Case, interpolation: Interpolation) -> NDArray[np.bool_]:
-    """Pixels ``(n, d, d)`` of our images that do not hang on the rounding of a position."""
+    """Pixels ``(n, d, d)`` of the grid's images that do not depend on rounding."""
     if interpolation == "bilinear":
-        return np.ones((len(pair.order), pair.ours.dim, pair.ours.dim), bool)
-    lonlat = np.stack([pair.theirs.lonlat(face) for face in pair.order])
+        return np.ones((len(pair.order), pair.grid.dim, pair.grid.dim), bool)
+    lonlat = np.stack([pair.reference.lonlat(face) for face in pair.order])
     # Nearest takes a pixel of an image smaller than 2^7: float32 rounds positions to 2^-17.
     certain = certain_nearest(lonlat, case.shape, margin=1e-4)
     assert certain.mean() > 0.9
@@ -104,16 +104,16 @@ def certain_pixels(pair: Pair, case: Case, interpolation: Interpolation) -> NDAr
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_forward_in_torch(case: Case, interpolation: Interpolation) -> None:
+def test_tensors_are_rendered_like_the_reference(case: Case, interpolation: Interpolation) -> None:
     pair = pair_of(case)
     image = noise(*case.shape, 3)
-    expected = pair.theirs.forward(image, interpolation)[pair.order]
+    expected = pair.reference.forward(image, interpolation)[pair.order]
     certain = certain_pixels(pair, case, interpolation)
     for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-4)):
         tensor = torch.from_numpy(image).permute(2, 0, 1).to(dtype)
-        result = equirect_to_tangent(tensor, pair.ours, interpolation=interpolation)
+        result = equirect_to_tangent(tensor, pair.grid, interpolation=interpolation)
         assert result.dtype == dtype
-        assert result.shape == (len(pair.order), 3, pair.ours.dim, pair.ours.dim)
+        assert result.shape == (len(pair.order), 3, pair.grid.dim, pair.grid.dim)
         error = np.abs(result.permute(0, 2, 3, 1).double().numpy() - expected)
         assert error[certain].max() < tolerance
 
@@ -123,8 +123,8 @@ def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integ
     pair = pair_of(case)
     labels = (noise(*case.shape) * np.iinfo(dtype).max).astype(dtype)
     certain = certain_pixels(pair, case, "nearest")
-    expected = pair.theirs.forward(labels[..., None].astype(np.float64), "nearest")[pair.order]
-    result = equirect_to_tangent(labels, pair.ours, interpolation="nearest")
+    expected = pair.reference.forward(labels[..., None].astype(np.float64), "nearest")[pair.order]
+    result = equirect_to_tangent(labels, pair.grid, interpolation="nearest")
     assert result.dtype == dtype
     assert result.shape == expected.shape[:-1]
     np.testing.assert_array_equal(result[certain], expected[..., 0][certain])
@@ -141,7 +141,7 @@ def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integ
         ("float64", 1, 1e-9),
     ],
 )
-def test_forward_of_any_number_of_channels(
+def test_every_number_of_channels_is_rendered(
     channels: int, dtype: str, largest: int, tolerance: float
 ) -> None:
     pair = pair_of(CASES[0])
@@ -152,8 +152,8 @@ def test_forward_of_any_number_of_channels(
     # OpenCV rounds positions; float32 positions near 100 are good to 4e-6 px.
     steps = [np.abs(np.diff(exact, axis=axis)).max() for axis in (0, 1)]
     tolerance += (dtype not in ("int32", "float64")) * 2 * POSITION_ERROR * sum(steps)
-    expected = pair.theirs.forward(exact)[pair.order].reshape(20, 16, 16, *shape[2:])
-    result = equirect_to_tangent(image, pair.ours)
+    expected = pair.reference.forward(exact)[pair.order].reshape(20, 16, 16, *shape[2:])
+    result = equirect_to_tangent(image, pair.grid)
     assert (result.dtype.name, result.shape) == (dtype, expected.shape)
     assert np.abs(result - expected).max() < tolerance
     assert abs((result - expected).mean()) < 0.1 or largest > 255, "no bias"
@@ -161,7 +161,9 @@ def test_forward_of_any_number_of_channels(
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
 @pytest.mark.parametrize("shape", [(50, 100), (33, 67)])
-def test_rotated_panorama(shape: tuple[int, int], interpolation: Interpolation) -> None:
+def test_rotated_panoramas_agree_with_the_reference(
+    shape: tuple[int, int], interpolation: Interpolation
+) -> None:
     image = noise(*shape, 3)
     seen_from = to_lonlat(to_xyz(panorama_lonlat(shape)) @ ROTATION)  # R⁻¹ d
     expected = sample_panorama(image, seen_from, interpolation)
@@ -173,49 +175,49 @@ def test_rotated_panorama(shape: tuple[int, int], interpolation: Interpolation) 
 
 
 def rendered_back(pair: Pair, images: Array, shape: tuple[int, int], blend: Blend) -> Array:
-    """The reference's panorama of our images ``(n, d, d, C)``."""
+    """The reference's panorama of the grid's images ``(n, d, d, C)``."""
     in_their_order = np.empty_like(images)
     in_their_order[pair.order] = images
     if blend == "feather":
-        return pair.theirs.feathered(in_their_order, shape)
-    return pair.theirs.backward(in_their_order, shape)
+        return pair.reference.feathered(in_their_order, shape)
+    return pair.reference.backward(in_their_order, shape)
 
 
 def clear_pixels(pair: Pair, shape: tuple[int, int], blend: Blend) -> NDArray[np.bool_]:
-    """Panorama pixels whose owner does not hang on rounding; a feathered one has no owner."""
-    clear = pair.theirs.clear(shape) if blend == "nearest" else np.ones(shape, bool)
+    """Panorama pixels whose owner does not depend on rounding; a feathered one has no owner."""
+    clear = pair.reference.clear(shape) if blend == "nearest" else np.ones(shape, bool)
     assert clear.mean() > 0.95
     return clear
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_backward_in_torch(case: Case, blend: Blend) -> None:
+def test_tensors_are_rendered_back_like_the_reference(case: Case, blend: Blend) -> None:
     pair = pair_of(case)
-    images = noise(len(pair.order), pair.ours.dim, pair.ours.dim, 3)
+    images = noise(len(pair.order), pair.grid.dim, pair.grid.dim, 3)
     clear = clear_pixels(pair, case.shape, blend)
     expected = rendered_back(pair, images, case.shape, blend)[clear]
     for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-5)):
         tensor = torch.from_numpy(images).permute(0, 3, 1, 2).to(dtype)
-        result = tangent_to_equirect(tensor, pair.ours, case.shape, blend)
+        result = tangent_to_equirect(tensor, pair.grid, case.shape, blend)
         assert (result.dtype, result.shape) == (dtype, (3, *case.shape))
         error = result.permute(1, 2, 0).double().numpy()[clear] - expected
         assert np.abs(error).max() < tolerance
-    arrays = tangent_to_equirect(images.astype(np.float32), pair.ours, case.shape, blend)
+    arrays = tangent_to_equirect(images.astype(np.float32), pair.grid, case.shape, blend)
     np.testing.assert_allclose(arrays[clear], expected, atol=2e-5)
 
 
 def test_nearest_is_the_nearest_pixel(case: Case) -> None:
-    ours, theirs, order = pair_of(case)
-    owner = theirs.nearness(case.shape).argmax(axis=-1)
-    places = np.stack(theirs.positions(case.shape, owner))
+    grid, reference, order = pair_of(case)
+    owner = reference.nearness(case.shape).argmax(axis=-1)
+    places = np.stack(reference.positions(case.shape, owner))
     # Half-way between two pixels or two images, rounding decides.
-    certain = theirs.clear(case.shape) & (np.abs(places % 1 - 0.5) > 1e-4).all(axis=0)
+    certain = reference.clear(case.shape) & (np.abs(places % 1 - 0.5) > 1e-4).all(axis=0)
     assert certain.mean() > 0.9
     # Every pixel has a value of its own.
-    images = np.arange(ours.num_images * ours.dim**2).reshape(-1, ours.dim, ours.dim)
-    row, column = np.floor(places + 0.5).clip(0, ours.dim - 1).astype(int)
+    images = np.arange(grid.num_images * grid.dim**2).reshape(-1, grid.dim, grid.dim)
+    row, column = np.floor(places + 0.5).clip(0, grid.dim - 1).astype(int)
     expected = images[np.argsort(order)[owner], row, column]
-    found = tangent_to_equirect(images, ours, case.shape, interpolation="nearest")
+    found = tangent_to_equirect(images, grid, case.shape, interpolation="nearest")
     assert found.dtype == images.dtype
     np.testing.assert_array_equal(found[certain], expected[certain])
 
@@ -223,12 +225,12 @@ def test_nearest_is_the_nearest_pixel(case: Case) -> None:
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_labels_are_the_best_interpolated_logits(case: Case, blend: Blend) -> None:
     pair = pair_of(case)
-    logits = noise(len(pair.order), pair.ours.dim, pair.ours.dim, CLASSES)
+    logits = noise(len(pair.order), pair.grid.dim, pair.grid.dim, CLASSES)
     rendered = rendered_back(pair, logits, case.shape, blend)
     clear = clear_pixels(pair, case.shape, blend)
     for dtype, margin in ((torch.float64, 1e-9), (torch.float32, 4e-5)):
         tensor = torch.from_numpy(logits).permute(0, 3, 1, 2).to(dtype)
-        labels = tangent_to_labels(tensor, pair.ours, case.shape, blend).numpy()
+        labels = tangent_to_labels(tensor, pair.grid, case.shape, blend).numpy()
         certain = clear & certain_labels(rendered, margin)
         assert certain.mean() > 0.95
         np.testing.assert_array_equal(labels[certain], rendered.argmax(axis=-1)[certain])

@@ -37,7 +37,7 @@ def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
 
 @pytest.mark.parametrize("base_level", [0, 1, 4])
 @pytest.mark.parametrize(("rotation", "shape"), [(None, (64, 128)), (ROTATION, (63, 125))])
-def test_owners_are_the_nearest_centres(
+def test_owners_are_the_nearest_centers(
     base_level: int, rotation: NDArray[np.float64] | None, shape: tuple[int, int]
 ) -> None:
     grid = TangentGrid(base_level, base_level + 3, rotation=rotation)
@@ -50,7 +50,7 @@ def test_owners_are_the_nearest_centres(
 
 
 @pytest.mark.parametrize("at_pole", [None, 0, 7])
-def test_spans_hold_what_images_see_and_little_more(at_pole: int | None) -> None:
+def test_spans_contain_the_covered_pixels_and_few_others(at_pole: int | None) -> None:
     shape, grid = (130, 200), TangentGrid(1, 6)
     if at_pole is not None:
         grid = grid.with_rotation([[1], [-1], [1]] * grid.world_from_camera[at_pole].T)
@@ -90,7 +90,7 @@ def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: An
 def test_tables_are_computed_once(
     monkeypatch: pytest.MonkeyPatch, rotation: NDArray[np.float64] | None
 ) -> None:
-    """The released code made its tables anew for every panorama."""
+    """The paper's released code computes its tables again for each panorama."""
 
     def render(shape: tuple[int, int]) -> list[NDArray[np.generic]]:
         grid = TangentGrid(0, 4, 15, rotation)  # a new, equal grid every time
@@ -170,8 +170,8 @@ def test_forked_workers_render_after_their_parent() -> None:
 
     expected, forked = render(0), {"num_workers": 1, "multiprocessing_context": "fork"}
     loader: Any = DataLoader([0], batch_size=None, collate_fn=render, timeout=60, **forked)  # type: ignore[arg-type]
-    for mine, theirs in zip(expected, next(iter(loader)), strict=True):
-        np.testing.assert_array_equal(mine, theirs)
+    for in_parent, in_worker in zip(expected, next(iter(loader)), strict=True):
+        np.testing.assert_array_equal(in_parent, in_worker)
 
 
 @pytest.mark.parametrize("threads", [1, 3])

@@ -22,13 +22,13 @@ PAGE = (DOCS / "results" / "distortion.md").read_text(encoding="utf-8")
 
 
 def test_the_page_shows_the_tables() -> None:
-    """Where the paper has a figure, it stands beside ours."""
+    """Figures of the paper are beside those of this project."""
     for rows in (fov(), surface_area(6), angular_resolution()):
         for line in markdown(rows).splitlines():
             assert line in PAGE
 
 
-def test_distortion_has_its_closed_forms() -> None:
+def test_distortions_agree_with_closed_forms() -> None:
     distortions = {row["images"]: row for row in representation_distortion((128, 256))}
     erp, cube, first = (distortions[name] for name in ("ERP", "cube", "b = 0"))
     gamma = math.gamma
@@ -42,7 +42,7 @@ def test_distortion_has_its_closed_forms() -> None:
     corner = math.degrees(2 * math.asin((3 - math.sqrt(3)) / (3 + math.sqrt(3))))
     assert cube["angle worst °"] == pytest.approx(corner)
     assert cube["area most"] == pytest.approx(math.sqrt(3) * math.pi / 2, rel=1e-3)
-    # The icosahedron's vertices are 37.377° from the centres of its faces: 2 asin(tan²(θ/2)).
+    # The icosahedron's vertices are 37.377° from the centers of its faces: 2 asin(tan²(θ/2)).
     angle = math.acos(math.sqrt((5 + 2 * math.sqrt(5)) / 15))
     assert first["angle worst °"] == pytest.approx(
         math.degrees(2 * math.asin(math.tan(angle / 2) ** 2))
@@ -68,7 +68,7 @@ def test_the_lens_agrees_with_a_slow_sampler(k1: float) -> None:
     np.testing.assert_allclose(found[0, 0], expected, atol=1e-9)
 
 
-def test_the_zoom_is_the_lens_on_average() -> None:
+def test_enlargement_is_the_mean_enlargement_of_the_lens() -> None:
     points = pixel_centers(torch.zeros(1, 1, 560, 560))
     body = points[points.abs().amax(dim=-1) < BODY]
     expected = float((1 + 0.5 * body.square().sum(dim=-1)).mean())

@@ -1,4 +1,4 @@
-"""Networks of other libraries and files, as checkpoints that every command takes."""
+"""Import photo networks from other libraries and files, as checkpoints for all commands."""
 
 from tangent_train.inference.photo_networks.importing import import_network
 from tangent_train.inference.photo_networks.network import PhotoNetwork

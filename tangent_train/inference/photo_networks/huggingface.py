@@ -1,4 +1,4 @@
-"""Segmentation networks of transformers, from the hub or a folder."""
+"""Load segmentation networks of transformers, from the Hugging Face hub or a folder."""
 
 from __future__ import annotations
 
@@ -28,28 +28,28 @@ _TASK = "the task is semantic"
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
 _SIDE = 32
-"""Rows and columns of images that are given to an image processor."""
+"""Rows and columns of the images with which an image processor is tested."""
 
 _NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
-"""Settings of an image processor that change positions of pixels."""
+"""Settings of an image processor that move pixels; they are switched off in the test."""
 
 _LISTED = 4
-"""Wrong tensors in a message."""
+"""Largest number of wrong tensors in a message."""
 
 
 def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
-    """A network of transformers for semantic or universal segmentation.
+    """Load a network of transformers for semantic or universal segmentation.
 
-    No code of its author is run, and weights are read from safetensors only.
+    Code from the model's author is not run, and weights are only read from safetensors files.
 
     Args:
         model: Name on the hub, or a folder written by ``save_pretrained``.
-        classes: JSON file of the class names; None for those of its config.
-        normalization: See `Normalization.of`; None for that of its image processor.
+        classes: JSON file of the class names; None for the names in the model's config.
+        normalization: See `Normalization.of`; None for that of the model's image processor.
 
     Raises:
-        DataError: A file is missing, cannot be fetched or used.
-        SettingError: A setting is impossible, or transformers is missing.
+        DataError: A file is missing, or cannot be fetched or used.
+        SettingError: A setting is invalid, or transformers is not installed.
     """
     folder = saved_folder(model)
     with offline():
@@ -60,7 +60,7 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
     config, path = json_in(folder, "config.json"), folder / "config.json"
     labels = config.get("id2label")
     if isinstance(labels, dict):
-        labels = {place: str(name).strip() for place, name in labels.items()}
+        labels = {index: str(name).strip() for index, name in labels.items()}
     names = names_of(labels, path, _NAMES)
     described = architecture(config | {"use_auxiliary_head": False})
     processor = _processor(folder)
@@ -74,7 +74,7 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
         settings["task"] = _task(folder, config)
     network = build_from_config(settings, "network", SettingsFile(path))
     if len(names) == 1 and network.is_universal:
-        expected = "two classes at least: masks say which class a pixel has, not if it has one"
+        expected = "at least two classes: with one, masks contain it in every pixel"
         raise DataError(path, found="masks of one class", expected=expected)
     tensors, remarks = tensors_in(folder)
     _load_tensors(network, tensors, folder)
@@ -92,10 +92,10 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
 
 
 def _processor(folder: Path) -> dict[str, Any]:
-    """Settings of the image processor, with those of its class where the file has none.
+    """Return settings of the image processor, with the defaults of its class.
 
-    ``do_flip_channel_order``, ``mean`` and ``std``, of images from 0 to 1, are measured. Texts are
-    left out, for some of them are names of files to be fetched.
+    ``do_flip_channel_order``, ``mean`` and ``std`` (for images from 0 to 1) are measured. Settings
+    with a text are left out, because some of them are names of files that would be fetched.
 
     Raises:
         DataError: There is no usable image processor.
@@ -109,39 +109,44 @@ def _processor(folder: Path) -> dict[str, Any]:
     }
     try:
         with hide_output():
-            made = kind(**known)
-            order, black, gain = _response(made)
-    except Exception as error:  # whatever a processor raises about its settings
+            processor = kind(**known)
+            order, black, gain = _response(processor)
+    except Exception as error:  # processors raise many kinds about their settings
         raise DataError(
             path,
             found=f"no normalization in {content} ({first_line(error)})",
-            expected=f"settings of {kind.__name__} that multiply three channels",
+            expected=f"settings of {kind.__name__} that scale three channels",
         ) from error
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
     rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
-    settings: dict[str, Any] = made.to_dict()
+    settings: dict[str, Any] = processor.to_dict()
     return settings | rounded | {"do_flip_channel_order": bool(order[0])}
 
 
 def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
-    """The image's channel in each of the network's, its value for black and its range to 1.
+    """Measure how an image processor normalizes colors.
+
+    Returns:
+        For each input channel of the network: index of the image's channel, value for black, and
+        difference between full intensity and black.
 
     Raises:
-        ArithmeticError: The processor does not multiply three channels, in their order or reversed.
+        ArithmeticError: The processor does not scale three channels, in their order or reversed.
     """
     known = processor.valid_kwargs.__annotations__
-    as_they_are = {name: False for name in _NOT_OF_COLORS if name in known}
+    switched_off = {name: False for name in _NOT_OF_COLORS if name in known}
     colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 204, 102]], np.uint8)
     images = [np.tile(color, (_SIDE, _SIDE, 1)) for color in colors]
-    seen = np.asarray(processor(images, return_tensors="np", **as_they_are)["pixel_values"])
-    black, *primary, mixed = seen[:, :, _SIDE // 2, _SIDE // 2].astype(np.float64)
+    pixels = np.asarray(processor(images, return_tensors="np", **switched_off)["pixel_values"])
+    black, *primary, mixed = pixels[:, :, _SIDE // 2, _SIDE // 2].astype(np.float64)
     ranges = np.array(primary) - black  # (channel of the image, channel of the network)
     order = np.abs(ranges).argmax(axis=0)
     gain = ranges[order, np.arange(len(order))]
     error = np.abs(mixed - black - gain * colors[-1][order] / _BYTE).max()
     in_order = order.tolist() in ([0, 1, 2], [2, 1, 0])
-    if not (in_order and np.isfinite(seen).all() and gain.min() > 0 and error < 1e-3 * gain.max()):
-        raise ArithmeticError(f"makes {mixed.round(3).tolist()} of {colors[-1].tolist()}")
+    is_finite = np.isfinite(pixels).all()
+    if not (in_order and is_finite and gain.min() > 0 and error < 1e-3 * gain.max()):
+        raise ArithmeticError(f"maps {colors[-1].tolist()} to {mixed.round(3).tolist()}")
     return order, black, gain
 
 
@@ -156,14 +161,14 @@ def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:
             folder,
             found=f"no {path.name}",
             expected="the image processor of the network: its normalization and image size",
-            remedy="Copy that file from the model that this one was fine-tuned from.",
+            remedy="Copy this file from the model from which this one was fine-tuned.",
         )
     return path, json_in(folder, path.name)
 
 
 def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
-    """The class that a file names, also under its older names, or else that of the network."""
-    import transformers  # every class of it is loaded when it is asked for
+    """Return the class named in a file, also by its older name, or the network's default."""
+    import transformers  # loads its classes on demand
     from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
     from transformers.image_processing_utils import BaseImageProcessor
 
@@ -178,7 +183,7 @@ def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
 
 
 def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
-    """Rows and columns of the images that the image processor makes."""
+    """Return rows and columns of the images after the image processor."""
     given = processor.get("size") if processor.get("do_resize") else None
     if processor.get("do_center_crop") and processor.get("crop_size"):
         given = processor["crop_size"]
@@ -196,7 +201,7 @@ def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
 
 
 def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
-    """The tokens that ask OneFormer for classes (``OneFormerProcessor``)."""
+    """Return the tokens that select OneFormer's semantic task (``OneFormerProcessor``)."""
     from transformers import AutoTokenizer
 
     expected = "the tokenizer of OneFormer, which takes its task as text"
@@ -208,7 +213,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
             folder, local_files_only=True, trust_remote_code=False
         )
         text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
-    except Exception as error:  # whatever a tokenizer raises about its files
+    except Exception as error:  # tokenizers raise many kinds about their files
         raise DataError(
             folder,
             found=f"an unusable tokenizer ({first_line(error)})",
@@ -219,7 +224,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
 
 
 def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
-    """Load weights through transformers, which knows their names in its older versions."""
+    """Load weights with transformers, which maps tensor names of its older versions."""
     inner = network.network
     with hide_output():
         loaded, found = type(inner).from_pretrained(
@@ -236,7 +241,7 @@ def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folde
         raise DataError(
             folder,
             found=f"other weights: {', '.join(wrong[:_LISTED])}",
-            expected=f"those of {type(inner).__name__} as config.json describes it, for the "
+            expected=f"weights of {type(inner).__name__} as described in config.json, for the "
             "classes in its id2label",
         )
     inner.load_state_dict(loaded.state_dict())

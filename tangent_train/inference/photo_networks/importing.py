@@ -1,4 +1,4 @@
-"""Writing a photo network as a checkpoint of this package."""
+"""Write a photo network as a checkpoint of this package."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ def _groups(
     unknown_classes: Collection[str],
     wins: bool,
 ) -> tuple[list[str], Groups | None]:
-    """Names of the labels, and the scores of each; see `TrainedNetwork.groups`."""
+    """Return the names of the labels, and the scores of each, see `TrainedNetwork.groups`."""
     score_names, unknown_classes = (
         list(map(composed, score_names)),
         list(map(composed, unknown_classes)),
@@ -160,38 +160,38 @@ def _groups(
         raise SettingError(
             "unknown_classes",
             found=", ".join(sorted(missing)),
-            expected=f"of {', '.join(score_names)}",
+            expected=f"names among {', '.join(score_names)}",
         )
-    places, rest = _places(len(score_names), kind, count)
+    scores, rest = _scores_of(len(score_names), kind, count)
     kept = [
         (k, name)
-        for k, name in zip(places, score_names, strict=True)
+        for k, name in zip(scores, score_names, strict=True)
         if name not in unknown_classes
     ]
     if not kept:
-        raise SettingError("unknown_classes", found="all classes", expected="some of them")
+        raise SettingError("unknown_classes", found="all classes", expected="a part of them")
     if not wins and (len(kept) == 1 or kind == "labels"):
         raise SettingError(
             "unknown_wins",
             found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
-            expected="true: where they may not win, the network has no other class to give",
+            expected="true, because the network has no other class to predict",
         )
-    rest += [k for k, name in zip(places, score_names, strict=True) if name in unknown_classes]
+    rest += [k for k, name in zip(scores, score_names, strict=True) if name in unknown_classes]
     names = ["unknown", *(name for _, name in kept)]
     if kind in ("logits", "probabilities") and not unknown_classes:
         return names, None
     return names, [[k] for k, _ in kept] + ([rest] if rest and wins else [])
 
 
-def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:
-    """Places of the named classes, and those of none of them, see `ScoreKind`.
+def _scores_of(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:
+    """Return indices of the named classes' scores, and of scores without a class, see `ScoreKind`.
 
-    One score, or labels of one name, are of a class and its background. The background has the
-    first of two names.
+    A single score, or labels with one name, belong to a class and its background. Of two names for
+    a single score, the first is the background.
     """
-    places = list(range(named))
+    indices = list(range(named))
     if kind == "labels":
-        return ([1], [0, 2]) if named == 1 else (places, [named])
+        return ([1], [0, 2]) if named == 1 else (indices, [named])
     independent = kind in ("sigmoid_logits", "sigmoid")
     if independent and (count, named) == (1, 2):
         return [1, 0], []
@@ -199,10 +199,10 @@ def _places(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[in
         raise SettingError(
             "class names of the network",
             found=f"{named}, for {count} score{'s' * (count > 1)}",
-            expected="one for every score"
+            expected="one for each score"
             + (", or two for one score, the background first" if count == 1 else ""),
         )
-    return places, [count] if independent else []
+    return indices, [count] if independent else []
 
 
 def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:

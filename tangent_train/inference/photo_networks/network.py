@@ -1,4 +1,4 @@
-"""A photo network of any library, and the names of its scores."""
+"""A photo network from another library or file, and the names of its scores."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tangent_train.files import read_json
 from tangent_train.registry import is_class_name
 
 USUAL_SIZE = (512, 512)
-"""Rows and columns of the photos, if they are not known."""
+"""Rows and columns of the photos if they are unknown."""
 
 
 @dataclass(frozen=True)
@@ -25,13 +25,14 @@ class PhotoNetwork:
 
     Attributes:
         network: Maps normalized RGB images ``(B, 3, h, w)`` to scores ``(B, K, h, w)``, to a dict
-            with these under ``"out"``, or to label maps ``(B, h, w)``.
-        settings: The section of a config that makes it, plain values; None of an ONNX file.
-        score_names: Name of every score.
+            that contains them under ``"out"``, or to label maps ``(B, h, w)``.
+        settings: Section of a config that builds the network; None for an ONNX file.
+        score_names: Name of each score.
         normalization: Normalization of the images.
-        image_size: Rows and columns that it was trained for.
-        fixed_size: True if it takes images of this size only.
-        score_kind: Output of the network if its library declares it; None to find it by trial.
+        image_size: Rows and columns of the training images.
+        fixed_size: True if the network only takes images of this size.
+        score_kind: Kind of the network's output if its library declares it; None to find it by
+            trial.
         remarks: Sentences to print for the user.
     """
 
@@ -46,15 +47,15 @@ class PhotoNetwork:
 
 
 def class_names_in(path: Path | None) -> tuple[str, ...]:
-    """The names of a network's scores, in their order.
+    """Read the names of a network's scores, in their order.
 
     Args:
-        path: A JSON file: a list of names, or an object with the name of each place, as
+        path: JSON file with a list of names, or an object that maps each index to a name, such as
             ``{"0": "wall"}`` (``id2label``).
 
     Raises:
         SettingError: No file is given.
-        DataError: It holds something else.
+        DataError: The file has other content.
     """
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
     if path is None:
@@ -63,19 +64,19 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
 
 
 def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
-    """Names from plain values, see `class_names_in`.
+    """Return names from the content of a file, see `class_names_in`.
 
     Args:
-        content: A list of names, or a dict with the name of each place.
+        content: A list of names, or a dict that maps each index to a name.
         path: File of the names, for the message.
-        expected: For the message.
+        expected: Expected content, for the message.
 
     Raises:
-        DataError: It is something else.
+        DataError: The content is neither.
     """
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
-        names = [content.get(str(place)) for place in range(len(content))]
+        names = [content.get(str(index)) for index in range(len(content))]
     if not names or not all(name and is_class_name(name) for name in names):
         raise DataError(path, found=str(content)[:80], expected=expected)
     return tuple(names)

@@ -1,4 +1,4 @@
-"""Networks of the user's own files: ONNX, and a config with a state dict."""
+"""Load networks from users' files: ONNX, or a config with a state dict."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tangent_train.registry import build_from_config
 
 
 def load_onnx(file: Path | None, classes: Path | None, normalization: Any) -> PhotoNetwork:
-    """Load the network of an ONNX file, see `OnnxNetwork`.
+    """Load a network from an ONNX file, see `OnnxNetwork`.
 
     Args:
         file: ONNX file.
@@ -46,11 +46,11 @@ def load_config(
     classes: Path | None,
     normalization: Any,
 ) -> PhotoNetwork:
-    """Load a network of ``configs/network``.
+    """Load a network that is described by a config of ``configs/network``.
 
     Args:
-        settings: Section of the network.
-        weights: File of its state dict.
+        settings: Section ``network`` of a config.
+        weights: File of the network's state dict.
         classes: JSON file of the class names.
         normalization: See `Normalization.of`.
 

@@ -1,4 +1,4 @@
-"""Folders that ``save_pretrained`` of transformers or segmentation-models-pytorch wrote."""
+"""Read folders written by ``save_pretrained`` of transformers or segmentation-models-pytorch."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ _FILES = ("*.json", _WEIGHTS, _SHARDS, "merges.txt")
 
 
 def saved_folder(model: str | None) -> Path:
-    """The folder of a model: the user's own, or of files fetched from the hub.
+    """Return the folder of a model, which is fetched from the hub if necessary.
 
     Args:
         model: A folder, or a name on the hub, ``owner/name``.
 
     Raises:
-        DataError: It can be neither found nor fetched.
+        DataError: The model is neither a folder nor can it be fetched.
         SettingError: No model is given.
     """
     if model is None:
@@ -37,23 +37,27 @@ def saved_folder(model: str | None) -> Path:
         from huggingface_hub import snapshot_download
 
         return Path(snapshot_download(model, allow_patterns=list(_FILES)))
-    except Exception as error:  # no connection, no such name, or one must sign in for it
+    except Exception as error:  # no connection, no such name, or the model needs a login
         fetch = f"hf download {model} --local-dir {model.rpartition('/')[2] or 'network'}"
         raise DataError(
             model,
             found="no such folder, and no way to fetch it "
             f"({type(error).__name__}: {first_line(error)})",
             expected="a folder, or the name of a model on huggingface.co that you may read",
-            remedy=f"On a machine that can, run `{fetch}` (first `hf auth login` if its page asks "
-            "you to agree to terms), and set model= to the path of that folder.",
+            remedy=f"On a machine with access, run `{fetch}` (after `hf auth login` if the model "
+            "requires agreement to terms), and set model= to the path of that folder.",
         ) from error
 
 
 def json_in(folder: Path, name: str) -> dict[str, Any]:
-    """The object in a JSON file of such a folder.
+    """Read the object in a JSON file of a saved model.
+
+    Args:
+        folder: Folder of the model.
+        name: Name of the file.
 
     Raises:
-        DataError: It is missing or holds something else.
+        DataError: The file is missing or has other content.
     """
     path, expected = folder / name, "a JSON object of save_pretrained"
     content = read_json(path, expected)
@@ -63,10 +67,16 @@ def json_in(folder: Path, name: str) -> dict[str, Any]:
 
 
 def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
-    """The weights of such a folder as float32, and remarks about them.
+    """Read the weights of a saved model.
+
+    Args:
+        folder: Folder of the model.
+
+    Returns:
+        Tensors by name, floats as float32; and remarks to print for the user.
 
     Raises:
-        DataError: There are none as safetensors, or they are unreadable.
+        DataError: There are no safetensors files, or they are unreadable.
     """
     whole = folder / _WEIGHTS
     paths = [whole] if whole.is_file() else sorted(folder.glob(_SHARDS))
@@ -75,9 +85,9 @@ def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
         raise DataError(
             folder,
             found=f"{', '.join(others) or 'no weights'}, no {_WEIGHTS}",
-            expected="weights as safetensors: reading others may run code",
-            remedy="Where you trust them, load them with from_pretrained(…) of their library and "
-            "write them with save_pretrained(…), which makes safetensors.",
+            expected="weights as safetensors: reading other formats may run code",
+            remedy="If you trust the files, load them with from_pretrained(…) of their library and "
+            "write them with save_pretrained(…), which creates safetensors.",
         )
     tensors = {name: t for path in paths for name, t in read_tensors(path)[""].items()}
     floats = {name: t for name, t in tensors.items() if t.is_floating_point()}

@@ -1,4 +1,4 @@
-"""Find out by trial which kind of scores a photo network returns."""
+"""Find by trial which kind of scores a photo network returns."""
 
 from __future__ import annotations
 
@@ -15,37 +15,37 @@ from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 
 _MASK_NAMES = 2
-"""Names, at most, of a class and its background."""
+"""Largest number of names for a class and its background."""
 
 _LISTED = 9
-"""Labels in a message."""
+"""Largest number of labels in a message."""
 
 _VOID = -1
-"""The value of NaN in label maps."""
+"""Value that replaces NaN in label maps."""
 
 _ROUNDED = 2e-3
 """Relative error of sums of probabilities in float16."""
 
 _SCALES = (1, 100, 255)
-"""Sums of probabilities, also as percentages and bytes."""
+"""Sums of probabilities: as numbers, percentages and bytes."""
 
 _BYTE = 255
-"""Steps of coarse probabilities: quantized, or clipped near 0 and 1."""
+"""Number of steps of coarse probabilities, which are quantized or clipped near 0 and 1."""
 
 _OVERSHOOT = 0.5
-"""Beyond 0 and 1, after bicubic interpolation."""
+"""Largest distance beyond 0 and 1 of probabilities after bicubic interpolation."""
 
 _WILD = 30.0
 """Standard deviation of an image that drives scores far from 0 and 1."""
 
 _CERTAIN = ("logits", "sigmoid_logits")
-"""Kinds that no further image makes another one."""
+"""Kinds that are certain after one image."""
 
 _OF_ONE_SCORE: dict[ScoreKind, ScoreKind] = {
     "logits": "sigmoid_logits",
     "probabilities": "sigmoid",
 }
-"""A softmax over one score is always 1, so that its networks end in a sigmoid."""
+"""Kinds of a single score: a softmax over it is always 1, so such networks use a sigmoid."""
 
 _NAME_SCORES = (
     "Name it: scores=logits for a network whose last step, a softmax, is missing; "
@@ -133,7 +133,7 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
 
 
 def _images(network: PhotoNetwork) -> Iterator[Tensor]:
-    """Black, white, noise, and noise beyond all colors, normalized."""
+    """Yield normalized images: black, white, noise, and noise far beyond the range of colors."""
     mean, std = (
         torch.tensor(values, dtype=torch.float32)[:, None, None]
         for values in (network.normalization.mean, network.normalization.std)
@@ -146,10 +146,10 @@ def _images(network: PhotoNetwork) -> Iterator[Tensor]:
 
 
 def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
-    """Scores ``(1, K, h, w)`` as float32, label maps with K = 1."""
+    """Return scores ``(1, K, h, w)`` as float32; label maps have K = 1."""
     try:
         scores = plain_scores(network.network(image))
-    except Exception as error:  # each network refuses images in its own words
+    except Exception as error:  # networks raise many kinds about images they do not take
         if isinstance(error, SettingError) and str(error.subject).startswith("output of"):
             raise
         raise SettingError(
@@ -171,22 +171,22 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
 
 
 def _check_labels(found: Sequence[float], named: int) -> None:
-    """Refuse other labels than the named ones, beyond which only void has a value, e.g. 255."""
-    known = max(2, named)  # those of one class are 0, its background, and 1
+    """Refuse labels without a name, except one value for void, e.g. 255."""
+    known = max(2, named)  # a single class has the label 1 and a background 0
     others = 0 not in found or (1 not in found and max(found) > 1)
     is_two_valued = len([label for label in found if label > 1]) <= 1
     if known in found or (named == 1 and others) or (named <= _MASK_NAMES and not is_two_valued):
         raise SettingError(
             "class names of the network",
             found=f"{named}, for labels {', '.join(f'{label:g}' for label in found[:_LISTED])}",
-            expected="a name for every label; one name is that of label 1, beside a background 0",
-            remedy="Name the others too; unknown_classes= names those that are written as unknown."
+            expected="a name for each label; a single name is for label 1, with background 0",
+            remedy="Name the other labels too; unknown_classes= lists names to write as unknown."
             + f" {_FACTOR}" * (named <= _MASK_NAMES),
         )
 
 
 def _kind_of(tried: Sequence[Tensor], named: int) -> ScoreKind | None:
-    """The kind of the scores ``(K, pixels)`` of some images; None if they fit none."""
+    """Return the kind of the scores ``(K, pixels)`` of some images; None if it is unclear."""
     scores = torch.cat(list(tried), dim=1)
     whole = bool(((scores == scores.round()) | scores.isnan()).all())
     scores = scores[:, scores.isfinite().all(dim=0)]
@@ -206,11 +206,11 @@ def _kind_of(tried: Sequence[Tensor], named: int) -> ScoreKind | None:
 
 
 def _kind_of_one(scores: Tensor, whole: bool, named: int) -> ScoreKind | None:
-    """The kind of one score."""
+    """Return the kind of a single score; None if it is unclear."""
     least, most = scores.amin().item(), scores.amax().item()
     if named <= _MASK_NAMES and _is_mask(scores):
         return "sigmoid"
-    if whole and len(np.unique(scores[scores < 0].numpy())) <= 1:  # of void, e.g. -1
+    if whole and len(np.unique(scores[scores < 0].numpy())) <= 1:  # e.g. -1 for void
         return "labels"
     if least >= 0 and most <= 1:
         return "sigmoid"
@@ -218,13 +218,13 @@ def _kind_of_one(scores: Tensor, whole: bool, named: int) -> ScoreKind | None:
 
 
 def _is_mask(scores: Tensor) -> bool:
-    """True of one score that is 0 or one number above 1, such as 255."""
+    """Return True for a single score that is 0 or one number above 1, such as 255."""
     values = np.unique(scores.numpy()).tolist()
     return len(scores) == 1 and len(values) == 2 and values[0] == 0 and values[1] > 1
 
 
 def _has_even_sums(scores: Tensor, whole: bool) -> bool:
-    """True if the scores of every pixel have the same sum, up to rounding of each of them."""
+    """Return True if the scores of all pixels have the same sum, up to rounding of each score."""
     sums = scores.sum(dim=0)
     mean = sums.mean().item()
     steps = {scale: len(scores) * max(scale / _BYTE, float(whole)) for scale in _SCALES}

@@ -1,4 +1,4 @@
-"""Networks of segmentation-models-pytorch, from the hub or a folder."""
+"""Load networks of segmentation-models-pytorch, from the Hugging Face hub or a folder."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from tangent_train.registry import SettingsFile, build_from_config
 
 _CLASS = "_model_class"
 _LEFT_OUT = {"activation", "aux_params"}
-"""Settings of what follows the scores, and of a second output: classes of the whole image."""
+"""Settings that are not used: the activation after the scores, and a classification head."""
 
 _HEAD_OF_IMAGES = "classification_head."
 _NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
 
 
 def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
-    """A network that segmentation-models-pytorch saved with ``save_pretrained``.
+    """Load a network that segmentation-models-pytorch saved with ``save_pretrained``.
 
     Args:
-        model: A folder, or its name on the hub.
+        model: A folder, or a name on the hub.
         classes: JSON file of the class names.
-        normalization: See `Normalization.of`; None for that of the encoder's own weights.
+        normalization: See `Normalization.of`; None for that of the encoder's published weights.
 
     Raises:
-        DataError: A file is missing, cannot be fetched or used.
-        SettingError: A setting is missing, or the package is.
+        DataError: A file is missing, or cannot be fetched or used.
+        SettingError: A setting is missing, or segmentation-models-pytorch is not installed.
     """
     folder = saved_folder(model)
     path = folder / "config.json"
@@ -46,7 +46,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         raise DataError(
             path,
             found=f"in_channels: {config['in_channels']}",
-            expected="3: the commands give a photo network RGB images only",
+            expected="3: photo networks only get RGB images",
         )
     network = build_from_config(settings, "network", SettingsFile(path))
     given = None if normalization is None else Normalization.of(normalization, 3)
@@ -64,15 +64,15 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
 
 
 def _of_encoder(config: dict[str, Any]) -> Normalization:
-    """The normalization that belongs to the encoder's published weights."""
+    """Return the normalization of the encoder's published weights."""
     from segmentation_models_pytorch import encoders  # type: ignore[import-untyped]
 
     name, weights = config.get("encoder_name"), config.get("encoder_weights") or "imagenet"
     try:
-        with offline():  # a file named the encoder
+        with offline():  # the encoder's name is from a file
             given = encoders.get_preprocessing_params(name, weights)
-    except Exception as error:  # of the library, or because its file was never fetched
-        found = f"none, and none known of {name} ({first_line(error)})"
+    except Exception as error:  # unknown name, or a file that was not fetched
+        found = f"none, and no default for {name} ({first_line(error)})"
         raise SettingError("normalization", found=found, expected=_NORMALIZATION) from error
     if given["input_space"] != "RGB":
         found = f"none, and {name} takes {given['input_space']}"

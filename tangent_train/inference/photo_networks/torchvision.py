@@ -1,4 +1,4 @@
-"""Segmentation networks of torchvision."""
+"""Load segmentation networks of torchvision."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ _AUXILIARY = "aux_classifier."
 def load(
     *, model: str | None, weights: str | None, classes: Path | None, normalization: Any, **_: Any
 ) -> PhotoNetwork:
-    """A network of ``torchvision.models.segmentation``, with published weights or one's own.
+    """Load a network of ``torchvision.models.segmentation``.
 
     Args:
         model: Name of the network.
-        weights: Published weights by name, or a file of a state dict, to which the classes and
-            normalization of the default weights belong.
-        classes: JSON file of the class names; None for those of the weights.
+        weights: Name of published weights, or a file with a state dict. By default a file has the
+            classes and the normalization of the default weights.
+        classes: JSON file of the class names; None for the names of the weights.
         normalization: See `Normalization.of`; None for that of the weights.
 
     Raises:

@@ -1,1 +1,1 @@
-"""The input of a network: tangent images, cube faces, the panorama itself, crops of photos."""
+"""Inputs of networks: tangent images, cube faces, the panorama itself, and crops of photos."""

@@ -1,4 +1,4 @@
-"""The equirectangular image itself as a representation, a baseline."""
+"""The equirectangular image itself as a representation: a baseline for tangent images."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class EquirectViews(Views):
 
     Attributes:
         rotation: ``(3, 3)`` rotation of its directions; None for the identity.
-        first: First column that is seen.
-        width: Number of columns that are seen; None for all.
-        mirrored: True if it is mirrored left to right.
-        rows: Rows of the view; None for those of the panorama.
+        first: First column of the view.
+        width: Number of columns of the view; None for all.
+        mirrored: True if the view is mirrored left to right.
+        rows: Rows to which the panorama is resized; None to keep its size.
     """
 
     rotation: NDArray[np.float64] | None = None
@@ -47,7 +47,7 @@ class EquirectViews(Views):
         return 1
 
     def __getitem__(self, part: slice) -> Self:
-        """The view."""
+        """Return the view itself."""
         return self
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
@@ -69,7 +69,7 @@ class EquirectViews(Views):
         return view
 
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
-        """The scores of the unrotated panorama, continued by a pixel around the sphere."""
+        """Return the scores of the unrotated panorama, extended by a pixel on all sides."""
         scores = scores.roll(self.first, -1)
         if self.rotation is not None:
             scores = rotate_equirect(scores, self.rotation)
@@ -93,16 +93,16 @@ class EquirectRepresentation:
         level: Level s of the panorama.
         crop_deg: Width of the training crops in degrees of longitude, full height, at a random
             longitude and across the seam; the whole image by default.
-        random_rotation: Rotation of the panorama while training; about the vertical by whole
-            columns.
-        mirror: Mirror half of the training samples left to right.
+        random_rotation: Rotation of the panorama in training; `yaw` rotates by whole columns.
+        mirror: True to mirror half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
-        rows: Rows of the image that the network sees, default those of the panorama. Its scores are
-            interpolated on the panorama.
-        rotations: Rotations about the vertical that are averaged over: each has its seam elsewhere.
+        rows: Rows of the network's input, default those of the panorama. Its scores are
+            interpolated to the panorama.
+        rotations: Number of rotations about the vertical to average over. Each has its seam at
+            another longitude.
 
     Raises:
-        SettingError: The crop is not a part of the panorama, or there are no rows or rotations.
+        SettingError: `crop_deg` is not between 0 and 360, or `rows` or `rotations` is less than 1.
     """
 
     blend: Blend = "nearest"
@@ -134,18 +134,18 @@ class EquirectRepresentation:
         self._first_columns = [round(columns * k / rotations) for k in range(rotations)]
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
-        """The same representation in rotated directions R·d."""
+        """Return the same representation in rotated directions R·d."""
         rotated = copy.copy(self)
         rotated._rotation = unless_identity(rotation)
         return rotated
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the image, as evaluated."""
+        """Rows and columns of the image in evaluation."""
         return self._rows, 2 * self._rows
 
     def sample(self, rng: np.random.Generator) -> EquirectViews:
-        """The panorama or one crop of it, optionally rotated."""
+        """Return the panorama or a random crop of it, optionally rotated."""
         first, width, columns = 0, None, self.image_size[1]
         if self.crop_deg is not None or self.random_rotation == "yaw":
             first, width = (
@@ -160,6 +160,6 @@ class EquirectRepresentation:
         return EquirectViews(rotation, first, width, mirrored, self._rows)
 
     def view_sets(self) -> list[EquirectViews]:
-        """The whole panorama, in every rotation."""
+        """Return the whole panorama in every rotation."""
         rotation, rows = self._rotation, self._rows
         return [EquirectViews(rotation, first, rows=rows) for first in self._first_columns]

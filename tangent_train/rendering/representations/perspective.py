@@ -1,9 +1,9 @@
 """Photos as network input: crops of one common camera (paper, supplement, section 2.1).
 
-Photos of any camera become images of the same angular resolution as a panorama's, so that a network
-trained on them sees objects at their size in tangent images. The common camera has
-the side W' = H' and the field of view Ω': ``f' = W' / (2 tan(Ω'/2))``; a crop is
-``x' = K'(K+Δ)⁻¹x`` with a shift Δ that keeps it inside the photo.
+Photos of different cameras become images of the same angular resolution as a panorama's, so that a
+network trained on them gets objects of the same size in tangent images. The common camera has the
+side W' = H' and the field of view Ω': ``f' = W' / (2 tan(Ω'/2))``. A crop is ``x' = K'(K+Δ)⁻¹x``
+with a shift Δ that keeps it inside the photo.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from tangent_train.rendering.sampling import plane_rays
 _PAPER_FOV_DEG = 45.0
 
 _NEGLIGIBLE = 1e-6
-"""Share of a crop's side that may stay uncovered."""
+"""Share of a crop's side that may remain uncovered, for rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,11 +38,11 @@ class PhotoCrops(Views):
     """Crops of one photo.
 
     Attributes:
-        boxes: ``(N, 4)`` left, top, right and bottom of all crops in the photo, in pixels from its
+        boxes: ``(N, 4)`` left, top, right and bottom of all crops, in pixels from the photo's
             corner.
-        size: Rows and columns of the crops.
-        mirrored: True if they are mirrored left to right.
-        numbers: ``(n,)`` crops that are rendered; None for all.
+        size: Rows and columns of a crop.
+        mirrored: True if the crops are mirrored left to right.
+        numbers: ``(n,)`` numbers of the crops that are rendered; None for all.
         canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
         overlapping: See `Views`.
     """
@@ -68,7 +68,7 @@ class PhotoCrops(Views):
         return self.boxes
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
-        """See `Views`; for ``bilinear`` an array is uint8."""
+        """See `Views`; arrays must be uint8 for ``bilinear``."""
         parts: Any = [crop(image, b, self.size, interpolation) for b in self.boxes[self.chosen]]
         if isinstance(image, Tensor):
             crops = torch.stack(parts)
@@ -77,15 +77,15 @@ class PhotoCrops(Views):
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
 
     def owned(self) -> NDArray[np.bool_]:
-        """Pixels of each crop that lie nearer to its center than to any other's, ``(n, h, w)``.
+        """Return a mask of the pixels nearer to the crop's center than to any other, ``(n, h, w)``.
 
-        So every point of the photo counts once, however much the crops overlap.
+        With it, every point of the photo counts once, even where crops overlap.
         """
         cells = cells_of(self.boxes)
         across, down = (
-            (cells[:, None, axis] <= places) & (places < cells[:, None, axis + 2])
+            (cells[:, None, axis] <= centers) & (centers < cells[:, None, axis + 2])
             for axis in (0, 1)
-            for places in [self._places(axis)]
+            for centers in [self._pixel_centers(axis)]
         )
         return down[:, :, None] & across[:, None, :]
 
@@ -102,7 +102,7 @@ class PhotoCrops(Views):
         """See `Views`."""
         boxes = self._on_canvas[self.chosen]
         across, down = (self.size[1 - i] / (boxes[:, 2 + i] - boxes[:, i]) for i in (0, 1))
-        # Of the ray (j, 1, i): pixel j of the photo is at j + ½ from its corner.
+        # For rays (j, 1, i): the center of pixel j is j + ½ from the photo's corner.
         matrices = np.zeros((len(boxes), 3, 3))
         matrices[:, 0, 0], matrices[:, 0, 1] = across, (0.5 - boxes[:, 0]) * across - 0.5
         matrices[:, 1, 2], matrices[:, 1, 1] = down, (0.5 - boxes[:, 1]) * down - 0.5
@@ -117,7 +117,7 @@ class PhotoCrops(Views):
         return _spans(self._owned_pixels(shape)[self.chosen], shape)
 
     def _owned_pixels(self, shape: tuple[int, int]) -> NDArray[np.intp]:
-        """``(N, 4)`` first column and row of the owned pixels, and those after the last."""
+        """Return ``(N, 4)``: first column and row of the owned pixels, and those after the last."""
         height, width = shape
         edges = np.ceil(cells_of(self._on_canvas) - 0.5).clip(0, (width, height, width, height))
         return edges.astype(np.intp)
@@ -126,20 +126,20 @@ class PhotoCrops(Views):
     def _on_canvas(self) -> NDArray[np.float64]:
         return self.boxes if self.canvas_boxes is None else self.canvas_boxes
 
-    def _places(self, axis: int) -> NDArray[np.float64]:
-        """``(n, pixels)`` where the centers of a crop's columns (0) or rows (1) are."""
+    def _pixel_centers(self, axis: int) -> NDArray[np.float64]:
+        """Return ``(n, pixels)`` positions in the photo of a crop's columns (0) or rows (1)."""
         near, far, count = self.boxes[:, axis], self.boxes[:, axis + 2], self.size[1 - axis]
         return np.linspace(near, far, 2 * count + 1, axis=1)[:, 1::2]
 
 
 def cells_of(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The part of the photo that lies nearer to a crop's center than to any other's.
+    """Return the part of the photo that is nearer to each crop's center than to any other.
 
     Args:
         boxes: ``(N, 4)`` left, top, right and bottom of all crops.
 
     Returns:
-        ``(N, 4)`` cells; infinite beyond the outermost.
+        ``(N, 4)`` cells; the outer edges of the outermost cells are infinite.
     """
     cells = np.empty_like(boxes)
     for axis in (0, 1):
@@ -151,7 +151,7 @@ def cells_of(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _spans(edges: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.int32]:
-    """``(n, H, 2)`` spans of rectangles, see `CanvasGeometry`."""
+    """Return ``(n, H, 2)`` spans of rectangles, see `CanvasGeometry`."""
     height, width = shape
     spans = np.zeros((len(edges), height, 2), np.int32)
     clipped = edges.clip(0, (width, height, width, height)).astype(int)
@@ -162,7 +162,7 @@ def _spans(edges: NDArray[Any], shape: tuple[int, int]) -> NDArray[np.int32]:
 
 @dataclass(frozen=True)
 class PhotoSampler:
-    """Draws crops of photos of one camera.
+    """Selects crops of photos of one camera.
 
     Attributes:
         camera_matrix: ``(3, 3)`` K, integer pixel centers.
@@ -175,21 +175,22 @@ class PhotoSampler:
     representation: PerspectiveRepresentation
 
     def sample(self, rng: np.random.Generator) -> PhotoCrops:
-        """Crops anywhere in the photo."""
-        wanted = self.representation
+        """Return crops at random positions in the photo."""
+        common = self.representation
         least, greatest = self._shifts()
-        shifts = rng.uniform(least, greatest, (wanted.crops_per_photo, 2))
-        return self._crops(shifts, mirrored=wanted.mirror and bool(rng.random() < 0.5))
+        shifts = rng.uniform(least, greatest, (common.crops_per_photo, 2))
+        return self._crops(shifts, mirrored=common.mirror and bool(rng.random() < 0.5))
 
     def view_sets(self) -> list[PhotoCrops]:
-        """The fewest crops that cover the photo, evenly spread."""
+        """Return the fewest crops that cover the photo, evenly spaced."""
         return [self.cover()]
 
     def cover(self, overlap: float = 0.0) -> PhotoCrops:
-        """The fewest crops that cover the photo, evenly spread.
+        """Return the fewest crops that cover the photo, evenly spaced.
 
         Args:
-            overlap: The least share of its side by which a crop overlaps the next, 0 to below 1.
+            overlap: Minimum overlap of neighboring crops as a share of their side, from 0 to less
+                than 1.
         """
         least, greatest = self._shifts()
         extent = self._extent() * (1 - overlap)
@@ -201,34 +202,35 @@ class PhotoSampler:
         return self._crops(np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2))
 
     def _shifts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        wanted = self.representation
-        return shift_range(self.camera_matrix, self.size, wanted.fov_deg, wanted.image_size)
+        common = self.representation
+        return shift_range(self.camera_matrix, self.size, common.fov_deg, common.image_size)
 
     def _extent(self) -> NDArray[np.float64]:
-        """Width and height of a crop in pixels of the photo."""
+        """Return width and height of a crop in pixels of the photo."""
         rows, columns = self.representation.image_size
         width = 2 * math.tan(math.radians(self.representation.fov_deg) / 2)
         return np.diag(self.camera_matrix)[:2] * width * (1, rows / columns)
 
     def _crops(self, shifts: NDArray[np.float64], *, mirrored: bool = False) -> PhotoCrops:
-        """Crops whose corners `normalize_camera` moves there, see its homography."""
+        """Return crops with their centers shifted from the principal point."""
         centers, half = self.camera_matrix[:2, 2] + 0.5 + shifts, self._extent() / 2
         boxes = np.concatenate([centers - half, centers + half], axis=1)
-        inside = boxes.clip(0, np.tile(self.size[::-1], 2))  # rounding may lead outside
+        inside = boxes.clip(0, np.tile(self.size[::-1], 2))  # rounding may exceed the photo
         return PhotoCrops(inside, self.representation.image_size, mirrored)
 
 
 @registered
 class PerspectiveRepresentation:
-    """Crops of photos, all of one camera; evaluation covers the photo, each place counted once.
+    """Crops of photos, normalized to one camera. Evaluation covers the photo and counts it once.
 
     Args:
-        level: Level s of the panoramas whose angular resolution the crops have.
+        level: Level s of panoramas with the same angular resolution.
         fov_deg: Horizontal field of view Ω' of a crop in degrees.
-        dim: Side W' = H' of a crop in pixels, or ``[H', W']``; default that of the paper's
-            resolution: 2^(s−1) for 45°, 128 at level 8, more for a wider view. Pixels are square.
-        crops_per_photo: Crops drawn at random for a training sample.
-        mirror: Mirror half of the training samples left to right.
+        dim: Side W' = H' of a crop in pixels, or ``[H', W']``. The default is the paper's
+            resolution: 2^(s−1) for 45°, such as 128 at level 8, and more for a wider view. Pixels
+            are square.
+        crops_per_photo: Number of random crops in a training sample.
+        mirror: True to mirror half of the training samples left to right.
 
     Attributes:
         image_size: Rows and columns of a crop.
@@ -258,7 +260,7 @@ class PerspectiveRepresentation:
         self.mirror = mirror
 
     def of_camera(self, camera_matrix: NDArray[np.float64], size: tuple[int, int]) -> PhotoSampler:
-        """The sampler of the crops of a photo.
+        """Return a sampler of crops for photos of a camera.
 
         Args:
             camera_matrix: ``(3, 3)`` K of the photo, integer pixel centers, without skew.

@@ -30,24 +30,25 @@ class PinholeRepresentation:
     """Pinhole images around the center: base of tangent images and cube maps.
 
     Args:
-        grids: The images at every level that is averaged over, not rotated.
+        grid: Images of `level`, not rotated.
+        grids: Images of each level to average over, not rotated.
         level: Level s of the panorama.
-        random_rotation: Rotation of the images as a whole while training.
-        mirror: Mirror half of the training samples left to right.
+        random_rotation: Rotation of the images as a whole in training.
+        mirror: True to mirror half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         blend: Blending of overlapping images.
-        rotations: Rotations about the vertical that are averaged over.
-        faces_per_panorama: Images drawn at random for a training sample; all by default.
+        rotations: Number of rotations about the vertical to average over.
+        faces_per_panorama: Number of random images in a training sample; all by default.
 
     Attributes:
-        grid: The images of `level`, not rotated.
+        grid: Images of `level`, not rotated.
 
     Raises:
-        SettingError: A value is impossible.
+        SettingError: A setting is invalid.
     """
 
     symmetry_deg: ClassVar[float]
-    """The images look in the same directions after this rotation about the vertical."""
+    """Rotation about the vertical after which the images cover the same directions again."""
 
     def __init__(
         self,
@@ -79,7 +80,7 @@ class PinholeRepresentation:
         return self.grid.dim, self.grid.dim
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
-        """The same representation with all images rotated, directions R·d."""
+        """Return the same representation in rotated directions R·d."""
         rotated = copy.copy(self)
         rotation_or_none = unless_identity(rotation)
         rotated.grid = self.grid.with_rotation(rotation_or_none)
@@ -87,7 +88,7 @@ class PinholeRepresentation:
         return rotated
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
-        """All images or a random subset, optionally rotated as a whole and mirrored one by one."""
+        """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
         grid = self.grid
         if self.random_rotation != "none":
             yaw = self.random_rotation == "yaw"
@@ -100,7 +101,7 @@ class PinholeRepresentation:
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
 
     def view_sets(self) -> list[PinholeViews]:
-        """All images of every level, in every rotation."""
+        """Return all images of every level in every rotation."""
         return [PinholeViews(_rotated(grid, r)) for grid in self._grids for r in self._rotations]
 
 
@@ -110,23 +111,23 @@ class TangentRepresentation(PinholeRepresentation):
 
     Args:
         base_level: Base level b: 20·4^b images.
-        level: Level s; it sets the angular resolution of the images.
+        level: Level s, which sets the angular resolution of the images.
         dim: Side of the images in pixels, default 2^(s−b).
-        crop_multiple: Instead of `dim`: crop to the owned cells, the side rounded up to a multiple
-            of this (the network's stride).
-        faces_per_panorama: Images drawn at random for a training sample; all by default.
-        random_rotation: Rotation of the icosahedron while training.
-        mirror: Mirror half of the training samples left to right.
+        crop_multiple: Crop to the owned cells, with the side rounded up to a multiple of this
+            number (the network's stride). Replaces `dim`.
+        faces_per_panorama: Number of random images in a training sample; all by default.
+        random_rotation: Rotation of the icosahedron in training.
+        mirror: True to mirror half of the training samples left to right.
         blend: Blending of overlapping images in evaluation and prediction: the scores of the owner
-            (`nearest`), or probabilities averaged with weights that fall to the borders
+            (`nearest`), or the average of probabilities with weights that fall to 0 at the borders
             (`feather`).
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
-        rotations: Rotations of the icosahedron that are averaged over, see `vertical_rotations`.
-        levels: A level or several levels that are averaged over, with images of as many pixels:
-            images of a lower level show more. Default `level`.
+        rotations: Number of rotations of the icosahedron to average over, see `vertical_rotations`.
+        levels: One or more levels to average over, default `level`. All have images of the same
+            number of pixels, so images of a lower level have a wider field of view.
 
     Raises:
-        SettingError: An impossible combination.
+        SettingError: Settings are invalid or exclude each other.
     """
 
     grid: TangentGrid
@@ -176,23 +177,21 @@ class TangentRepresentation(PinholeRepresentation):
 
 @registered
 class CubemapRepresentation(PinholeRepresentation):
-    """Cube-map baseline: the six faces of a cube.
-
-    Training and evaluation use all six.
+    """Cube-map baseline: the six faces of a cube, all used in training and evaluation.
 
     Args:
         level: Level s of the panorama.
-        dim: Side of the faces in pixels, default 2^s and twice the margin: 90° over as many pixels
-            as on the panorama's equator.
+        dim: Side of the faces in pixels, default 2^s plus twice the margin. With it, 90° have as
+            many pixels as on the panorama's equator.
         margin: Pixels of a face beyond its 90° on every side, which show its surroundings.
         blend: Blending of faces with a margin, see `TangentRepresentation`.
-        random_rotation: Rotation of the cube while training.
-        mirror: Mirror half of the training samples left to right, every face by itself.
+        random_rotation: Rotation of the cube in training.
+        mirror: True to mirror each face of half of the training samples left to right.
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
-        rotations: Rotations of the cube that are averaged over, see `vertical_rotations`.
+        rotations: Number of rotations of the cube to average over, see `vertical_rotations`.
 
     Raises:
-        SettingError: A value is impossible.
+        SettingError: A setting is invalid.
     """
 
     grid: CubeGrid
@@ -215,7 +214,7 @@ class CubemapRepresentation(PinholeRepresentation):
 
 
 def level_list(levels: int | Sequence[int] | None, level: int) -> list[int]:
-    """The levels that a setting names; `level` where it names none.
+    """Return a setting for one or more levels as a list; `[level]` if the setting is None.
 
     Raises:
         SettingError: The list is empty.
@@ -229,13 +228,13 @@ def level_list(levels: int | Sequence[int] | None, level: int) -> list[int]:
 
 
 def vertical_rotations(count: int, period_deg: float = 360.0) -> list[NDArray[np.float64]]:
-    """Rotations about the vertical to average over, evenly spaced; the first is the identity.
+    """Return evenly spaced rotations about the vertical to average over, the identity first.
 
-    Images stay upright, as in most networks' training: arbitrary rotations halve their scores.
+    Images remain upright, as in the training of most networks: arbitrary rotations halve scores.
 
     Args:
         count: Number of rotations, 1 or more.
-        period_deg: Angle after which images look in the same directions.
+        period_deg: Angle after which images cover the same directions again.
 
     Raises:
         SettingError: The count is less than 1.
@@ -245,11 +244,11 @@ def vertical_rotations(count: int, period_deg: float = 360.0) -> list[NDArray[np
 
 
 def unless_identity(rotation: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
-    """None for the identity: only tables of grids without a rotation are kept."""
+    """Return the rotation, or None for the identity, so that tables of the grid are cached."""
     return None if rotation is None or np.array_equal(rotation, np.eye(3)) else rotation
 
 
 def _rotated(grid: _Grid, rotation: NDArray[np.float64]) -> _Grid:
-    """A grid rotated about its own axes: with its rotation R, directions become R·rotation·d."""
+    """Rotate a grid in its own axes: with its rotation R, directions become R·rotation·d."""
     outer = np.eye(3) if grid.rotation is None else grid.rotation
     return grid.with_rotation(unless_identity(outer @ rotation))

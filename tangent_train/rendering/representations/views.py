@@ -1,10 +1,10 @@
-"""Representations of panoramas: the images that a network is given.
+"""Representations of panoramas: the images that a network gets as input.
 
 A *representation* selects the *views* of a panorama: tangent images or, as baselines, the faces of
-a cube, the equirectangular image itself or crops of it. It draws the views of one training sample
-(which images, rotated and mirrored how), and lists the sets of views that evaluation and prediction
-average over. Views render themselves from an image, and say where they lie on its canvas (see
-`kernels`). `inference.engine` gives them to the network.
+a cube, the equirectangular image itself or crops of it. It selects the views of one training sample
+with random subsets, rotations and mirroring, and lists the sets of views that evaluation and
+prediction average over. Views render themselves from an image, and provide their position on its
+canvas (see `kernels`). `inference.engine` passes them to the network.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
 
 
 class Views:
-    """Views of one panorama or photo: some of N images that each show a part of it.
+    """Some of the N views of a panorama or photo, each an image of a part of it.
 
     Attributes:
         overlapping: True if every pixel is inside an image, not only on its outer edge.
         chosen: ``(n,)`` numbers of these views, 0 … N − 1.
-        all_images: The same object for all parts of one set of images.
+        all_images: An object that identifies the set of N views.
     """
 
     overlapping: bool
@@ -47,11 +47,11 @@ class Views:
         return len(self.chosen)
 
     def __getitem__(self, part: slice) -> Self:
-        """Some of the views."""
+        """Return some of the views."""
         raise NotImplementedError
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
-        """Render the views, dtype kept.
+        """Render the views, with the dtype of the image.
 
         Args:
             image: An array ``(H, W[, C])``, or a tensor ``(C, H, W)``.
@@ -63,36 +63,36 @@ class Views:
         raise NotImplementedError
 
     def rays(self) -> NDArray[np.float32]:
-        """``(n, 3, 3)`` viewing rays of the images; `NO_RAYS` if they are not pinhole images.
+        """Return ``(n, 3, 3)`` viewing rays; `NO_RAYS` if the views are not pinhole images.
 
-        Each matrix maps ``(x, y, 1)``, with x and y from −1 at the left and upper edge of an image
-        to 1 at the opposite one, to a direction (of any length) on the sphere.
+        Each matrix maps ``(x, y, 1)`` to a direction of any length on the sphere. x runs from −1 at
+        the left edge of an image to 1 at the right edge, y from −1 at the top to 1 at the bottom.
         """
         return NO_RAYS
 
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
-        """Scores ``(n, K, h, w)`` as images on the canvas ``(H, W)``, and these images."""
+        """Return scores ``(n, K, h, w)`` as images on the canvas ``(H, W)``, and their geometry."""
         del shape
         return scores, self
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
-        """``(H, W)`` number of the image whose center is nearest to each pixel of the canvas."""
+        """Return the number of the image with the nearest center for each pixel ``(H, W)``."""
         raise NotImplementedError
 
     def geometry(
         self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
     ) -> CanvasGeometry:
-        """Geometry of some rows of the canvas.
+        """Return the geometry of the views and some rows of the canvas.
 
         Args:
             shape: ``(H, W)`` of the canvas.
             rows: Rows of the canvas, without a step.
-            owner: Owners of these rows; empty for feathering.
+            owner: ``(rows, W)`` owners; empty for feathering.
         """
         raise NotImplementedError
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """``(n, H, 2)`` spans of pixels of the canvas that contain those that an image owns."""
+        """Return ``(n, H, 2)`` spans of the canvas that contain the owned pixels of each image."""
         raise NotImplementedError
 
 
@@ -100,17 +100,17 @@ class Sampler(Protocol):
     """Selects views of one panorama or photo."""
 
     def sample(self, rng: np.random.Generator) -> Views:
-        """Views of one training sample: a random subset, augmented."""
+        """Return the views of one training sample: a random subset, augmented."""
         ...
 
     def view_sets(self) -> Sequence[Views]:
-        """Sets of views that each cover the whole; the scores of several sets are averaged."""
+        """Return sets of views that each cover the whole image; their scores are averaged."""
         ...
 
 
 @runtime_checkable
 class Representation(Sampler, Protocol):
-    """The images of a panorama that a network is given."""
+    """The views of a panorama that a network gets as input."""
 
     blend: Blend
 
@@ -121,11 +121,11 @@ class Representation(Sampler, Protocol):
 
     @property
     def erp_height(self) -> int:
-        """Rows of the panorama it reads and is scored on."""
+        """Rows of the panorama from which views are rendered, and on which scores are computed."""
         ...
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
-        """The same representation in rotated directions R·d, for tilted panoramas."""
+        """Return the same representation in rotated directions R·d, for tilted panoramas."""
         ...
 
 
@@ -135,7 +135,7 @@ class PinholeViews(Views):
 
     Attributes:
         grid: Geometry of all images.
-        faces: Images that are rendered; None for all.
+        faces: Indices of the images that are rendered; None for all.
         mirrored: True if each image is mirrored left to right.
     """
 
@@ -173,7 +173,7 @@ class PinholeViews(Views):
         return mirrored
 
     def rays(self) -> NDArray[np.float32]:
-        """Camera axes, scaled to the images' edges; see `Views`."""
+        """Return camera axes, scaled to the images' edges; see `Views`."""
         grid = self.grid
         edge = grid.dim / 2 * grid.pitch
         axes = grid.world_from_camera[self.chosen]

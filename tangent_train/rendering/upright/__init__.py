@@ -1,1 +1,1 @@
-"""The direction of up in a panorama."""
+"""Estimate the direction of up in a panorama."""

@@ -24,13 +24,13 @@ from tangent_train.rendering.upright.manhattan import (
 Judge = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 
-_EVEN_CHANCE = 3.1  # significance of frames of which half are right
+_EVEN_CHANCE = 3.1  # significance at which half of the frames are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
 _HOPELESS = 1 / 400
-"""Directions less likely than the best by that factor are not judged: judging takes time."""
+"""Directions less likely than the best by this factor are not passed to the judge, to save time."""
 _LEAST_ROWS = 64
-"""With fewer, noise looks like a room."""
+"""In panoramas with fewer rows, noise is mistaken for a room."""
 _DISTINCT = np.cos(np.radians(6))
 
 _SMALL = (32, 64)
@@ -39,14 +39,22 @@ _CAP = 0.85
 _GRAY = cv2.COLOR_RGB2GRAY
 
 _EVEN = np.array([4.0, 4.5, -2.3, -24.0, -5.2])
-"""Weights of what an axis has in common with its opposite: the share of the segments that follows
-it; the share of all within 30° of the plane across it; their density within 32° of it and of its
-opposite, relative to the mean; of those that follow it, how far from that plane they are (mean
-squared sine), and how far from being evenly all around."""
+"""Weights of features that are equal for an axis and its opposite:
+
+1. share of segments that follow the axis;
+2. share of all segments within 30° of the plane perpendicular to it;
+3. density of segments within 32° of the axis or its opposite, relative to the mean;
+4. mean squared sine of the angle between that plane and the segments that follow the axis;
+5. unevenness around the axis of the segments that follow it, 0 to 1.
+"""
 
 _ODD = np.array([-3.8, -7.0, 0.35])
-"""Weights of what differs: how high (mean sine) the segments are that follow this axis, and those
-that follow none (clutter); by how many standard deviations its side is brighter."""
+"""Weights of features with the opposite sign for the opposite axis:
+
+1. mean height (sine) of segments that follow the axis;
+2. mean height of segments that follow no axis (clutter);
+3. standard deviations by which the side of the axis is brighter than the other.
+"""
 
 
 def estimate_up(
@@ -54,28 +62,31 @@ def estimate_up(
 ) -> NDArray[np.float64] | None:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
-    Most of them follow three directions at right angles, one of which is the vertical: the frame
-    that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) gives its axes, to a
-    fraction of a degree. Where only one of them is within `max_tilt_deg` of the panorama's own
-    vertical, it is up. Of several, one is chosen by the appearance of rooms (see
-    `up_probabilities`), with which one in six randomly rotated SynthRooms gets a wrong axis, and by
-    `judge`, if there is one.
+    Most straight edges follow three directions at right angles, and one of them is the vertical.
+    The frame that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) provides
+    these axes to a fraction of a degree. If only one axis is within `max_tilt_deg` of the
+    panorama's own vertical, it is up. If several are, one is selected by the appearance of rooms
+    (see `up_probabilities`), and by `judge` if it is given. By appearance alone, one in six
+    randomly rotated SynthRooms gets a wrong axis.
 
-    Estimates with a probability below one half are rejected: nature, noise and pictures without
-    edges leave the panorama as it is.
+    Estimates with a probability below one half are rejected, for example in nature, noise and
+    images without edges.
 
     Args:
-        rgb: ``(H, W, 3)`` uint8 whole panorama. 128 rows or more give good results, less than 64
-            none. Black (0, 0, 0) areas count as missing.
-        max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 is any orientation.
-            Choose it slightly above the camera's tilt: beyond it, another axis of the room may be
-            taken for up.
+        rgb: ``(H, W, 3)`` uint8 whole panorama. With less than 64 rows there is no estimate; use
+            128 or more. Black (0, 0, 0) areas count as missing.
+        max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 for all orientations.
+            Choose it slightly above the camera's tilt: with a larger value, another axis of the
+            room may be taken for up.
         judge: Other evidence about directions, such as the confidence of a network
-            (`tangent_train.inference.judge`). Asked once at most, for those of the best frame that
-            are not hopeless.
+            (`tangent_train.inference.judge`). It is called at most once, for the likely directions
+            of the best frame.
+
+    Returns:
+        ``(3,)`` unit vector in the panorama's frame; None without an estimate.
 
     Raises:
-        SettingError: The tilt is none.
+        SettingError: The tilt is not above 0 and at most 180.
     """
     if not 0 < max_tilt_deg <= 180:
         raise SettingError("max_tilt_deg", found=max_tilt_deg, expected="above 0, at most 180")
@@ -96,8 +107,8 @@ def _candidates(
     lowest: float,
     judge: Judge | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Directions of up in reach ``(n, 3)`` and their probabilities ``(n,)``."""
-    # A logit model of all frames and of none of them; frames with the same vertical add up.
+    """Return possible directions of up ``(n, 3)`` and their probabilities ``(n,)``."""
+    # A logit model over all frames and "no frame"; frames with the same vertical add up.
     odds = [math.exp(_STEEPNESS * (frame.significance - _EVEN_CHANCE)) for frame in frames]
     directions = np.zeros((0, 3))
     chances = np.zeros(0)
@@ -109,11 +120,11 @@ def _candidates(
         shares = np.ones(1)
         if inside.sum() > 1:
             shares = up_probabilities(rgb, segments, frame.axes_xyz)[inside]
-            open_ones = shares > _HOPELESS * shares.max()
-            if judge is not None and frame is frames[0] and open_ones.sum() > 1:
-                likely = judge(axes[inside][open_ones])
-                shares[open_ones] *= np.exp(likely - likely.max())
-                shares[~open_ones] = 0
+            likely = shares > _HOPELESS * shares.max()
+            if judge is not None and frame is frames[0] and likely.sum() > 1:
+                evidence = judge(axes[inside][likely])
+                shares[likely] *= np.exp(evidence - evidence.max())
+                shares[~likely] = 0
         for axis, share in zip(axes[inside], odd * shares / shares.sum(), strict=True):
             known = np.flatnonzero(directions @ axis > _DISTINCT)
             if len(known):
@@ -127,18 +138,19 @@ def _candidates(
 def up_probabilities(
     rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Probability that each direction of a frame is up, for panoramas in any orientation.
+    """Return the probability that each direction of a frame is up, for arbitrary rotations.
 
-    Cues of rooms: vertical edges all around, at eye level and below; clutter below; few edges
-    straight above and below; light from above. The weights were fitted to panoramas of SynthRooms.
+    Rooms have vertical edges all around, at eye level and below; clutter below; few edges straight
+    above and below; light from above. The weights of these features were fitted to panoramas of
+    SynthRooms.
 
     Args:
         rgb: ``(H, W, 3)`` panorama.
-        segments: Its segments.
+        segments: Line segments of the panorama.
         axes_xyz: ``(3, 3)`` unit directions as columns.
 
     Returns:
-        ``(6,)`` probabilities of ``±axes_xyz``: of all three columns, then of their opposites.
+        ``(6,)`` probabilities of the three columns, then of their opposites.
     """
     even, odd = cues(rgb, segments, axes_xyz)
     scores = np.concatenate([even @ _EVEN + odd @ _ODD, even @ _EVEN - odd @ _ODD])
@@ -149,7 +161,7 @@ def up_probabilities(
 def cues(
     rgb: NDArray[np.uint8], segments: LineSegments, axes_xyz: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """``(3, 5)`` even and ``(3, 3)`` odd features of the axes, in the order of their weights."""
+    """Return ``(3, 5)`` even and ``(3, 3)`` odd features of axes, in the order of the weights."""
     weights = segment_weights(segments)
     column, agreement = followed_axes(segments, axes_xyz)
     heights = segments.middles_xyz @ axes_xyz
@@ -178,7 +190,7 @@ def _mean(values: NDArray[Any], weights: NDArray[np.float64]) -> complex:
 
 
 def _light(rgb: NDArray[np.uint8], axes_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
-    """``(3,)`` by how many standard deviations the side of each axis is brighter than the other."""
+    """Return how many standard deviations brighter each axis is than its opposite, ``(3,)``."""
     gray = cv2.cvtColor(cv2.resize(rgb, _SMALL[::-1], interpolation=cv2.INTER_AREA), _GRAY).ravel()
     area = np.repeat(equirect_solid_angles(_SMALL), _SMALL[1]) * (gray > 0) + 1e-9
     cosines = equirect_directions(_SMALL).reshape(-1, 3) @ axes_xyz
@@ -189,19 +201,19 @@ def _light(rgb: NDArray[np.uint8], axes_xyz: NDArray[np.float64]) -> NDArray[np.
 
 
 def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
-    """The smallest rotation R with ``R @ (0, 0, 1) = up``.
+    """Return the smallest rotation R with ``R @ (0, 0, 1) = up``.
 
-    A grid rotated by it (``grid.with_rotation(R)``) has its z axis point up, and
-    ``rotate_equirect(panorama, R.T)`` is the panorama upright.
+    The z axis of a grid rotated by it (``grid.with_rotation(R)``) points up, and
+    ``rotate_equirect(panorama, R.T)`` returns the upright panorama.
 
     Args:
         up: ``(3,)`` direction of up in the panorama's frame, of any length.
 
     Returns:
-        ``(3, 3)`` rotation; half a turn about the y axis for ``(0, 0, -1)``.
+        ``(3, 3)`` rotation; half a revolution about the y axis for ``(0, 0, -1)``.
 
     Raises:
-        SettingError: It is no direction.
+        SettingError: The direction is not three finite numbers, or all are 0.
 
     >>> upright_rotation([0, 1, 0]).round(6).tolist()
     [[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]
@@ -217,25 +229,25 @@ def upright_rotation(up: ArrayLike) -> NDArray[np.float64]:
 
 
 def up_from_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
-    """The direction of up by `PosePitchDegrees` and `PoseRollDegrees` of a panorama.
+    """Return the direction of up from `PosePitchDegrees` and `PoseRollDegrees` of a panorama.
 
-    In Google's Photo Sphere XMP metadata
-    (https://developers.google.com/streetview/spherical-metadata) the pitch is that of the middle of
-    the image, in degrees above the horizon; as the roll increases, the horizon rotates
-    counterclockwise in the image: the camera's right side goes down. The camera is rotated by the
-    heading, then by the pitch about its own right, then by the roll about its own forward axis; the
-    heading leaves up where it is. Some programs have written, or shown, the roll with the other
+    These are Google's Photo Sphere XMP metadata
+    (https://developers.google.com/streetview/spherical-metadata). The pitch is that of the middle
+    of the image, in degrees above the horizon. As the roll increases, the horizon rotates
+    counterclockwise in the image and the camera's right side moves down. The camera is rotated by
+    the heading, then by the pitch about its own right axis, then by the roll about its own forward
+    axis; up does not depend on the heading. Some programs write or show the roll with the opposite
     sign.
 
     Args:
-        pitch_deg: −90 to 90.
-        roll_deg: −180 to 180.
+        pitch_deg: Pitch, −90 to 90.
+        roll_deg: Roll, −180 to 180.
 
     Returns:
         ``(3,)`` unit vector in the panorama's frame: forward, right, up.
 
     Raises:
-        SettingError: An angle that is NaN or infinite.
+        SettingError: An angle is NaN or infinite.
 
     >>> up_from_pose(0, -90).round(6).tolist()
     [0.0, 1.0, 0.0]

@@ -1,6 +1,6 @@
 """Manhattan frames: three directions at right angles that the straight edges of a scene follow.
 
-Straight edges of a panorama are arcs of great circles, found in pinhole views of it.
+Straight edges appear in a panorama as arcs of great circles. They are detected in pinhole views.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from tangent_train.rendering.forward import equirect_to_tangent
 _Float = TypeVar("_Float", bound=np.floating)
 
 MOST_ROWS = 512
-"""Larger panoramas are shrunk to that many rows."""
+"""Larger panoramas are resized to this number of rows."""
 
-_LEAST_SIDE = 128  # of a face: LSD looks for rows of pixels
+_LEAST_SIDE = 128  # of a face: LSD needs lines of several pixels
 _SHORTEST_RAD = np.radians(3)
-_MOST = 400  # the longest; more only take time
+_MOST = 400  # the longest segments; more take time without better results
 _LEAST_CONTRAST = 16
 _BLACK_BLOCK = np.ones((5, 5), np.uint8)
 _BLACK_RIM = np.ones((7, 7), np.uint8)
@@ -31,7 +31,7 @@ _SEARCH_TOLERANCE = np.sin(np.radians(4))
 _TOLERANCE = np.sin(np.radians(2))
 _REFINEMENTS = np.sin(np.radians([4, 3, 2, 1.5, 1.2, 1.2, 1.2]))
 _CHANCE = 2 * _TOLERANCE  # ∫ (1 − q²/τ²) dq = 2τ/3 of every axis, for |cos| q uniform on [0, 1]
-_LONGEST_RAD = 0.5  # longer segments count no more: one beam is not a room
+_LONGEST_RAD = 0.5  # longer segments get the same weight: a single beam is not a room
 _FIRST_AXES = 24
 _APART = np.cos(np.radians(6))
 _FRAMES = 8
@@ -40,8 +40,8 @@ _FRAMES = 8
 class LineSegments(NamedTuple):
     """Straight edges as arcs of great circles, the longest first.
 
-    A straight edge of the scene and the center of the camera span a plane. The vanishing points of
-    the edge, and all that is parallel to it, lie in that plane.
+    A straight edge of the scene and the center of the camera span a plane. The plane contains the
+    vanishing points of the edge, which are those of all parallel edges.
 
     Attributes:
         normals_xyz: ``(n, 3)`` unit normals of the planes.
@@ -59,9 +59,9 @@ class ManhattanFrame(NamedTuple):
 
     Attributes:
         axes_xyz: ``(3, 3)`` unit directions as columns, of either sign and in any order.
-        significance: By how many standard deviations more segments follow them than would with
-            random directions at a given frame. Of the best of all frames it is about 1.5
-            for random segments, never above 2.
+        significance: Number of standard deviations by which more segments follow the frame than
+            random segments would follow a given frame. For random segments, the best of all frames
+            reached about 1.5, and at most 2.
     """
 
     axes_xyz: NDArray[np.float64]
@@ -71,21 +71,21 @@ class ManhattanFrame(NamedTuple):
 def find_line_segments(rgb: NDArray[np.uint8]) -> LineSegments:
     """Find straight edges on all sides of a panorama.
 
-    The line segment detector LSD (von Gioi et al., PAMI 2010), which bounds false detections in
-    noise, works on the six faces of a cube. Edges of black areas are left out: where there is no
-    picture, they are those of a cut.
+    The line segment detector LSD (von Gioi et al., PAMI 2010), which limits false detections in
+    noise, is applied to the six faces of a cube. Edges of black areas are left out, because they
+    are borders of missing parts.
 
     Args:
-        rgb: ``(H, W, 3)``; panoramas of more than 512 rows are shrunk first.
+        rgb: ``(H, W, 3)`` panorama; with more than 512 rows it is resized first.
 
     Returns:
-        The 400 longest of the segments from 3°.
+        The longest segments of at least 3°, up to 400.
     """
     height, width = rgb.shape[:2]
     if height > MOST_ROWS:
         size = (max(1, round(width * MOST_ROWS / height)), MOST_ROWS)
         rgb = cv2.resize(rgb, size, interpolation=cv2.INTER_AREA)
-    # In the middle of a face as many pixels per degree as the panorama has at its equator.
+    # The middle of a face has as many pixels per degree as the panorama's equator.
     grid = CubeGrid(max(_LEAST_SIDE, round(rgb.shape[0] * 2 / np.pi)))
     black = (rgb.max(axis=-1) == 0).astype(np.uint8)
     gray = _stretched(cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY), black)
@@ -102,7 +102,7 @@ def find_line_segments(rgb: NDArray[np.uint8]) -> LineSegments:
 
 
 def _stretched(gray: NDArray[np.uint8], black: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Full contrast for dark rooms: LSD asks for steps of some grey levels."""
+    """Stretch the contrast of dark rooms, because LSD needs steps of several gray levels."""
     counts = np.bincount(gray[black == 0], minlength=256).cumsum()
     low, high = np.searchsorted(counts, np.array([0.01, 0.99]) * counts[-1])
     steps = (np.arange(256) - low) * (255 / max(high - low, _LEAST_CONTRAST))
@@ -113,11 +113,11 @@ def _stretched(gray: NDArray[np.uint8], black: NDArray[np.uint8]) -> NDArray[np.
 def _seen_segments(
     detector: cv2.LineSegmentDetector, face: NDArray[np.uint8], unseen: NDArray[np.uint8]
 ) -> NDArray[np.float64]:
-    """``(n, 2, 2)`` ends (x, y) of the segments of a face that are not the rim of black areas."""
+    """Return ``(n, 2, 2)`` ends (x, y) of segments of a face, without rims of black areas."""
     found = detector.detect(face)[0]
     ends = np.zeros((0, 2, 2)) if found is None else found.reshape(-1, 2, 2).astype(np.float64)
     if len(ends) and unseen.any():
-        # Single black pixels are dark things, not missing parts.
+        # Single black pixels are dark objects, not missing parts.
         areas = cv2.morphologyEx(unseen, cv2.MORPH_OPEN, _BLACK_BLOCK)
         x, y = np.rint(ends.mean(axis=1)).astype(np.intp).clip(0, len(face) - 1).T
         ends = ends[cv2.dilate(areas, _BLACK_RIM)[y, x] == 0]
@@ -125,7 +125,7 @@ def _seen_segments(
 
 
 def _arcs(ends_xyz: NDArray[np.float64]) -> LineSegments:
-    """Arcs of ``(n, 2, 3)`` directions of their ends."""
+    """Return the longest arcs, given the directions of their ends, ``(n, 2, 3)``."""
     ends = ends_xyz / np.linalg.norm(ends_xyz, axis=-1, keepdims=True)
     normals = np.cross(ends[:, 0], ends[:, 1])
     sines = np.linalg.norm(normals, axis=-1)
@@ -138,22 +138,22 @@ def _arcs(ends_xyz: NDArray[np.float64]) -> LineSegments:
 
 
 def segment_weights(segments: LineSegments) -> NDArray[np.float64]:
-    """``(n,)`` weights: lengths in radians, up to half a radian."""
+    """Return ``(n,)`` weights: lengths in radians, at most half a radian."""
     return np.minimum(segments.lengths_rad, _LONGEST_RAD)
 
 
 def followed_axes(
     segments: LineSegments, axes_xyz: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Assign each segment to the axis it follows, and say how well.
+    """Assign each segment to an axis, with a measure of agreement.
 
     Args:
         segments: n segments.
         axes_xyz: ``(3, 3)`` unit directions as columns.
 
     Returns:
-        ``(n,)`` columns, and ``(n,)`` from 1 (the plane of the segment holds the axis) to 0 (it is
-        2° off or more: the segment follows no axis).
+        ``(n,)`` columns of the nearest axes; and ``(n,)`` agreement from 1 (the plane of the
+        segment contains the axis) to 0 (the axis is 2° or more off: the segment follows no axis).
     """
     cosines = np.abs(segments.normals_xyz @ axes_xyz)
     return cosines.argmin(axis=1), _agreement(cosines.min(axis=1), _TOLERANCE)
@@ -162,14 +162,14 @@ def followed_axes(
 def find_manhattan_frames(segments: LineSegments) -> list[ManhattanFrame]:
     """Find the frames that most segments follow, the best first.
 
-    A search over a grid of all directions, one degree around each of the best of them, then
-    reweighted least squares; deterministic.
+    The first axis is searched on a grid of all directions, the second in steps of one degree around
+    each of the best; reweighted least squares refines the frame. The result is deterministic.
 
     Args:
-        segments: Of a panorama.
+        segments: Line segments of a panorama.
 
     Returns:
-        Up to 8 that differ by more than 6°; none for fewer than four segments.
+        Up to 8 frames that differ by more than 6°; empty for fewer than four segments.
     """
     if len(segments.lengths_rad) < 4:
         return []
@@ -194,7 +194,7 @@ def _agreement(cosines: NDArray[_Float], tolerance: float) -> NDArray[_Float]:
 
 @lru_cache(maxsize=1)
 def _hemisphere() -> NDArray[np.float32]:
-    """``(1286, 3)`` directions about 4° apart: the half of a sphere, and its rim."""
+    """Return ``(1286, 3)`` directions about 4° apart: half of a sphere, and its rim."""
     vertices = icosphere(4).vertices
     directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
     half: NDArray[np.float32] = directions[directions[:, 2] > -1e-9].astype(np.float32)
@@ -205,7 +205,7 @@ def _hemisphere() -> NDArray[np.float32]:
 def _first_axes(
     normals: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> list[NDArray[np.float64]]:
-    """Directions that many segments follow, the best first, none close to a better one."""
+    """Return directions that many segments follow, the best first, at least 6° apart."""
     directions = _hemisphere()
     agreement = _agreement(np.abs(directions @ normals.T.astype(np.float32)), _SEARCH_TOLERANCE)
     scores = agreement @ weights.astype(np.float32)
@@ -220,37 +220,37 @@ def _first_axes(
 def _around(
     axis: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[float, NDArray[np.float64]]:
-    """The best frame with a given axis, to a degree, and its score."""
+    """Return the score of the best frame with a given axis, and the frame, in steps of a degree."""
     second = np.cross(axis, np.eye(3)[np.abs(axis).argmin()])
     second /= np.linalg.norm(second)
     third = np.cross(axis, second)
-    turns = np.radians(np.arange(180.0))
-    circle = np.cos(turns)[:, None] * second + np.sin(turns)[:, None] * third
+    angles = np.radians(np.arange(180.0))
+    circle = np.cos(angles)[:, None] * second + np.sin(angles)[:, None] * third
     agreement = _agreement(np.abs((circle @ normals.T).astype(np.float32)), _SEARCH_TOLERANCE)
     along = agreement @ weights.astype(np.float32)
     pairs = along[:90] + along[90:]
     best = int(pairs.argmax())
-    own = _agreement(np.abs(normals @ axis), _SEARCH_TOLERANCE) @ weights
+    score = pairs[best] + _agreement(np.abs(normals @ axis), _SEARCH_TOLERANCE) @ weights
     axes = np.stack([axis, circle[best], np.cross(axis, circle[best])], axis=1)
-    return float(pairs[best] + own), axes
+    return float(score), axes
 
 
 def _refined(
     axes: NDArray[np.float64], normals: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """A frame rotated so that the segments that follow it do so best."""
+    """Return a frame rotated to the best agreement with the segments that follow it."""
     for tolerance in _REFINEMENTS:
         cosines = normals @ axes
         nearest = np.abs(cosines).argmin(axis=1)
         residuals = np.take_along_axis(cosines, nearest[:, None], axis=1)[:, 0]
         agreed = weights * _agreement(np.abs(residuals), tolerance)
-        # A small turn δ, in axes of the frame, moves axis e to e + δ×e: n·(δ×e) = δ·(e×n).
+        # A small rotation δ, in axes of the frame, moves axis e to e + δ×e: n·(δ×e) = δ·(e×n).
         slopes = np.cross(np.eye(3)[nearest], cosines)
         normal_matrix = (slopes * agreed[:, None]).T @ slopes + 1e-9 * np.eye(3)
-        turn = -np.linalg.solve(normal_matrix, slopes.T @ (agreed * residuals))
-        angle = float(np.linalg.norm(turn))
+        step = -np.linalg.solve(normal_matrix, slopes.T @ (agreed * residuals))
+        angle = float(np.linalg.norm(step))
         if angle > 1e-12:
-            axes = axes @ rotation_about(turn, angle)
+            axes = axes @ rotation_about(step, angle)
     return axes
 
 

@@ -21,7 +21,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png, write_png
 
-FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("grey",))}
+FORMATS = {"rgb": (8, ("RGB",)), "labels": (8, ("gray",))}
 
 
 class ToyReader(PngReader):

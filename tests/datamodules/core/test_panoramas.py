@@ -12,7 +12,7 @@ from datamodules.core.panoramas import mask_black, resize_area, resize_depth, re
 
 
 def test_a_ramp_keeps_its_place_at_an_uneven_ratio() -> None:
-    # Centre of target column j lies at (j + ½) · 3/2 source columns; the ramp says where it is.
+    # The center of target column j lies at (j + ½) · 3/2 source columns; the ramp shows it.
     ramp = np.tile(np.arange(96, dtype=np.uint8) * 2, (48, 1))
     expected = 2 * ((np.arange(64) + 0.5) * 1.5 - 0.5)
     area = resize_area(np.repeat(ramp[..., None], 3, axis=2), (32, 64))[0, :, 0]
@@ -20,7 +20,7 @@ def test_a_ramp_keeps_its_place_at_an_uneven_ratio() -> None:
     np.testing.assert_allclose(resize_nearest(ramp, (32, 64))[0], expected, atol=1)
 
 
-def test_colours_are_means_of_areas() -> None:
+def test_colors_are_means_of_areas() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
     means = rgb.reshape(8, 4, 16, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(resize_area(rgb, (8, 16)), means, atol=0.501)
@@ -60,7 +60,9 @@ def test_depth_is_that_of_the_nearest_valid_pixel(shape: tuple[int, int]) -> Non
     ("mask", "expected"),
     [("labels", [5, 5, 5]), ("any_black", [0, 0, 5]), ("all_black", [0, 5, 5])],
 )
-def test_masks(mask: Literal["labels", "any_black", "all_black"], expected: list[int]) -> None:
+def test_black_pixels_are_unknown(
+    mask: Literal["labels", "any_black", "all_black"], expected: list[int]
+) -> None:
     rgb = np.array([[[0, 0, 0], [9, 0, 9], [1, 2, 3]]], np.uint8)
     masked = mask_black(np.full((1, 3), 5, np.uint8), rgb, mask)
     assert masked.dtype == np.uint8

@@ -26,7 +26,7 @@ def _rgb(files: ImageFiles) -> NDArray[np.uint8]:
 
 
 def _heights() -> Panorama:
-    """A panorama whose labels, colours and depth tell the direction's height z."""
+    """A panorama whose labels, colors and depth tell the direction's height z."""
     z = np.round(100 + 100 * equirect_directions((32, 64))[..., 2])
     labels = z.astype(np.uint8)
     return Panorama(np.stack([labels] * 3, axis=-1), z.astype(np.uint16), labels)
@@ -69,10 +69,10 @@ def test_image_depth_labels_and_up_rotate_together(
 
 
 def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
+    estimated: list[str] = []
 
     def read_up(path: Path) -> NDArray[np.float64] | None:
-        asked.append(str(path))
+        estimated.append(str(path))
         return UP if str(path) == "1" else None
 
     monkeypatch.setattr("datamodules.core.transforms.read_up", read_up)
@@ -80,18 +80,18 @@ def test_files_are_asked_once_where_up_is(monkeypatch: pytest.MonkeyPatch) -> No
     for _ in range(2):
         assert posed(_heights(), 0, FILES[0]).up is None
         np.testing.assert_array_equal(posed(_heights(), 1, FILES[1]).up, UP)
-    assert asked == ["0", "1"]
+    assert estimated == ["0", "1"]
 
 
 @pytest.mark.parametrize("found", [None, UP])
-def test_only_what_nothing_says_is_estimated_and_only_once(
+def test_only_unknown_up_directions_are_estimated_and_only_once(
     monkeypatch: pytest.MonkeyPatch, found: NDArray[np.float64] | None
 ) -> None:
-    asked: list[float] = []
+    estimated: list[float] = []
 
     def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> Any:
         assert judge is None
-        asked.append(max_tilt_deg)
+        estimated.append(max_tilt_deg)
         return found
 
     monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
@@ -99,7 +99,7 @@ def test_only_what_nothing_says_is_estimated_and_only_once(
     for _ in range(2):
         np.testing.assert_array_equal(upright(_heights()._replace(up=-UP), 1, FILES[1]).up, -UP)
         assert upright(_heights(), 0, FILES[0]).up is found
-    assert asked == [50]
+    assert estimated == [50]
 
 
 def test_a_judge_sees_the_panorama_and_stays_in_its_process(
@@ -122,7 +122,7 @@ def test_a_judge_sees_the_panorama_and_stays_in_its_process(
     np.testing.assert_array_equal(sent(_heights(), 1, FILES[1]).up, UP)
 
 
-def test_what_is_remembered_is_read_once_and_what_is_broken_is_listed() -> None:
+def test_images_in_memory_are_read_once_and_broken_ones_are_listed() -> None:
     read: list[str] = []
 
     def decode(files: ImageFiles) -> Panorama:

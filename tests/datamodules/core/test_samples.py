@@ -106,7 +106,7 @@ def _training(erp: Representation, seed: int = 0) -> TrainingImages:
     return TrainingImages(POSITIONS, erp, seed, DEPTH)
 
 
-def test_training_sample(erp: Representation) -> None:
+def test_a_training_sample_holds_the_rendered_views(erp: Representation) -> None:
     sample = _training(erp)[4, 1]
     rgb, depth = sample.images
     assert (rgb.shape, rgb.dtype) == ((1, 16, 8, 3), torch.uint8)
@@ -118,7 +118,7 @@ def test_training_sample(erp: Representation) -> None:
         torch.testing.assert_close(rgb[..., channel], sample.labels)
     sample = _training(TangentRepresentation(0, 3, random_rotation="so3"))[0, 0]
     torch.testing.assert_close(sample.images[1], sample.labels.short() * 4)
-    assert not torch.equal(sample.images[0][..., 0], sample.labels), "colours are interpolated"
+    assert not torch.equal(sample.images[0][..., 0], sample.labels), "colors are interpolated"
 
 
 def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
@@ -128,10 +128,10 @@ def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
     assert not torch.equal(first, _training(erp, seed=1)[4, 1].labels)
 
 
-# --- colours -----------------------------------------------------------------------------------
+# --- colors -----------------------------------------------------------------------------------
 
 
-def test_jitter_changes_the_colours_and_nothing_else(erp: Representation) -> None:
+def test_jitter_changes_the_colors_and_nothing_else(erp: Representation) -> None:
     before = _training(erp)[2, 1]
     after, again = (TrainingImages(POSITIONS, erp, 0, DEPTH, 0.5)[2, 1] for _ in range(2))
     assert not torch.equal(before.images[0], after.images[0])
@@ -148,12 +148,12 @@ def test_jitter_against_slow_formulas() -> None:
     brightness, contrast, saturation = (rng.uniform(1 - strength, 1 + strength) for _ in range(3))
     hue = rng.uniform(-1, 1) * strength / 10
 
-    def grey(colors: NDArray[np.floating]) -> NDArray[np.floating]:
+    def gray(colors: NDArray[np.floating]) -> NDArray[np.floating]:
         return colors @ [0.2989, 0.587, 0.114]
 
     colors = np.minimum(rgb / 255 * brightness, 1)
-    colors = np.clip(contrast * colors + (1 - contrast) * grey(colors).mean(), 0, 1)
-    colors = np.clip(saturation * colors + (1 - saturation) * grey(colors)[..., None], 0, 1)
+    colors = np.clip(contrast * colors + (1 - contrast) * gray(colors).mean(), 0, 1)
+    colors = np.clip(saturation * colors + (1 - saturation) * gray(colors)[..., None], 0, 1)
     for place in np.ndindex(rgb.shape[:3]):
         h, s, v = colorsys.rgb_to_hsv(*colors[place])
         expected = colorsys.hsv_to_rgb((h + hue) % 1, s, v)

@@ -79,7 +79,7 @@ CROPS: Any = PerspectiveRepresentation(level=5)
     ],
     ids=lambda value: value.__name__ if isinstance(value, type) else str(value),
 )
-def test_impossible_settings(
+def test_impossible_settings_are_refused(
     data: Any, settings: dict[str, Any], name: str, tmp_path: Path
 ) -> None:
     if data is FolderPanoramas:
@@ -98,7 +98,7 @@ def test_impossible_settings(
         (SynthRoomsPerspective, CROPS, {"rooms": {}}, "views_per_camera: found 0"),
     ],
 )
-def test_what_does_not_go_together(
+def test_conflicting_settings_are_refused(
     data: Any, representation: Any, settings: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     with pytest.raises(SettingError, match=message):

@@ -97,9 +97,9 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     monkeypatch.setattr("datamodules.core.transforms.read_up", lambda path: tagged)
     known = make_module(test_rotation=30, upright="pose")
     np.testing.assert_array_equal(known.source("train").read(0).up, tagged)
-    turned = known.source("test").read(0).up
-    assert turned is not None
-    assert aware.up @ turned == pytest.approx(0.8)
+    rotated_up = known.source("test").read(0).up
+    assert rotated_up is not None
+    assert aware.up @ rotated_up == pytest.approx(0.8)
 
 
 def test_up_is_estimated_from_the_file_of_a_small_panorama(
@@ -294,7 +294,7 @@ def test_shuffled_order_is_new_every_epoch_and_reproducible() -> None:
     assert _indices(EpochSampler(20, 8)) != first
 
 
-def test_impossible_processes() -> None:
+def test_fewer_samples_than_processes_are_refused() -> None:
     with pytest.raises(SettingError, match="2 processes for 1 samples"):
         EpochSampler(1, 0, rank=0, world_size=2)
 

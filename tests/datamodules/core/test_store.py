@@ -67,7 +67,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_is_written_is_mapped(source: Path, store: Path) -> None:
+def test_stored_arrays_are_memory_mapped(source: Path, store: Path) -> None:
     rng = np.random.default_rng(0)
     arrays = {
         "rgb": rng.integers(0, 256, (5, 7, 3), np.uint8),
@@ -215,7 +215,7 @@ def test_parts_make_the_whole_store(make_module: MakeModule, store: Path, tmp_pa
         make_module(store=None).prepare_part(parts[0])
 
 
-def test_what_is_there_is_kept_and_what_is_not_is_made(
+def test_existing_files_are_kept_and_missing_ones_are_made(
     make_module: MakeModule, store: Path, root: Path, erp: Any
 ) -> None:
     make_module().prepare_data()

@@ -1,4 +1,4 @@
-"""Data sets in code of one's own: samples by index, whole images as arrays."""
+"""Data sets in user code: samples by index, whole images as arrays."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _agreement(panorama: LabeledImage, image: LabeledImage, directions: NDArray[
     known = np.isfinite(image.distance_m)
     assert known.mean() > 0.8
     points = image.pose.points_m(directions[known], image.distance_m[known])
-    seen, distance_m = panorama.pose.seen(points)
+    seen, distance_m = panorama.pose.project(points)
     row = (0.5 - np.arcsin(seen[..., 2]) / np.pi) * 64
     column = (0.5 + np.arctan2(seen[..., 1], seen[..., 0]) / (2 * np.pi)) * 128
     place = row.astype(int).clip(0, 63), column.astype(int) % 128
@@ -107,7 +107,7 @@ def test_the_pose_of_a_rotated_panorama_is_rotated(rooms: Path) -> None:
     assert _agreement(panorama, rotated, directions) > 0.8
 
 
-def test_what_a_data_set_lacks_is_none_or_nan(stanford_root: Path) -> None:
+def test_missing_depth_and_poses_are_nan_or_null(stanford_root: Path) -> None:
     panorama = Stanford2D3DS(stanford_root, level=3).panoramas("test")[0]
     assert panorama.pose is None
     assert panorama.distance_m is not None

@@ -1,4 +1,4 @@
-"""A small data set of one's own."""
+"""A small user-defined data set."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Writes small data sets of one's own: images, label images, depth, `classes.json`."""
+"""Writes small user-defined data sets: images, label images, depth, `classes.json`."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def blocks(seed: int, height: int) -> NDArray[np.uint8]:
 def write_panorama(
     root: Path, name: str, seed: int, height: int = 32, suffix: str = ".png", *, depth: bool = False
 ) -> None:
-    """One panorama whose colours tell its label values."""
+    """One panorama whose colors tell its label values."""
     values = blocks(seed, height)
     rgb = np.stack([values, 255 - values // 2, np.full_like(values, 80 + seed % 100)], axis=-1)
     save(root / "images" / f"{name}{suffix}", rgb)
@@ -41,7 +41,7 @@ def write_panorama(
 
 
 def save(path: Path, image: NDArray[np.uint8], **settings: Any) -> None:
-    """Write an image as its name says."""
+    """Write an image in the format of its suffix."""
     path.parent.mkdir(parents=True, exist_ok=True)
     Image.fromarray(image).save(path, **settings)
 

@@ -1,4 +1,4 @@
-"""Writes small data sets of one's own photos: images, label images, classes, cameras."""
+"""Writes small user-defined data sets of photos: images, label images, classes, cameras."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _STORED = {
 
 
 def displayed(seed: int, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colours and label values of a photo as it is looked at."""
+    """Colors and label values of a photo as it is looked at."""
     values = blocks(seed, max(size))[: size[0], : size[1]]
     return np.stack([values, 255 - values // 2, np.full_like(values, 80 + seed)], axis=-1), values
 
@@ -38,9 +38,9 @@ def write_photo(
     """One photo.
 
     Args:
-        root: Of the data set.
-        name: With ending.
-        seed: Of its pixels.
+        root: Folder of the data set.
+        name: File name with suffix.
+        seed: Seed of the pixels.
         size: Rows and columns as displayed.
         film_mm: Focal length of film in its EXIF data.
         orientation: In its EXIF data.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.folder.labelled import FolderPanoramas
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import read_png
 from tests.datamodules.folder.folder_format import (
@@ -40,7 +40,7 @@ def test_pixels_are_those_of_the_files(root: Path, erp: Any) -> None:
             rgb = np.asarray(image.convert("RGB"))
         mean = rgb.reshape(16, 2, 32, 2, 3).mean(axis=(1, 3))
         assert np.abs(panorama.rgb - mean).max() <= 0.5
-        # Of 2×2 pixels the lower right one is nearest to the centre, as for all data sets.
+        # The lower right of 2×2 pixels is nearest to the center, as for all data sets.
         stored = read_png(root / "labels" / f"{name}.png")
         np.testing.assert_array_equal(panorama.labels, classes[stored[1::2, 1::2]])
         units = read_png(root / "depth" / f"{name}.png")
@@ -84,10 +84,10 @@ def test_palettes_are_entries_or_colors(
 
 
 @pytest.mark.parametrize("mode", ["RGBA", "LA"])
-def test_colors(tmp_path: Path, erp: Any, mode: str) -> None:
+def test_colors_are_decoded_to_classes(tmp_path: Path, erp: Any, mode: str) -> None:
     rng = np.random.default_rng(0)
-    grey = rng.choice(np.array([0, 17, 34, 255], np.uint8), (16, 32))
-    rgb = np.repeat(grey[..., None], 3, axis=-1)
+    gray = rng.choice(np.array([0, 17, 34, 255], np.uint8), (16, 32))
+    rgb = np.repeat(gray[..., None], 3, axis=-1)
     if mode == "RGBA":
         rgb[..., 1] = rng.choice(np.array([0, 17], np.uint8), (16, 32))
     image = Image.fromarray(rgb).convert(mode)
@@ -111,7 +111,7 @@ def test_normalization_is_by_the_inputs_or_ones_own(root: Path, erp: Any) -> Non
         FolderPanoramas(root, erp, normalization="image")
 
 
-# What is wrong with files
+# Broken files
 
 
 def test_files_that_cannot_be_used(own_root: Path, erp: Any) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datamodules.core.panoramas import Photo
-from datamodules.folder.labelled import FolderPhotos
+from datamodules.folder.labeled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.folder.folder_format import CLASS_OF_STORED, save, write_classes
@@ -104,7 +104,7 @@ def test_a_camera_is_that_of_the_photo_as_displayed(tmp_path: Path) -> None:
         _photos(tmp_path).setup()
 
 
-# What cannot be used
+# Broken files
 
 
 def test_a_photo_without_a_camera_is_named_with_all_remedies(two: Path) -> None:
@@ -132,7 +132,7 @@ def _with(row: int, column: int, value: object) -> list[list[Any]]:
         {"fx": 70, "fy": 72, "cx": 30, "cy": 20, "k1": 0.1},
     ],
 )
-def test_cameras_that_are_none(two: Path, value: Any) -> None:
+def test_invalid_camera_matrices_are_refused(two: Path, value: Any) -> None:
     write_cameras(two, {"hall/a": value, ".": K})
     ((name, finding, _),) = _found(two, fov=70)
     assert name == "cameras.json"
@@ -160,7 +160,7 @@ def test_all_problems_of_cameras_are_listed(two: Path) -> None:
     assert [name for name, _, _ in found] == ["cameras.json"] * 4
     named = [finding.partition(",")[0].partition(":")[0] for _, finding, _ in found]
     assert named == ["'a'", "'hall'", "'hall/a.png'", "'images/hall/a'"]
-    assert "of which there is no image or folder" in found[0][1]
+    assert "which is not an image or folder" in found[0][1]
     with pytest.raises(DataError, match=r"found 4 problems"):
         _photos(two).setup()
 
@@ -171,8 +171,8 @@ def test_labels_of_another_size(tmp_path: Path) -> None:
         write_photo(tmp_path, f"{name}.jpg", seed, (60, 40), orientation=6)
     save(tmp_path / "labels" / "a.png", np.ones((30, 20), np.uint8))
     save(tmp_path / "labels" / "b.png", np.ones((40, 60), np.uint8))
-    (_, small, resized), (_, turned, as_displayed) = _found(tmp_path)
+    (_, small, resized), (_, rotated, as_displayed) = _found(tmp_path)
     assert "20 × 30 (width × height); expected 40 × 60 (width × height)" in small
     assert "one size" in resized
-    assert "60 × 40 (width × height); expected 40 × 60 (width × height)" in turned
+    assert "60 × 40 (width × height); expected 40 × 60 (width × height)" in rotated
     assert "EXIF" in as_displayed

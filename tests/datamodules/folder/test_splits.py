@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 
 from datamodules.core.index import SPLITS
-from datamodules.folder.labelled import FolderPanoramas
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import write_data_set
@@ -100,7 +100,7 @@ def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
 @pytest.mark.parametrize(
     ("lists", "message"),
     [
-        ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', of which there is no"),
+        ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', which is not an image"),
         ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
         ({"test": ""}, r"found no images for test; .* Name some in test\.txt"),
         ({"val": "# none"}, r"no images for val; .*data\.validation_fraction=0"),

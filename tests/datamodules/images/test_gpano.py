@@ -298,7 +298,7 @@ def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_edges_are_where_the_crop_says(seed: int) -> None:
+def test_edges_are_at_the_angles_of_the_crop(seed: int) -> None:
     rng = np.random.default_rng(seed)
     across, down = rng.uniform(20, 350), rng.uniform(10, 170)
     west = rng.uniform(-180, 180)
@@ -330,7 +330,7 @@ def test_edges_are_where_the_crop_says(seed: int) -> None:
         ((0, 40, 0, 10), r"pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square"),
     ],
 )
-def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
+def test_impossible_crops_are_refused(crop: tuple[float, ...], message: str) -> None:
     with pytest.raises(SettingError, match=f"crop: found .*{message}|{message}"):
         area_of_crop((100, 100), crop)
 
@@ -342,15 +342,15 @@ def test_impossible_crops(crop: tuple[float, ...], message: str) -> None:
     ("pitch", "roll"),
     [("-24.49", "-121"), ("5.0", "0"), ("0.0", "-0"), ("+2.3E+1", "-.31e2"), ("5.", "007")],
 )
-def test_pose(tmp_path: Path, pitch: str, roll: str) -> None:
-    """Programs that do not know it write zero pitch and roll."""
+def test_zero_pitch_and_roll_are_unknown(tmp_path: Path, pitch: str, roll: str) -> None:
+    """Programs write zero pitch and roll by default."""
     tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
     up = read_up(_save(tmp_path / "image.jpg", tags))
     expected = None if float(pitch) == 0 else up_from_pose(float(pitch), float(roll))
     np.testing.assert_array_equal(up, expected)
 
 
-def test_impossible_poses(tmp_path: Path) -> None:
+def test_impossible_poses_are_refused(tmp_path: Path) -> None:
     for axis, value in (
         ("Pitch", "91"),
         ("Roll", "nan"),

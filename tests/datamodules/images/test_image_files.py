@@ -23,14 +23,14 @@ def test_a_folder_is_searched_for_images_only(tmp_path: Path) -> None:
     others += ["phone.HEIC", "deep/phone.heic", "escape.\x1b[2J"]
     _touch(*(tmp_path / name for name in names + others))
     (tmp_path / "folder.png").mkdir()
-    told: list[str] = []
-    found = image_paths(tmp_path, tell=told.append)
+    messages: list[str] = []
+    found = image_paths(tmp_path, tell=messages.append)
     assert found == sorted(tmp_path / name for name in names)
     assert image_paths(str(tmp_path)) == found
     counts = r"Skipped: 1 .\x1b[2j, 2 .heic, 1 .part, 1 .txt, 1 without suffix. Convert"
-    assert [text.partition(" images")[0] for text in told] == [counts]
-    image_paths(tmp_path / "*.png", tell=told.append)
-    assert len(told) == 1
+    assert [text.partition(" images")[0] for text in messages] == [counts]
+    image_paths(tmp_path / "*.png", tell=messages.append)
+    assert len(messages) == 1
 
 
 def test_names_may_have_the_characters_of_a_pattern(tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_names_may_have_the_characters_of_a_pattern(tmp_path: Path) -> None:
     assert image_paths(tmp_path / "[ab]") == [inside]
 
 
-def test_patterns(tmp_path: Path) -> None:
+def test_patterns_select_images(tmp_path: Path) -> None:
     _touch(*(tmp_path / name for name in ("a1.jpg", "a2.png", "b1.jpg", "s/a3.JPG", "s/t/a4.jpg")))
     _touch(tmp_path / "a5.txt", tmp_path / ".a6.jpg")
 
@@ -61,7 +61,7 @@ def test_patterns(tmp_path: Path) -> None:
         ("empty", "found nothing"),
     ],
 )
-def test_no_images(tmp_path: Path, pattern: str, found: str) -> None:
+def test_missing_images_are_refused(tmp_path: Path, pattern: str, found: str) -> None:
     _touch(*(tmp_path / name for name in ("notes.txt", "phone/a.HEIC", "phone/notes.txt")))
     (tmp_path / "empty").mkdir()
     with pytest.raises(DataError, match=rf"{re.escape(pattern)}: {found}.*\.webp") as caught:

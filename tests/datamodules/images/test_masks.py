@@ -30,7 +30,7 @@ def spotted(rows: int, seed: int = 0) -> Any:
 
 @pytest.mark.parametrize("rows", [31, 32, 180])
 @pytest.mark.parametrize("lowest_deg", [-60, -45.0, -0.5, 0])
-def test_what_is_below_a_latitude(rows: int, lowest_deg: float) -> None:
+def test_pixels_below_a_latitude_are_masked(rows: int, lowest_deg: float) -> None:
     counts = Masks(lowest_deg).read("a", whole_area(Path("a.png"), (rows, 2 * rows)))
     z = equirect_directions((rows, 2 * rows))[..., 2]
     np.testing.assert_array_equal(counts == 255, z > np.sin(np.radians(lowest_deg)) - 1e-9)
@@ -38,7 +38,7 @@ def test_what_is_below_a_latitude(rows: int, lowest_deg: float) -> None:
 
 
 @pytest.mark.parametrize("rows", [16, 64, 96])
-def test_a_mask_of_any_other_size_is_sampled_at_the_centres_of_pixels(
+def test_a_mask_of_any_other_size_is_sampled_at_the_centers_of_pixels(
     rows: int, tmp_path: Path
 ) -> None:
     pixels = spotted(rows)
@@ -92,7 +92,7 @@ def test_no_such_latitude(mask: Any) -> None:
         Masks(mask, "data.mask")
 
 
-def test_files_that_are_no_masks(tmp_path: Path) -> None:
+def test_files_that_are_not_masks_are_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"pole\.png: found no such file; expected a mask as PNG"):
         Masks(tmp_path / "pole.png")
     write_pixels(tmp_path / "pole.jpg", spotted(32))

@@ -1,4 +1,4 @@
-"""Colours, depth and arrays of any pixel type, written and read as they are."""
+"""Colors, depth and arrays of any pixel type, written and read as they are."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from datamodules.images.pixel_files import (
 from datamodules.images.png import read_png_header
 from tangent_train.errors import DataError, SettingError
 from tests.datamodules.data_files import (
+    as_displayed,
     exif_orientation,
     png_bytes,
     png_chunk,
     tiff_bytes,
-    turned,
     write_png,
 )
 
@@ -49,7 +49,7 @@ def _noise(shape: tuple[int, ...], dtype: Any = np.uint8) -> NDArray[Any]:
         (".npy", np.bool_),
     ],
 )
-def test_what_is_written_is_read(
+def test_written_pixels_are_read(
     suffix: str, dtype: Any, channels: tuple[int, ...], tmp_path: Path
 ) -> None:
     pixels = (_noise((7, 9, *channels)) / 255 * 250).astype(dtype)
@@ -76,7 +76,7 @@ def test_files_that_cannot_hold_the_pixels(
     check_writable(".npy", dtype, channels)
 
 
-# Colours
+# Colors
 
 
 @pytest.mark.parametrize("suffix", [".png", ".tif"])
@@ -90,24 +90,24 @@ def test_16_bits_become_8(tmp_path: Path, suffix: str, channels: int) -> None:
     np.testing.assert_array_equal(read_rgb(path), expected)
 
 
-def test_grey_palette_and_transparency(tmp_path: Path) -> None:
+def test_gray_palette_and_transparency_are_decoded(tmp_path: Path) -> None:
     rgb = _noise((6, 10, 3))
     alpha = _noise((6, 10))
     Image.fromarray(np.dstack([rgb, alpha])).save(tmp_path / "rgba.png")
-    Image.fromarray(rgb[..., 0]).save(tmp_path / "grey.png")
-    Image.fromarray(np.dstack([rgb[..., 0], alpha]), "LA").save(tmp_path / "grey_alpha.png")
+    Image.fromarray(rgb[..., 0]).save(tmp_path / "gray.png")
+    Image.fromarray(np.dstack([rgb[..., 0], alpha]), "LA").save(tmp_path / "gray_alpha.png")
     Image.fromarray(rgb[..., 0] > 127).save(tmp_path / "bits.png")
     palette = Image.fromarray(alpha % 4, "P")
     colors = _noise((4, 3))
     palette.putpalette(colors.tobytes())
     palette.save(tmp_path / "palette.png")
     palette.save(tmp_path / "see_through.png", transparency=bytes([0, 100, 200, 255]))
-    grey = np.repeat(rgb[..., :1], 3, axis=-1)
+    gray = np.repeat(rgb[..., :1], 3, axis=-1)
     expected = {
         "rgba": rgb,
-        "grey": grey,
-        "grey_alpha": grey,
-        "bits": np.where(grey > 127, 255, 0),
+        "gray": gray,
+        "gray_alpha": gray,
+        "bits": np.where(gray > 127, 255, 0),
         "palette": colors[alpha % 4],
         "see_through": colors[alpha % 4],
     }
@@ -142,7 +142,7 @@ def test_png_is_turned_wherever_its_exif_data_are(
     for orientation in range(1, 9):
         chunk = _EXIF_FORMS[form](exif_orientation(orientation))
         path.write_bytes(png_bytes(stored, **{place: chunk}))
-        shown = turned(stored, orientation)
+        shown = as_displayed(stored, orientation)
         expected = {2: shown[..., 0], 4: shown[..., :3]}.get(stored.size // 24, shown)
         np.testing.assert_array_equal(read_pixels(path, indices=True), expected)
         assert read_image_size(path) == expected.shape[:2]
@@ -159,7 +159,7 @@ def test_other_formats_are_turned(tmp_path: Path, suffix: str) -> None:
         path = tmp_path / f"{orientation}{suffix}"
         exif = b"Exif\0\0" + exif_orientation(orientation)
         Image.fromarray(stored).save(path, exif=exif, subsampling="4:4:4", **best)
-        expected = turned(stored, orientation)
+        expected = as_displayed(stored, orientation)
         away = np.abs(read_rgb(path).astype(int) - expected)
         assert away.max() <= (0 if suffix == ".webp" else 8)
         assert read_image_size(path) == expected.shape[:2]
@@ -263,7 +263,7 @@ def test_tiff_is_turned(tmp_path: Path, dtype: str, channels: int) -> None:
     for orientation in range(1, 9):
         tags = {274: orientation, 339: [3 if dtype == "f4" else 1] * channels}
         path.write_bytes(tiff_bytes(values, tags=tags))
-        expected = turned(values, orientation)
+        expected = as_displayed(values, orientation)
         np.testing.assert_array_equal(read_pixels(path, indices=True), expected)
         assert read_image_size(path) == expected.shape[:2]
 
@@ -273,20 +273,20 @@ def test_other_tiff_files(tmp_path: Path) -> None:
     values = _values("u2", 3)
     path.write_bytes(tiff_bytes(values, big=True))
     np.testing.assert_array_equal(read_pixels(path, indices=True), values)
-    grey = _values("u1", 1)
-    path.write_bytes(tiff_bytes(grey, tags={262: 0}))  # 0 is white
-    np.testing.assert_array_equal(read_rgb(path)[..., 0], 255 - grey)
+    gray = _values("u1", 1)
+    path.write_bytes(tiff_bytes(gray, tags={262: 0}))  # 0 is white
+    np.testing.assert_array_equal(read_rgb(path)[..., 0], 255 - gray)
     inks = _values("u1", 4)
     path.write_bytes(tiff_bytes(inks, tags={262: 5}))
     expected = (255.0 - inks[..., :3]) * (255.0 - inks[..., 3:]) / 255
     assert np.abs(read_rgb(path) - expected).max() <= 1
     refused: list[tuple[NDArray[Any], dict[int, Any]]] = [
         (values, {284: 2}),  # planes
-        (grey.astype(np.uint16) * 257, {262: 0}),
-        (_values("u2", 4), {338: 1}),  # colours multiplied by alpha
+        (gray.astype(np.uint16) * 257, {262: 0}),
+        (_values("u2", 4), {338: 1}),  # colors multiplied by alpha
         (_values("u2", 4), {262: 5}),
-        (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colours of fewer pixels
-        (grey.astype(np.uint16) // 16, {258: 12}),
+        (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colors of fewer pixels
+        (gray.astype(np.uint16) // 16, {258: 12}),
         (values, {339: [1, 1, 2]}),
     ]
     for pixels, tags in refused:
@@ -344,8 +344,8 @@ def test_thumbnails_before_a_page_of_a_tiff_file_are_passed_over(
         pytest.param(".avif", "RGB RGBA L animated", marks=_AVIF),
     ],
 )
-def test_other_formats(tmp_path: Path, suffix: str, modes: str) -> None:
-    """Of an animation, the first picture."""
+def test_other_formats_are_decoded(tmp_path: Path, suffix: str, modes: str) -> None:
+    """The first picture of an animation is read."""
     path, rgb = tmp_path / f"image{suffix}", np.kron(_noise((4, 8, 3)), np.ones((8, 8, 1)))
     for mode in modes.split():
         image = Image.fromarray(rgb.astype(np.uint8)).convert(mode.replace("animated", "P"))
@@ -364,7 +364,7 @@ def test_other_formats(tmp_path: Path, suffix: str, modes: str) -> None:
 
 
 @pytest.mark.parametrize("read", [read_rgb, read_image_size, photo_fov_deg])
-def test_files_that_are_no_images(tmp_path: Path, read: Any) -> None:
+def test_files_that_are_not_images_are_refused(tmp_path: Path, read: Any) -> None:
     (tmp_path / "notes.jpg").write_text("no picture at all")
     (tmp_path / "folder.jpg").mkdir()
     Image.fromarray(np.ones((4, 8), np.float32)).save(tmp_path / "depth.tif")
@@ -413,12 +413,12 @@ def test_depth_in_meters_array(tmp_path: Path, dtype: Any, axes: int) -> None:
     assert read_image_size(path) == (2, 4)
 
 
-def test_what_is_no_depth(tmp_path: Path) -> None:
-    Image.fromarray(_noise((4, 8))).save(tmp_path / "grey.png")
+def test_files_without_depth_are_refused(tmp_path: Path) -> None:
+    Image.fromarray(_noise((4, 8))).save(tmp_path / "gray.png")
     Image.fromarray(_noise((4, 8, 3))).save(tmp_path / "color.png")
     np.save(tmp_path / "yes.npy", np.ones((4, 8), bool))
     for name, found in [
-        ("grey.png", r"uint8 of shape \(4, 8\)"),
+        ("gray.png", r"uint8 of shape \(4, 8\)"),
         ("color.png", r"uint8 of shape \(4, 8, 3\)"),
         ("yes.npy", r"bool of shape \(4, 8\)"),
         ("nowhere.npy", "No such file"),

@@ -111,7 +111,7 @@ _WHOLE = [
 
 @pytest.mark.parametrize(("name", "settings"), _WHOLE, ids=[name for name, _ in _WHOLE])
 def test_whole_videos_are_read(tmp_path: Path, name: str, settings: dict[str, Any]) -> None:
-    """Of a varying rate, with longer sound, with a late start, of one frame."""
+    """Varying rate, longer sound, late start, one frame."""
     path = _write(tmp_path / name, name.partition(".")[0], **settings)
     count = len(settings.get("frames", range(_COUNT)))
     assert read_video_size(path) == (count, 64, 128)
@@ -173,18 +173,18 @@ def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
-@pytest.mark.parametrize("turns", range(4))
+@pytest.mark.parametrize("quarter_turns", range(4))
 @pytest.mark.parametrize("mirrored", ["", "hflip", "vflip"])
-def test_frames_are_upright(tmp_path: Path, suffix: str, turns: int, mirrored: str) -> None:
-    """Counterclockwise by quarter turns, and then mirrored."""
+def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mirrored: str) -> None:
+    """Counterclockwise by quarter quarter_turns, and then mirrored."""
 
     def rotate(stream: Any) -> None:
-        stream.set_display_rotation(90 * turns, **({mirrored: True} if mirrored else {}))
+        stream.set_display_rotation(90 * quarter_turns, **({mirrored: True} if mirrored else {}))
 
     stored = _pictures(2)
     path = _write(tmp_path / f"a{suffix}", "lossless", stored, setup=rotate)
     flip: Any = {"": lambda a: a, "hflip": np.fliplr, "vflip": np.flipud}[mirrored]
-    shown = [flip(np.rot90(rgb, turns)) for rgb in stored]
+    shown = [flip(np.rot90(rgb, quarter_turns)) for rgb in stored]
     assert read_video_size(path) == (2, *shown[0].shape[:2])
     np.testing.assert_array_equal(_read(path), shown)
     seen: dict[int, NDArray[np.uint8]] = {}
@@ -193,7 +193,7 @@ def test_frames_are_upright(tmp_path: Path, suffix: str, turns: int, mirrored: s
     np.testing.assert_array_equal([seen[0], seen[1]], shown)
     again = np.array(_decoded(tmp_path / "b.mp4"), float)
     assert again.shape == np.shape(shown)
-    assert np.abs(again - shown).mean() < 20  # compressed, with colours at half resolution
+    assert np.abs(again - shown).mean() < 20  # compressed, with colors at half resolution
 
 
 def test_other_angles_are_refused(tmp_path: Path) -> None:
@@ -204,19 +204,19 @@ def test_other_angles_are_refused(tmp_path: Path) -> None:
         read_video_size(path)
 
 
-def _orientation_sei(turns: int) -> bytes:
-    """Quarter turns counterclockwise (H.264, D.1.27), with the length of the NAL unit."""
-    bits = f"000{turns % 4 << 14:016b}10100"
+def _orientation_sei(quarter_turns: int) -> bytes:
+    """Quarter quarter_turns counterclockwise (H.264, D.1.27), with the length of the NAL unit."""
+    bits = f"000{quarter_turns % 4 << 14:016b}10100"
     return b"\0\0\0\x07\x06\x2f\x03" + int(bits, 2).to_bytes(3) + b"\x80"
 
 
-@pytest.mark.parametrize("turns", ["1", "1 1", "3 3", "0 3", "1 3", "3 2", "0 1"])
+@pytest.mark.parametrize("quarter_turns", ["1", "1 1", "3 3", "0 3", "1 3", "3 2", "0 1"])
 def test_the_orientation_in_an_h264_stream_is_that_of_all_frames(
-    tmp_path: Path, turns: str
+    tmp_path: Path, quarter_turns: str
 ) -> None:
-    """In quarter turns of the first frame and of frame 6; the others have no matrix."""
+    """In quarter quarter_turns of the first frame and of frame 6; the others have no matrix."""
     whole, path = _write(tmp_path / "whole.mp4", "forward"), tmp_path / "a.mp4"
-    first, *later = map(int, turns.split())
+    first, *later = map(int, quarter_turns.split())
     places = {0: first} | dict.fromkeys([6] if later else [], *later)
     with av.open(str(whole)) as source, av.open(str(path), "w") as output:
         stream = output.add_stream_from_template(source.streams.video[0])

@@ -29,7 +29,7 @@ def _touch(path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", ["by class", "by split"])
-def test_both_layouts(tmp_path: Path, layout: Literal["by class", "by split"]) -> None:
+def test_both_layouts_are_found(tmp_path: Path, layout: Literal["by class", "by split"]) -> None:
     root = write_tree(tmp_path, layout)
     _touch(root / "README.txt")
     _touch(root / "spheres_64x128/chair/train/chair_0001.npy")
@@ -111,7 +111,7 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
 # --- samples -----------------------------------------------------------------------------------
 
 
-def test_batches(make_module: MakeModule) -> None:
+def test_batches_have_the_documented_shapes(make_module: MakeModule) -> None:
     module = make_module(shapes_per_step=4, validation_fraction=0)
     batches = list(module.train_dataloader())
     assert [len(batch.label) for batch in batches] == [4, 4, 4, 3]

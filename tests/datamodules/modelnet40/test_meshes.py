@@ -73,7 +73,7 @@ def test_broken_files_are_named(tmp_path: Path, content: str) -> None:
 # --- closed forms ------------------------------------------------------------------------------
 
 
-def test_a_cube() -> None:
+def test_spheres_of_a_cube_match_the_closed_form() -> None:
     box = creation.box((5, 5, 5)).apply_translation((7, -3, 20))
     spheres = mesh_spheres(clean_mesh(box), SHAPE)
     half = RADIUS / math.sqrt(3)
@@ -137,7 +137,7 @@ def test_a_flat_mesh_is_its_own_hull() -> None:
 # --- cleaning ----------------------------------------------------------------------------------
 
 
-def test_what_counts_twice_or_not_at_all_changes_nothing() -> None:
+def test_duplicate_and_degenerate_triangles_change_nothing() -> None:
     mesh = make_shape(0, "chair", 1)
     rng = np.random.default_rng(0)
     count = len(mesh.vertices)
@@ -159,9 +159,9 @@ def test_size_place_and_attitude_of_the_original_do_not_matter(scale: float) -> 
     mesh = make_shape(0, "table", 2)
     moved = _mesh((mesh.vertices + 1.5) * scale, mesh.faces)
     np.testing.assert_allclose(clean_mesh(mesh).vertices, clean_mesh(moved).vertices, atol=1e-6)
-    turn = random_rotation(np.random.default_rng(0))
-    turned = clean_mesh(_mesh(mesh.vertices @ turn.T, mesh.faces))
-    np.testing.assert_allclose(turned.vertices, clean_mesh(mesh).vertices @ turn.T, atol=1e-6)
+    rotation = random_rotation(np.random.default_rng(0))
+    rotated = clean_mesh(_mesh(mesh.vertices @ rotation.T, mesh.faces))
+    np.testing.assert_allclose(rotated.vertices, clean_mesh(mesh).vertices @ rotation.T, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -173,6 +173,6 @@ def test_size_place_and_attitude_of_the_original_do_not_matter(scale: float) -> 
         ([[1e308, 0, 0], [-1e308, 0, 0], [0, 1, 0]], "extent of inf"),
     ],
 )
-def test_no_surface(vertices: Any, found: str) -> None:
+def test_meshes_without_surface_are_refused(vertices: Any, found: str) -> None:
     with pytest.raises(DataError, match=found):
         clean_mesh(_mesh(vertices, [[0, 1, 2]]))

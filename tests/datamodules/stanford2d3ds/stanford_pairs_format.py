@@ -21,7 +21,7 @@ def write_paper_pairs(root: Path, rows: int = 8) -> Path:
 
     Args:
         root: Where ``area_1`` comes to be.
-        rows: Of the panoramas.
+        rows: Rows of the panoramas.
 
     Returns:
         The same folder.
@@ -34,35 +34,35 @@ def write_paper_pairs(root: Path, rows: int = 8) -> Path:
     return root
 
 
-def write_panorama(root: Path, camera: str, room: str, grey: int, rows: int = 8) -> Path:
-    """One panorama of one grey, 2 m all around, its uppermost row without depth.
+def write_panorama(root: Path, camera: str, room: str, gray: int, rows: int = 8) -> Path:
+    """One panorama of one gray, 2 m all around, its uppermost row without depth.
 
     Args:
         root: Where ``area_1`` comes to be.
         camera: 32 hexadecimal digits.
         room: As ``office_3``.
-        grey: Of all pixels; also decides the pose.
-        rows: Of the panorama.
+        gray: Value of all pixels, which also determines the pose.
+        rows: Rows of the panorama.
 
     Returns:
-        The colours' file.
+        The colors' file.
     """
     pano = root / "area_1" / "pano"
     stem = f"camera_{camera}_{room}_frame_equirectangular_domain"
     pictures: dict[str, Any] = {
-        "rgb": np.full((rows, 2 * rows, 3), grey, np.uint8),
+        "rgb": np.full((rows, 2 * rows, 3), gray, np.uint8),
         "depth": np.full((rows, 2 * rows), 1024, np.uint16),
     }
     pictures["depth"][0] = 65535
     for kind, picture in pictures.items():
         write_png(pano / kind / f"{stem}_{kind}.png", picture)
     (pano / "pose").mkdir(exist_ok=True)
-    turn = rotation_about((0, 0, 1), grey / 50) @ rotation_about((1, 0, 0), math.pi / 2)
-    rotation = np.diag([1.0, -1, -1]) @ turn.T
-    location = np.array([grey / 10, 1.0, 1.5])
+    upright = rotation_about((0, 0, 1), gray / 50) @ rotation_about((1, 0, 0), math.pi / 2)
+    rotation = np.diag([1.0, -1, -1]) @ upright.T
+    location = np.array([gray / 10, 1.0, 1.5])
     record = {
         "camera_rt_matrix": np.hstack([rotation, -(rotation @ location)[:, None]]).tolist(),
-        "camera_original_rotation": euler_angles(turn).tolist(),
+        "camera_original_rotation": euler_angles(upright).tolist(),
         "camera_location": location.tolist(),
     }
     (pano / "pose" / f"{stem}_pose.json").write_text(json.dumps(record))

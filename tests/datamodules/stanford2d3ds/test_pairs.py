@@ -69,7 +69,7 @@ def test_all_pairs_are_found(area: Path) -> None:
     assert (pair.left.distance_m[1:] == 2).all()
 
 
-def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path) -> None:
+def test_missing_and_ambiguous_names_are_listed_together(area: Path, tmp_path: Path) -> None:
     root = tmp_path / "copy"
     shutil.copytree(area, root)
     for name in ("f85a909", "33e598f"):
@@ -84,7 +84,7 @@ def test_missing_and_ambiguous_names_are_told_at_once(area: Path, tmp_path: Path
         _ = StanfordPairs(root).names
 
 
-def test_what_is_not_there_is_said(tmp_path: Path) -> None:
+def test_missing_areas_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"area_1.*Get Stanford2D3DS"):
         _ = StanfordPairs(tmp_path).names
     with pytest.raises(DataError, match=r"no two panoramas of one room; expected area_1"):
@@ -100,7 +100,7 @@ def _disagreement(left: Any, right: Any) -> float:
     """Median of |distance − its prediction from the left| / distance, where the right sees it."""
     known = np.isfinite(left.distance_m)
     points = left.pose.points_m(equirect_directions((64, 128))[known], left.distance_m[known])
-    seen, predicted = right.pose.seen(points)
+    seen, predicted = right.pose.project(points)
     rows = ((0.5 - np.arcsin(seen[:, 2].clip(-1, 1)) / np.pi) * 64).astype(int).clip(0, 63)
     columns = ((np.arctan2(seen[:, 1], seen[:, 0]) / (2 * np.pi) + 0.5) * 128).astype(int) % 128
     found = right.distance_m[rows, columns]

@@ -68,7 +68,7 @@ def test_instances_past_the_end_are_counted_and_listed_by_the_check(
         f"camera_{'0f' * 16}_office_1_frame_left_domain_rgb.png",
     ],
 )
-def test_other_names(name: str) -> None:
+def test_other_file_names_are_refused(name: str) -> None:
     with pytest.raises(DataError, match="unknown file name"):
         FileName.parse(name)
 
@@ -129,18 +129,18 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
 
 
 def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
-    labelled, masked = (
+    labeled, masked = (
         Stanford2D3DS(stanford_root, erp, unknown=unknown).source("train").read(0).labels
         for unknown in ("labels", "any_black")
     )
     assert not masked[-2:, :4].any(), "a patch without blue"
-    assert labelled[-2:, :4].all()
+    assert labeled[-2:, :4].all()
 
 
 # --- what cannot be used -----------------------------------------------------------------------
 
 
-def test_wrong_layout(tmp_path: Path, erp: Any) -> None:
+def test_wrong_layouts_are_refused(tmp_path: Path, erp: Any) -> None:
     broken_root = fabricate(tmp_path / "data", dict.fromkeys(AREAS, ("office_1",)), height=16)
     with pytest.raises(DataError, match="no area_1, area_2"):
         Stanford2D3DS(broken_root / "area_1", erp).setup()
@@ -184,7 +184,7 @@ def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
         expected = z[row, column] * math.sqrt(1 + (x * x + y * y) / focal**2)
         assert photo.depth[row, column] == pytest.approx(expected, abs=0.51)
     np.testing.assert_allclose(
-        photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centres"
+        photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centers"
     )
 
 

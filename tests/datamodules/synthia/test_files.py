@@ -25,11 +25,11 @@ def _write_camera(folder: Path, text: str) -> Path:
     "text",
     ["532.740352\n640\n380\n0.8\n", "532.740352, 640, 380", None],
 )
-def test_cameras(tmp_path: Path, text: str | None) -> None:
+def test_cameras_are_read(tmp_path: Path, text: str | None) -> None:
     if text is not None:
         _write_camera(tmp_path, text)
     camera = read_view_camera(tmp_path, (760, 1280))
-    # Counted from pixel corners the centre is the middle of the image; so it is here.
+    # Counted from pixel corners the center is the middle of the image; so it is here.
     expected = [[532.740352, 0, 639.5], [0, 532.740352, 379.5], [0, 0, 1]]
     np.testing.assert_array_equal(camera, expected)
 
@@ -38,7 +38,7 @@ def test_cameras(tmp_path: Path, text: str | None) -> None:
     "text",
     ["focal 532 640 380", "532 640 380 0.8 1", "nan 640 380", "532 64000 380"],
 )
-def test_strange_cameras(tmp_path: Path, text: str) -> None:
+def test_strange_cameras_are_refused(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
     with pytest.raises(DataError, match=r"intrinsics\.txt: found .* views of 1280 × 760"):
         read_view_camera(tmp_path, (760, 1280))

@@ -30,14 +30,14 @@ def two(root: Path, erp: Any, **settings: Any) -> OmniSynthia:
 
 
 def classes_of(ids: NDArray[Any]) -> NDArray[Any]:
-    """Of twelve ids and traffic lights; the others are unknown."""
+    """Return the labels of ids: twelve classes and traffic lights; other ids are unknown."""
     return np.where(ids == 15, 13, np.where(ids > 12, 0, ids))
 
 
 # --- splits --------------------------------------------------------------------------------------
 
 
-def test_splits(root: Path, erp: Any) -> None:
+def test_splits_follow_the_authors(root: Path, erp: Any) -> None:
     module = OmniSynthia(root, erp)
     module.prepare_data()  # nothing to make
     module.setup("fit")

@@ -93,7 +93,7 @@ def test_labels_are_those_of_the_nearest_pixel_of_one_view(made: Path, seen: See
         np.testing.assert_array_equal(labels[seen.certain], expected[seen.certain])
 
 
-def test_colours_are_those_of_the_world(made: Path, seen: Seen) -> None:
+def test_colors_are_those_of_the_world(made: Path, seen: Seen) -> None:
     rgb = panorama(made, "rgb")[..., ::-1]
     error = np.abs(rgb - synthia.rgb_of(DIRECTIONS))
     inner = (seen.place >= 0) & (seen.place <= np.array([SIZE[1] - 1, SIZE[0] - 1]))
@@ -102,7 +102,7 @@ def test_colours_are_those_of_the_world(made: Path, seen: Seen) -> None:
     assert not rgb[~seen.inside].any()
 
 
-def test_depth_is_the_distance_from_the_centre(made: Path, seen: Seen) -> None:
+def test_depth_is_the_distance_from_the_center(made: Path, seen: Seen) -> None:
     rays = np.stack([synthia.view_rays(view) for view in VIEWS])
     distance = np.rint(500 + 10 * rays[..., 2]) * np.linalg.norm(rays, axis=-1)
     distance[:, :2, :3] = 0  # as fabricated

@@ -47,7 +47,7 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
         ({"views": "all"}, "views: found all"),
     ],
 )
-def test_what_cannot_work_is_named(wrong: dict[str, Any], message: str) -> None:
+def test_impossible_settings_are_named(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         RoomSettings(**wrong)
 
@@ -139,8 +139,8 @@ def test_pictures_survive_the_files() -> None:
 @pytest.mark.parametrize("panorama", [True, False])
 def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
     original = Pose.looking(np.array([1.0, 2.0, 1.5]), 0.7)
-    turned = Pose.looking(original.location, -1.2, 0.3, 0.1)
-    view = PanoramaRays(original, 64) if panorama else PerspectiveRays(turned, 100, 1.0)
+    rotated = Pose.looking(original.location, -1.2, 0.3, 0.1)
+    view = PanoramaRays(original, 64) if panorama else PerspectiveRays(rotated, 100, 1.0)
     frame = "equirectangular" if panorama else "4"
     record = pose_record(ROOMS[1], CAMERA, frame, view, original)
     assert record["camera_uuid"] == record["point_uuid"] == CAMERA
@@ -150,11 +150,11 @@ def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
     rt = np.array(record["camera_rt_matrix"])
     np.testing.assert_allclose(rt[:, :3], np.diag([1, -1, -1]) @ final.T, atol=1e-12)
     np.testing.assert_allclose(rt[:, :3] @ record["camera_location"] + rt[:, 3], 0, atol=1e-12)
-    first, turn = (
+    first, last = (
         euler_rotation(np.array(record[key]))
         for key in ("camera_original_rotation", "rotation_from_original_to_point")
     )
-    np.testing.assert_allclose(turn @ first, final, atol=1e-12)
+    np.testing.assert_allclose(last @ first, final, atol=1e-12)
     size = 64 if panorama else 100
     K = np.array(record["camera_k_matrix"])
     assert K[0, 2] == K[1, 2] == size / 2

@@ -63,7 +63,7 @@ def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
     np.testing.assert_allclose(depth[seen], expected[seen], atol=1e-4)
 
 
-def test_what_was_not_scanned_has_neither_label_nor_depth_but_a_colour() -> None:
+def test_unscanned_surfaces_have_a_color_but_no_label_or_depth() -> None:
     view = PanoramaRays(Pose.looking(HERE, 0.0), 64)
     whole = take(view)
     wall = HERE + np.array([3.5, 0, 0])

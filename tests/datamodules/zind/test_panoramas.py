@@ -202,7 +202,7 @@ def test_panoramas_inside_one_room_are_paired(tmp_path: Path) -> None:
 
 
 def test_both_panoramas_see_the_same_room(tmp_path: Path) -> None:
-    """Every point, of either panorama, is on the room as it is in the world, in metres."""
+    """Every point, of either panorama, is on the room as it is in the world, in meters."""
     room = replace(CORNERED, ceiling_z=0.8)
     cameras = [Camera("pano_1", (1.2, 0.7), 25), Camera("pano_2", (0.9, 4.5), -160)]
     write_home(tmp_path / "000", [(room, cameras)])
@@ -225,8 +225,8 @@ def test_both_panoramas_see_the_same_room(tmp_path: Path) -> None:
         assert -1e-4 < points_m[:, 2].min() < points_m[:, 2].max() < 1.8 * unit_m + 1e-4
         on_a_line = [np.abs(walls[:, axis, None] - corners[:, axis]) for axis in (0, 1)]
         np.testing.assert_allclose(np.min(on_a_line, axis=(0, 2)), 0, atol=1e-4)
-        # A corner of the room is seen where the layout says.
-        seen, away_m = side.pose.seen([0, 6 * unit_m, unit_m])
+        # A corner of the room is seen where the layout has it.
+        seen, away_m = side.pose.project([0, 6 * unit_m, unit_m])
         x, y = camera.local([(0, 6)])[0]
         np.testing.assert_allclose(seen * away_m, np.array([y, -x, 0]) * unit_m, atol=1e-9)
 

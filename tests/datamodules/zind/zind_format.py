@@ -19,7 +19,7 @@ from tests.datamodules.rays import hit_distances
 KINDS = {"doors": 4, "windows": 5, "openings": 0}
 """Fixtures and their labels; 1 is ceiling, 2 floor, 3 wall."""
 
-SCALE, METERS = 0.4, 3.0  # units of the floor in a camera height, metres in such a unit
+SCALE, METERS = 0.4, 3.0  # units of the floor in a camera height, meters in such a unit
 
 Fixtures = dict[str, list[tuple[tuple[float, float], tuple[float, float], tuple[float, float]]]]
 """By kind: both ends, then bottom and top."""
@@ -45,8 +45,10 @@ class Camera:
 
     def local(self, points: Any) -> NDArray[np.float64]:
         """Points of the floor in the frame of the camera."""
-        turn = math.radians(self.rotation_deg)
-        rotation = np.array([[math.cos(turn), -math.sin(turn)], [math.sin(turn), math.cos(turn)]])
+        angle = math.radians(self.rotation_deg)
+        rotation = np.array(
+            [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        )
         local: NDArray[np.float64] = (np.array(points, float) - self.xy) @ rotation
         return local
 
@@ -63,7 +65,7 @@ class Camera:
         return {"vertices": self.local(room.vertices).tolist(), **fixtures, "internal": []}
 
     def record(self, room: Room, image_path: str) -> dict[str, Any]:
-        """What the file says of the panorama."""
+        """Return the record of the panorama in the file."""
         layout = self.layout(room)
         seen = {"layout_visible": layout} if self.is_inside else {}
         return {
@@ -87,9 +89,9 @@ def write_home(
     """One home of one floor; returns its ``zind_data.json``.
 
     Args:
-        folder: Of the home.
+        folder: Folder of the home.
         rooms: Complete rooms of one part each, and the panoramas of each.
-        rows: Of the pictures, which are noise.
+        rows: Rows of the pictures, which are noise.
     """
     rng = np.random.default_rng(0)
     floor: dict[str, Any] = {}
@@ -150,7 +152,7 @@ def brute_force_labels(
     Args:
         layout: As in the file.
         ceiling_z: Height of the ceiling above the camera; the floor is 1 below it.
-        shape: Of the panorama.
+        shape: Rows and columns of the panorama.
     """
     x, y, z = np.moveaxis(equirect_directions(shape), -1, 0)
     rays = np.stack([-y, x, z], axis=-1).reshape(-1, 3)  # x to the left, y to the middle

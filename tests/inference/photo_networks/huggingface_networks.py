@@ -1,4 +1,4 @@
-"""Tiny networks of transformers with random weights, and their library's own pipelines."""
+"""Tiny networks of transformers with random weights, and pipelines of that library."""
 
 from __future__ import annotations
 
@@ -119,10 +119,10 @@ def own_scores(network: Any, processor: Any, **arguments: Any) -> Tensor:
     returned = network(pixel_values=pixels, **arguments)
     if "patch_offsets" in returned:
         returned["patch_offsets"] = None
-    (own,) = processor.post_process_semantic_segmentation(
+    (result,) = processor.post_process_semantic_segmentation(
         returned, target_sizes=[(_SIDE, _SIDE)], return_segmentation_scores=True
     )
-    scores: Tensor = own["segmentation_scores"]
+    scores: Tensor = result["segmentation_scores"]
     return scores
 
 
@@ -152,8 +152,8 @@ def imported_scores(trained: TrainedNetwork) -> Tensor:
     return trained.network(((rgb - mean) / std)[None])[0]
 
 
-def assert_same(scores: Tensor, own: Tensor) -> None:
-    torch.testing.assert_close(scores, own, rtol=0, atol=1e-4)
+def assert_same(scores: Tensor, expected: Tensor) -> None:
+    torch.testing.assert_close(scores, expected, rtol=0, atol=1e-4)
 
 
 def tokenizer(folder: Path) -> Any:
@@ -166,6 +166,6 @@ def tokenizer(folder: Path) -> Any:
 
 
 def change_json(path: Path, **changes: Any) -> None:
-    """Change an object in a JSON file; None removes."""
+    """Change keys of an object in a JSON file; None removes a key."""
     content = json.loads(path.read_text()) | changes
     path.write_text(json.dumps({n: v for n, v in content.items() if v is not None}))

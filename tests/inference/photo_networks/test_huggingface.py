@@ -32,10 +32,14 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "net"
 
 
-def test_segformer(tmp_path: Path) -> None:
-    """With a processor that multiplies and normalizes in its own way."""
-    own = {"rescale_factor": 1 / 128, "image_mean": [0.4, 0.5, 0.6], "image_std": [0.2, 0.3, 0.4]}
-    network, processor = networks.saved(networks.segformer, tmp_path, **own)
+def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
+    """The processor has an unusual factor and normalization."""
+    settings = {
+        "rescale_factor": 1 / 128,
+        "image_mean": [0.4, 0.5, 0.6],
+        "image_std": [0.2, 0.3, 0.4],
+    }
+    network, processor = networks.saved(networks.segformer, tmp_path, **settings)
     trained = networks.imported(tmp_path)
     assert trained.class_names == ("unknown", *networks.NAMES)
     assert trained.image_size == (64, 64)
@@ -58,12 +62,12 @@ def test_scores_are_those_of_the_library(
     networks.assert_same(scores.exp() if shares else scores, expected)
 
 
-def test_oneformer_is_asked_for_classes(tmp_path: Path) -> None:
+def test_oneformer_gets_the_semantic_task(tmp_path: Path) -> None:
     (tmp_path / "classes.json").write_text(
         json.dumps({k: {"name": name, "isthing": 0} for k, name in enumerate(networks.NAMES)})
     )
-    own: dict[str, Any] = {"repo_path": str(tmp_path), "class_info_file": "classes.json"}
-    network, processor = networks.saved(lambda: networks.oneformer(**own), tmp_path)
+    settings: dict[str, Any] = {"repo_path": str(tmp_path), "class_info_file": "classes.json"}
+    network, processor = networks.saved(lambda: networks.oneformer(**settings), tmp_path)
     with pytest.raises(DataError, match=r"no tokenizer\.json or vocab\.json; expected the"):
         networks.imported(tmp_path)
     both = networks.transformers.OneFormerProcessor(
@@ -75,7 +79,7 @@ def test_oneformer_is_asked_for_classes(tmp_path: Path) -> None:
     networks.assert_same(scores.exp(), expected)
 
 
-def test_a_network_for_images_of_one_size(tmp_path: Path) -> None:
+def test_a_network_for_images_of_one_size_is_imported(tmp_path: Path) -> None:
     networks.saved(networks.eomt, tmp_path)
     trained = networks.imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
@@ -107,7 +111,7 @@ def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
     networks.saved(networks.mask2former, tmp_path / "masks")
     config = {"id2label": {"0": "sky"}, "label2id": {"sky": 0}}
     networks.change_json(tmp_path / "masks" / "config.json", **config)
-    with pytest.raises(DataError, match="found masks of one class; expected two classes at least"):
+    with pytest.raises(DataError, match="found masks of one class; expected at least two classes"):
         networks.imported(tmp_path / "masks")
 
 
@@ -121,7 +125,7 @@ _PROCESSORS = (
 def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
     name: str, tmp_path: Path
 ) -> None:
-    """Of one colour, what transformers' processor makes."""
+    """Images of one color are normalized as by transformers."""
     kind = getattr(networks.transformers, f"{name}ImageProcessor")
     kind().save_pretrained(tmp_path)
     path = tmp_path / "preprocessor_config.json"
@@ -144,14 +148,16 @@ def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
     for change in changes:
         content = {n: v for n, v in (whole | change).items() if v is not None}
         path.write_text(json.dumps(content))
-        own = networks.transformers.AutoImageProcessor.from_pretrained(tmp_path)
-        sizes = {n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(own, n)}
-        pixels = np.asarray(own(photo, return_tensors="np", **sizes)["pixel_values"])
+        processor = networks.transformers.AutoImageProcessor.from_pretrained(tmp_path)
+        sizes = {
+            n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(processor, n)
+        }
+        pixels = np.asarray(processor(photo, return_tensors="np", **sizes)["pixel_values"])
         expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
         found = huggingface._processor(tmp_path)
-        ours = (color / 255 - found["mean"]) / found["std"]
-        ours = ours[::-1] if found["do_flip_channel_order"] else ours
-        np.testing.assert_allclose(ours, expected, rtol=1e-4, atol=1e-4, err_msg=f"{change}")
+        normalized = (color / 255 - found["mean"]) / found["std"]
+        normalized = normalized[::-1] if found["do_flip_channel_order"] else normalized
+        np.testing.assert_allclose(normalized, expected, rtol=1e-4, atol=1e-4, err_msg=f"{change}")
 
 
 def test_an_image_processor_without_a_type_is_that_of_the_network(folder: Path) -> None:
@@ -188,7 +194,7 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
         ("preprocessor_config.json", {"size": {"height": 0, "width": 4}}, "found size: "),
     ],
 )
-def test_settings_that_do_not_fit(
+def test_settings_that_do_not_fit_are_refused(
     file: str, changes: dict[str, Any], message: str, folder: Path
 ) -> None:
     networks.change_json(folder / file, **changes)
@@ -196,14 +202,14 @@ def test_settings_that_do_not_fit(
         networks.imported(folder)
 
 
-def test_files_that_are_missing(folder: Path, tmp_path: Path) -> None:
+def test_missing_files_are_named(folder: Path, tmp_path: Path) -> None:
     weights = folder / "model.safetensors"
     weights.rename(folder / "pytorch_model.bin")
     with pytest.raises(DataError, match=r"found pytorch_model\.bin, no model\.safetensors.*save_"):
         networks.imported(folder)
     (folder / "pytorch_model.bin").rename(weights)
     (folder / "preprocessor_config.json").rename(tmp_path / "elsewhere.json")
-    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy that file"):
+    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy this file"):
         networks.imported(folder)
     nested = {"image_processor": json.loads((tmp_path / "elsewhere.json").read_text())}
     (folder / "processor_config.json").write_text(json.dumps(nested))
@@ -213,29 +219,31 @@ def test_files_that_are_missing(folder: Path, tmp_path: Path) -> None:
         networks.imported(folder)
 
 
-def test_a_model_that_cannot_be_fetched(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_that_cannot_be_fetched_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     def gated(name: str, **_: Any) -> None:
         raise OSError(f"403: you must accept the terms of {name}\nand more")
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", gated)
     with pytest.raises(DataError) as refused:
         networks.imported(Path("someone/net"))
-    said = str(refused.value)
-    assert "someone/net: found no such folder, and no way to fetch it (OSError: 403:" in said
-    assert "run `hf download someone/net --local-dir net`" in said
+    message = str(refused.value)
+    assert "someone/net: found no such folder, and no way to fetch it (OSError: 403:" in message
+    assert "run `hf download someone/net --local-dir net`" in message
 
 
-def test_a_model_of_the_hub(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: dict[str, Any] = {}
+def test_models_of_the_hub_are_fetched_without_code(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    requested: dict[str, Any] = {}
 
     def fetch(name: str, *, allow_patterns: list[str]) -> str:
-        asked[name] = allow_patterns
+        requested[name] = allow_patterns
         return str(folder)
 
     monkeypatch.setattr(huggingface_hub, "snapshot_download", fetch)
     network = huggingface.load(model="someone/net", classes=None, normalization=None)
     assert tuple(network.score_names) == networks.NAMES
-    (patterns,) = asked.values()
+    (patterns,) = requested.values()
     assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
 
 
@@ -252,7 +260,7 @@ def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Pat
 
 
 @pytest.mark.parametrize("made", [networks.segformer, networks.mask2former])
-def test_settings_that_transformers_does_not_declare(
+def test_undeclared_settings_are_left_out_or_refused(
     made: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They are left out at the import of a folder, and refused in a checkpoint."""
@@ -294,7 +302,7 @@ def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
         _GPT2,
         {"model_type": "timm_backbone", "backbone": f"hf-hub:{CANARY}/x"},
         {"model_type": "timm_backbone", "backbone": f"local-dir:{CANARY}"},
-        # A class whose own network inside is not of the kind that it says.
+        # A class whose own network inside is of another kind than it declares.
         {"model_type": "sam3", "vision_config": _GPT2},
         {"model_type": "dpt", "backbone": "gpt2", "use_timm_backbone": False},
         {"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}--x.Config"}},

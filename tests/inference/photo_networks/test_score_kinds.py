@@ -53,8 +53,8 @@ def _images(*size: int) -> Tensor:
 
 def _linear(images: Tensor) -> NDArray[np.float64]:
     """``(B, h, w, K)`` in float64."""
-    own = np.einsum("kc,bchw->bhwk", WEIGHT.astype(np.float64), images.double().numpy()) + BIAS
-    return np.asarray(own)
+    scores = np.einsum("kc,bchw->bhwk", WEIGHT.astype(np.float64), images.double().numpy()) + BIAS
+    return np.asarray(scores)
 
 
 def _softmax(scores: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -119,7 +119,7 @@ def test_kinds_of_half_precision_and_coarse_scores(
 
 @pytest.mark.parametrize("softmax", [True, False])
 def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path: Path) -> None:
-    """Of one colour each; without the logarithm, no class has a probability above 0.05."""
+    """Each class has one color; without the logarithm, no class has a probability above 0.05."""
     colors = np.random.default_rng(3).integers(0, 256, (60, 3))
     weight, bias = 200 * colors / 255, -100 * ((colors / 255) ** 2).sum(axis=1)
     nodes = [_node("Softmax", "linear", "scores", axis=1)] * softmax
@@ -283,7 +283,7 @@ def test_where_no_sigmoid_is_above_one_half_the_label_is_unknown(tmp_path: Path)
 def test_other_values_of_label_maps_are_unknown(
     returned: int, void: float, keep: int, tmp_path: Path
 ) -> None:
-    """Where the network sees class d."""
+    """Pixels where the network predicts class d."""
     three, of_void = np.array(3), np.array(void)
     nodes = [
         _node("ArgMax", "linear", "best", axis=1, keepdims=keep),
@@ -388,7 +388,7 @@ class Wrong(nn.Module):
         (2, lambda x: x[:, :, 1:], NAMES[:2], r"output of the network: found \(1, 2, 15, 24\)"),
     ],
 )
-def test_what_cannot_be_understood_is_refused(
+def test_unclear_scores_are_refused(
     classes: int, function: Any, names: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     torch.manual_seed(2)
@@ -398,7 +398,7 @@ def test_what_cannot_be_understood_is_refused(
     assert not (tmp_path / "net.ckpt").exists()
 
 
-def test_what_the_user_says_counts(tmp_path: Path) -> None:
+def test_a_stated_kind_is_used(tmp_path: Path) -> None:
     """Squashed scores in the range of probabilities."""
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, _node("Sigmoid", "linear", "scores"))
     trained = _imported(path, score_kind="logits")

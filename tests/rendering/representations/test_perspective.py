@@ -46,7 +46,7 @@ def _triangle(image: NDArray[np.uint8], homography: NDArray[np.float64], side: i
 
 @pytest.mark.parametrize("dim", [9, 16, 31, 64])
 @pytest.mark.parametrize("fov_deg", [17.3, 30.0])
-def test_crops_against_the_slow_reference(dim: int, fov_deg: float) -> None:
+def test_crops_agree_with_the_slow_reference(dim: int, fov_deg: float) -> None:
     photo = _photo()
     sampler = PerspectiveRepresentation(7, fov_deg, dim, crops_per_photo=3).of_camera(K, SIZE)
     crops = sampler.sample(np.random.default_rng(1))
@@ -59,7 +59,7 @@ def test_crops_against_the_slow_reference(dim: int, fov_deg: float) -> None:
         assert np.abs(image - _triangle(photo, homography, dim)).max() < 1.01
 
 
-def test_labels_come_from_the_pixel_at_the_centre() -> None:
+def test_labels_come_from_the_pixel_at_the_center() -> None:
     labels = np.random.default_rng(0).integers(0, 14, SIZE).astype(np.uint8)
     depth = labels.astype(np.uint16) * 300
     crops = (
@@ -84,7 +84,7 @@ def test_labels_come_from_the_pixel_at_the_centre() -> None:
     overlap=st.sampled_from([0.0, 0.25, 0.6]),
     seed=st.integers(0, 100),
 )
-def test_crops_never_leave_the_photo_and_the_grid_counts_every_place_once(
+def test_crops_stay_inside_the_photo_and_count_each_pixel_once(
     focal: tuple[float, float],
     size: tuple[int, int],
     off_center: tuple[float, float],
@@ -133,6 +133,6 @@ def test_the_side_follows_from_the_level() -> None:
 
 
 @pytest.mark.parametrize(("setting", "value"), [("dim", 1), ("dim", [8, 0]), ("dim", [8, 8, 8])])
-def test_impossible_settings(setting: str, value: Any) -> None:
+def test_impossible_sides_are_refused(setting: str, value: Any) -> None:
     with pytest.raises(SettingError, match=f"representation.{setting}"):
         PerspectiveRepresentation(7, **{setting: value})

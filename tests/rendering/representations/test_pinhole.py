@@ -93,7 +93,7 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
         EquirectRepresentation(5, random_rotation="so3"),
     ],
 )
-def test_a_sample_depends_on_its_generator_alone_and_rotates_with_the_whole(
+def test_samples_depend_only_on_the_generator_and_the_rotation(
     representation: Representation,
 ) -> None:
     labels = _labels()
@@ -115,7 +115,7 @@ def test_a_sample_depends_on_its_generator_alone_and_rotates_with_the_whole(
     np.testing.assert_allclose(rotated, plain @ TILT.T, atol=0.05)
 
 
-def test_faces_are_drawn_without_repetition_and_all_of_them_sooner_or_later() -> None:
+def test_random_faces_do_not_repeat_and_all_occur() -> None:
     representation = TangentRepresentation(0, 5, faces_per_panorama=5)
     x = np.arange(64 * 128, dtype=np.float32).reshape(SHAPE)
     whole = representation.view_sets()[0].render(x, "nearest")
@@ -182,7 +182,7 @@ def test_impossible_settings_are_refused(made: Any, settings: dict[str, Any], me
 
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
 def test_rotated_views_see_the_panorama_rotated_back(representation: Representation) -> None:
-    """Independent: rotating what is looked at instead, with `rotate_equirect`."""
+    """Compared with rotating the panorama instead, with `rotate_equirect`."""
     waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
     image = waves.astype(np.float32)
     (rotated,), (plain,) = (
@@ -206,8 +206,8 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
     np.testing.assert_array_equal(found[clear], expected.argmax(axis=-1)[clear])
 
 
-def test_the_identity_is_no_rotation() -> None:
-    """Tables of rotated images are not kept."""
+def test_the_identity_counts_as_not_rotated() -> None:
+    """Tables of rotated grids have a smaller cache."""
     assert TangentRepresentation(0, 5).with_rotation(np.eye(3)).grid == TangentGrid(0, 5)
 
 
@@ -276,7 +276,7 @@ def test_equirectangular_averages_have_the_highest_mean_probability() -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_rays_say_where_the_pixels_look(mirrored: bool) -> None:
+def test_rays_are_the_directions_of_the_pixels(mirrored: bool) -> None:
     grid = TangentGrid(1, 5, 20, TILT)
     faces = np.array([3, 77, 12])
     views = PinholeViews(grid, faces, mirrored)

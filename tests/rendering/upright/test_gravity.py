@@ -48,7 +48,7 @@ def test_light_comes_from_above() -> None:
         assert up_probabilities(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3)).argmax() == axis
 
 
-def test_what_is_measured_of_segments() -> None:
+def test_cues_of_known_segments_have_known_values() -> None:
     level = np.radians([0, 90, 180, 270])
     around = np.stack([np.cos(level), np.sin(level), np.zeros(4)], axis=-1)
     middles = np.concatenate([around, [[0, 0, -1.0], [0.6, 0, -0.8]]])
@@ -67,7 +67,7 @@ def test_what_is_measured_of_segments() -> None:
     np.testing.assert_allclose(odd[:, 2], 0, atol=1e-12)
 
 
-def test_rims_of_missing_parts_are_no_edges() -> None:
+def test_rims_of_missing_parts_are_not_edges() -> None:
     ramp = np.linspace(90, 200, 256, dtype=np.uint8)
     image = np.broadcast_to(ramp[:, None, None], (256, 512, 3)).copy()
     image[60:190, 180:340] = 20
@@ -139,17 +139,17 @@ def _up(*given: Any) -> NDArray[np.float64]:
     ("tilt_deg", "azimuth_deg", "yaw_deg"),
     [(0, 0, 45), (3, 200, 180), (20, 0, 179), (44, 45, 3)],
 )
-def test_tilted_rooms(
+def test_up_is_found_in_tilted_rooms(
     shape: tuple[int, int], tilt_deg: float, azimuth_deg: float, yaw_deg: float
 ) -> None:
-    turn = _tilted(tilt_deg, azimuth_deg, yaw_deg)
-    assert angle_deg(_up(draw_room(shape, turn)), turn[:, 2]) < 0.5
+    rotation = _tilted(tilt_deg, azimuth_deg, yaw_deg)
+    assert angle_deg(_up(draw_room(shape, rotation)), rotation[:, 2]) < 0.5
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rooms_held_at_any_angle(seed: int) -> None:
-    turn = random_rotation(np.random.default_rng(seed))
-    assert angle_deg(_up(draw_room((128, 256), turn), 180), turn[:, 2]) < 0.5
+def test_up_is_found_under_arbitrary_rotation(seed: int) -> None:
+    rotation = random_rotation(np.random.default_rng(seed))
+    assert angle_deg(_up(draw_room((128, 256), rotation), 180), rotation[:, 2]) < 0.5
 
 
 def test_a_judge_chooses_among_the_axes_of_the_best_frame(
@@ -157,36 +157,36 @@ def test_a_judge_chooses_among_the_axes_of_the_best_frame(
 ) -> None:
     even = np.full(6, 1 / 6)
     monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)
-    turn = random_rotation(np.random.default_rng(0))
-    room = draw_room((128, 256), turn)
-    asked: list[NDArray[np.float64]] = []
+    rotation = random_rotation(np.random.default_rng(0))
+    room = draw_room((128, 256), rotation)
+    judged_axes: list[NDArray[np.float64]] = []
 
     def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
-        asked.append(ups)
+        judged_axes.append(ups)
         return 30 * ups @ wanted
 
-    wanted = turn[:, 2]
+    wanted = rotation[:, 2]
     estimate_up(room, 180, judge)
-    (axes,) = asked
+    (axes,) = judged_axes
     assert len(axes) == 6
     for one in axes:
-        assert min(angle_deg(axis, one) for axis in (*turn.T, *-turn.T)) < 0.5
+        assert min(angle_deg(axis, one) for axis in (*rotation.T, *-rotation.T)) < 0.5
     assert (axes @ axes.T - np.eye(6) < 0.01).all()
     for wanted in axes:
         np.testing.assert_array_equal(estimate_up(room, 180, judge), wanted)
 
 
-def test_what_is_hopeless_or_the_only_one_is_not_judged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_judge_is_not_called_without_a_choice(monkeypatch: pytest.MonkeyPatch) -> None:
     def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
         raise AssertionError(ups)
 
-    turn = _tilted(3, 200, 180)
-    assert angle_deg(_up(draw_room((128, 256), turn), 60, judge), turn[:, 2]) < 0.5
+    rotation = _tilted(3, 200, 180)
+    assert angle_deg(_up(draw_room((128, 256), rotation), 60, judge), rotation[:, 2]) < 0.5
     estimate_up(_without_structure()["black"], 180, judge)
     certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
-    place = "tangent_train.rendering.upright.gravity.up_probabilities"
-    monkeypatch.setattr(place, lambda *_: certain)
-    assert estimate_up(draw_room((128, 256), turn), 180, judge) is not None
+    function = "tangent_train.rendering.upright.gravity.up_probabilities"
+    monkeypatch.setattr(function, lambda *_: certain)
+    assert estimate_up(draw_room((128, 256), rotation), 180, judge) is not None
 
 
 def test_no_direction_beyond_the_largest_tilt() -> None:
@@ -212,39 +212,39 @@ def _without_structure() -> dict[str, NDArray[np.uint8]]:
 
 @pytest.mark.parametrize("name", list(_without_structure()))
 @pytest.mark.parametrize("max_tilt_deg", [45, 180])
-def test_nothing_is_done_where_nothing_is_found(name: str, max_tilt_deg: float) -> None:
+def test_images_without_structure_have_no_estimate(name: str, max_tilt_deg: float) -> None:
     assert estimate_up(_without_structure()[name], max_tilt_deg) is None
 
 
-def test_dark_rooms_with_missing_parts() -> None:
-    turn = _tilted(18, 130, 60)
-    room = draw_room((128, 256), turn) // 8
+def test_up_is_found_in_dark_rooms_with_missing_parts() -> None:
+    rotation = _tilted(18, 130, 60)
+    room = draw_room((128, 256), rotation) // 8
     room[:12], room[-9:], room[:, 30:45] = 0, 0, 0
-    assert angle_deg(_up(room), turn[:, 2]) < 0.5
+    assert angle_deg(_up(room), rotation[:, 2]) < 0.5
 
 
 # Rotating upright
 
 
 @given(st.tuples(*[st.floats(-5, 5)] * 3).filter(lambda up: np.linalg.norm(up) > 1e-3))
-def test_the_smallest_rotation(up: tuple[float, float, float]) -> None:
-    turn = upright_rotation(up)
+def test_the_rotation_is_the_smallest(up: tuple[float, float, float]) -> None:
+    rotation = upright_rotation(up)
     direction = np.array(up) / np.linalg.norm(up)
-    np.testing.assert_allclose(turn @ _UP, direction, atol=1e-9)
-    np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-9)
-    assert np.linalg.det(turn) > 0
+    np.testing.assert_allclose(rotation @ _UP, direction, atol=1e-9)
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(rotation) > 0
     # The angle of a rotation is in its trace; no smaller one moves z that far.
-    assert math.isclose(np.trace(turn), 1 + 2 * direction[2], abs_tol=1e-9)
+    assert math.isclose(np.trace(rotation), 1 + 2 * direction[2], abs_tol=1e-9)
 
 
-def test_the_poles() -> None:
+def test_the_poles_have_defined_rotations() -> None:
     np.testing.assert_array_equal(upright_rotation((0, 0, 2)), np.eye(3))
     np.testing.assert_allclose(upright_rotation((0, 0, -1)), np.diag([-1.0, 1, -1]), atol=1e-15)
     np.testing.assert_allclose(upright_rotation((1e-200, 0, 1)), np.eye(3), atol=1e-15)
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (0, 1), (math.nan, 0, 1), (math.inf, 0, 1), 3.0])
-def test_no_direction(up: Any) -> None:
+def test_invalid_directions_are_refused(up: Any) -> None:
     with pytest.raises(SettingError, match=r"up: found .*three numbers"):
         upright_rotation(up)
 
@@ -259,9 +259,9 @@ def _horizon_of_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
     about z), the pitch about x, the roll about y, in that order, each about the axes as already
     rotated.
     """
-    turn = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
+    rotation = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
     local = equirect_directions((360, 720))[..., [1, 0, 2]]
-    return np.asarray((local @ turn.T)[..., 2])
+    return np.asarray((local @ rotation.T)[..., 2])
 
 
 @pytest.mark.parametrize(

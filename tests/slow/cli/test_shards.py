@@ -25,7 +25,7 @@ COUNT = 30
 
 @pytest.fixture
 def settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Return settings for predictions of thirty panoramas, after a prediction to ``whole``."""
+    """Settings for predictions of thirty panoramas, which are in ``whole``."""
     monkeypatch.chdir(tmp_path)
     for number in range(COUNT):
         write_pixels(tmp_path / "in" / f"{number:02}.png", np.roll(sphere(128), number, 1))

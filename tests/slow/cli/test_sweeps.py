@@ -24,7 +24,7 @@ def _no_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def settings(rooms: str) -> tuple[str, ...]:
-    """Return the settings of a run of one epoch."""
+    """Settings of a run of one epoch."""
     return (*SETTINGS, "data.validation_fraction=0.4", "trainer.max_epochs=1", "panels=0", rooms)
 
 
@@ -114,8 +114,8 @@ def test_a_search_for_the_worse_score_is_refused(
 ) -> None:
     package = ROOT / "tests" / "tasks" / "toy_regression"
     monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{package.parent}")
-    config = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
+    toy = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
     settings = (*SMALL_ROOMS, rooms, "network.widths=[4,8]", "trainer.max_epochs=1")
     study = ("sweep=optuna", "hydra.sweeper.n_trials=1")
     with pytest.raises(SystemExit, match="found maximize; expected minimize, for val/mae"):
-        run("train", "-m", *config, *settings, *study)
+        run("train", "-m", *toy, *settings, *study)

@@ -1,4 +1,4 @@
-"""Commands and files that README and docs show, and how a command is run on small data."""
+"""The commands and files in README and docs, and the settings that run a command on small data."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ SMALL: dict[str, Any] = {
     "folds": "[1]",
     "max_pairs": 2,
 }
-"""Appended to a command where its config has the setting and it is not null."""
+"""Settings appended to a command whose config has them with a value that is not null."""
 
 CONFIGS = {
     "tangent-train": "train",
@@ -69,7 +69,7 @@ CONFIGS = {
     "tangent-check": "check",
     "tangent-keypoints": "keypoints",
 }
-"""Programs that get the settings above, and their config."""
+"""Programs to which these settings are appended, and their configs."""
 
 _FENCE = re.compile(r"^( *)```+(\w*)\n(.*?)^\1```+$", re.MULTILINE | re.DOTALL)
 _FILE = re.compile(r"^# (\S+\.\w+)\n")
@@ -81,36 +81,36 @@ class Block:
     """Commands that belong together, or a Python program.
 
     Attributes:
-        place: Document and line.
-        commands: Lines of a shell, with what continues them.
-        python: The program.
-        files: What the document shows as files, by path.
+        location: Page and line.
+        commands: Lines of a shell; continued lines are joined.
+        python: The Python program.
+        files: Contents of the files that the page shows, by path.
     """
 
-    place: str
+    location: str
     commands: list[str] = field(default_factory=list)
     python: str = ""
     files: dict[str, str] = field(default_factory=dict)
 
 
-def blocks(name: str, text: str) -> Iterator[Block]:
-    """All that a Markdown text tells its reader to run."""
+def find_blocks(name: str, text: str) -> Iterator[Block]:
+    """Return the commands and programs of a Markdown page."""
     fences = [(m.start(), m[2], re.sub(rf"^{m[1]}", "", m[3], flags=re.M)) for m in
               _FENCE.finditer(text)]  # fmt: skip
     files = {found[1]: body for _, _, body in fences if (found := _FILE.match(body))}
     for start, language, body in fences:
-        place = f"{name}:{text.count(chr(10), 0, start) + 1}"
+        location = f"{name}:{text.count(chr(10), 0, start) + 1}"
         if language in ("bash", "sh", "shell", "console"):
             lines = body.replace("\\\n", " ").splitlines()
-            yield Block(place, [line.removeprefix("$ ") for line in lines], files=files)
+            yield Block(location, [line.removeprefix("$ ") for line in lines], files=files)
         elif language == "python" and not _FILE.match(body):
-            yield Block(place, python=body, files=files)
+            yield Block(location, python=body, files=files)
 
 
-def words_of(line: str) -> tuple[dict[str, str], list[str]]:
-    """Variables and words of a command line as a shell reads them."""
-    together = _OPEN.sub(lambda found: found[0].replace(" ", "_"), line)
-    words = shlex.split(together, comments=True)
+def split_line(line: str) -> tuple[dict[str, str], list[str]]:
+    """Return the variables and the words of a command line, split like a shell does."""
+    joined = _OPEN.sub(lambda found: found[0].replace(" ", "_"), line)
+    words = shlex.split(joined, comments=True)
     variables: dict[str, str] = {}
     while words and (words[0] == "export" or re.match(r"\w+=", words[0])):
         name, _, value = words.pop(0).partition("=")
@@ -118,51 +118,63 @@ def words_of(line: str) -> tuple[dict[str, str], list[str]]:
     return variables, words
 
 
-def typed(words: list[str], world: Path) -> list[str]:
-    """The words with files of the world for placeholders and absolute paths; sweeps as one run."""
-    program, *given = [word for word in words if word != "…"]
+def fill_in(words: list[str], world: Path) -> list[str]:
+    """Replace placeholders and absolute paths by files of the world, and a sweep by one run."""
+    program, *arguments = [word for word in words if word != "…"]
     if "…" in words and program == "tangent-predict":
-        given += ["input=panoramas", "output=labels"]
-    sweep = program != "python" and "-m" in given
-    real = []
-    for word in given:
+        arguments += ["input=panoramas", "output=labels"]
+    is_sweep = program != "python" and "-m" in arguments
+    filled = []
+    for word in arguments:
         name, equals, value = word.replace("=/", "=").rpartition("=")
         if _OPEN.fullmatch(value):
             value = STAND_INS[name]
         elif _OPEN.search(value):
             parts = ("**" if _OPEN.fullmatch(p) else _OPEN.sub("*", p) for p in value.split("/"))
             found = sorted(world.glob("/".join(parts)))
-            assert found, f"nothing stands in for {word}"
+            assert found, f"no file matches {word}"
             value = str(found[0].relative_to(world))
-        if sweep and not value.startswith(("[", "{")):
+        if is_sweep and not value.startswith(("[", "{")):
             value = value.partition(",")[0]
-        real.append(f"{name}{equals}{value}")
-    if program == "tangent-predict" and not any(word.startswith("depth=") for word in given):
-        real = [word.replace("runs/demo", "runs/rgb") for word in real]
-    if "data=stanford2d3ds_pairs" in real:
-        real = [word.replace("data/2d3ds", "data/pairs") for word in real]
-    return [program, *(word for word in real if word != "-m" or not sweep)]
+        filled.append(f"{name}{equals}{value}")
+    if program == "tangent-predict" and not any(word.startswith("depth=") for word in arguments):
+        filled = [word.replace("runs/demo", "runs/rgb") for word in filled]
+    if "data=stanford2d3ds_pairs" in filled:
+        filled = [word.replace("data/2d3ds", "data/pairs") for word in filled]
+    return [program, *(word for word in filled if word != "-m" or not is_sweep)]
 
 
-def small(words: list[str], world: Path) -> list[str]:
-    """Settings appended to a command so that it takes seconds."""
-    program, *given = words
+def small_settings(words: list[str], world: Path) -> list[str]:
+    """Return settings that let a command take seconds."""
+    program, *arguments = words
     if program == "python":
-        return ["--help"] if given[0] == "-m" else []
-    if "--help" in given or any(word.startswith("resume=") for word in given):
+        return ["--help"] if arguments[0] == "-m" else []
+    if "--help" in arguments or any(word.startswith("resume=") for word in arguments):
         return []
-    config = CONFIGS.get(program, "train" if any(w.startswith("data=") for w in given) else None)
-    if config is None or any(word.startswith(("left=", "input=")) for word in given):
+    config = CONFIGS.get(
+        program, "train" if any(w.startswith("data=") for w in arguments) else None
+    )
+    if config is None or any(word.startswith(("left=", "input=")) for word in arguments):
         return []
-    own = [w for w in given if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))]
+    overrides = [
+        w for w in arguments if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))
+    ]
     if program == "tangent-evaluate":
-        own = [word for word in own if word.startswith(("data=", "representation="))]
-    folders = [world / given[given.index("--config-dir") + 1]] if "--config-dir" in given else []
+        overrides = [word for word in overrides if word.startswith(("data=", "representation="))]
+    folders = (
+        [world / arguments[arguments.index("--config-dir") + 1]]
+        if "--config-dir" in arguments
+        else []
+    )
     search = ",".join(f"file://{folder}" for folder in folders)
-    found = composed(config, *own, f"hydra.searchpath=[{search}]")
-    known = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
-    if "experiment=zero_shot" in given:  # which has no training, and says so
-        known = {n: v for n, v in known.items() if not n.startswith(("fine_tuning", "network"))}
+    found = composed(config, *overrides, f"hydra.searchpath=[{search}]")
+    settings = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
+    if "experiment=zero_shot" in arguments:  # an experiment without training refuses these
+        settings = {
+            n: v for n, v in settings.items() if not n.startswith(("fine_tuning", "network"))
+        }
     if program == "tangent-evaluate":
-        known = {n: v for n, v in known.items() if n.startswith(("data.rooms", "representation."))}
-    return [f"{name}={value}" for name, value in known.items()]
+        settings = {
+            n: v for n, v in settings.items() if n.startswith(("data.rooms", "representation."))
+        }
+    return [f"{name}={value}" for name, value in settings.items()]

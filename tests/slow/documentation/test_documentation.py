@@ -12,13 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from tests.slow.documentation.commands import Block, blocks, words_of
+from tests.slow.documentation.commands import Block, find_blocks, split_line
 from tests.slow.documentation.world import ROOT, build_world, run
 
 BLOCKS = [
     block
     for path in (ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")))
-    for block in blocks(path.relative_to(ROOT).as_posix(), path.read_text())
+    for block in find_blocks(path.relative_to(ROOT).as_posix(), path.read_text())
 ]
 
 
@@ -28,7 +28,7 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.timeout(1500)
-@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.place)
+@pytest.mark.parametrize("block", BLOCKS, ids=lambda block: block.location)
 def test_documented_commands_run(block: Block, template: Path, tmp_path: Path) -> None:
     world = shutil.copytree(template, tmp_path / "world")
     for name, content in block.files.items():
@@ -39,7 +39,7 @@ def test_documented_commands_run(block: Block, template: Path, tmp_path: Path) -
         run(["python", "documented.py"], {}, world)
     exported: dict[str, str] = {}
     for line in block.commands:
-        variables, words = words_of(line)
+        variables, words = split_line(line)
         if not words:
             exported |= variables
         elif words[0] in ("cd", "git", "make", "pip", "python3", "source"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import multiprocessing
 import os
 import re
@@ -30,7 +31,7 @@ from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pa
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
 from tests.inference.photo_networks import huggingface_networks as networks
-from tests.slow.documentation.commands import TIME, small, typed
+from tests.slow.documentation.commands import TIME, fill_in, small_settings
 
 ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
@@ -42,13 +43,15 @@ _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BAT
 
 
 def build_world(folder: Path) -> Path:
-    """Make all files that documents name; nothing in the folder depends on where it is."""
+    """Write all files that the pages name; the folder can be copied anywhere."""
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
     write_photos(folder / "my_photos")
+    classes = {name: [name] for name in ("wall", "floor", "window")}  # those of my_rooms
+    (folder / "my_map.json").write_text(json.dumps({"source": "ADE20K", "classes": classes}))
     _write_pictures(folder)
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
@@ -68,8 +71,9 @@ def build_world(folder: Path) -> Path:
     for root in ("synthrooms", "rooms_standard"):
         shutil.copytree(folder / "data" / "rooms_demo", folder / "data" / root)
     shutil.copyfile(folder / demo / "checkpoints" / "best.ckpt", folder / "other.ckpt")
-    best = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
-    shutil.copyfile(best, folder / "net.ckpt")
+    shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
+    trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
+    shutil.copyfile(trained, folder / "net.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
@@ -96,7 +100,7 @@ def _write_pictures(folder: Path) -> None:
             cv2.imwrite(str(path), image.astype(np.uint8 if image is panorama else np.uint16))
     cv2.imwrite(str(folder / "room.png"), panorama)
     cv2.imwrite(str(folder / "labels.png"), panorama[..., 0] // 32)
-    for name in ("tripod", "labels/labels/hall", "labels/labels/kitchen"):
+    for name in ("tripod", "poles", "labels/labels/hall", "labels/labels/kitchen"):
         path = folder / f"{name}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), panorama[..., 0] // 64)
@@ -125,20 +129,20 @@ def _write_colmap_model(project: Path) -> None:
 
 
 def run(words: list[str], variables: dict[str, str], world: Path) -> None:
-    """Run a documented command there, small; it must succeed and leave something.
+    """Run a documented command on small data; it must succeed and write a file.
 
-    The process is forked from a server that has imported what is slow to import.
+    The process is forked from a server that has already imported the slow modules.
     """
     for named in re.findall(r"(?<!dir=)runs/([\w/-]+?)(?=/…|/<|/\d{4}-|\s|$)", " ".join(words)):
         if not (world / "runs" / named).exists():
             kind = "shapes/default" if "shapes" in named else "demo"
             shutil.copytree(world / "runs" / kind / TIME, world / "runs" / named / TIME)
-    words = typed(words, world)
+    words = fill_in(words, world)
     for name, _, value in (word.partition("=") for word in words):
         place = world / value
         if name in ("output", "figure") and place != world:
             shutil.rmtree(place) if place.is_dir() else place.unlink(missing_ok=True)
-    words += small(words, world)
+    words += small_settings(words, world)
     before = _times(world)
     context = multiprocessing.get_context("forkserver")
     with tempfile.NamedTemporaryFile() as log, pytest.MonkeyPatch.context() as patch:
@@ -151,12 +155,12 @@ def run(words: list[str], variables: dict[str, str], world: Path) -> None:
         status = process.exitcode
         process.kill()
         output = Path(log.name).read_text(errors="replace")
-    told = f"was run as: {' '.join(words)}\n{output}"
-    assert status == 0, told
-    assert "Traceback" not in output, told
-    ready = ("tangent-check", "tangent-prepare", "python")
-    if words[0] not in ready and "--help" not in words:
-        assert _times(world) != before, f"nothing was written: {told}"
+    report = f"was run as: {' '.join(words)}\n{output}"
+    assert status == 0, report
+    assert "Traceback" not in output, report
+    may_only_print = ("tangent-check", "tangent-prepare", "python")
+    if words[0] not in may_only_print and "--help" not in words:
+        assert _times(world) != before, f"nothing was written: {report}"
 
 
 def _times(folder: Path) -> dict[Path, int]:

@@ -23,7 +23,7 @@ class Faulty(nn.Module):
 
     Args:
         at: Number of the forward pass in training, from 0.
-        wrong: Function that changes the scores of that pass.
+        wrong: Function that damages the scores of this pass.
     """
 
     def __init__(
@@ -59,7 +59,7 @@ def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
 
 
 def small_data(root: Path, **settings: Any) -> Stanford2D3DS:
-    """Colors of panoramas of 32×64."""
+    """RGB panoramas of 32×64 in the format of Stanford2D3DS."""
     representation = TangentRepresentation(base_level=0, level=4)
     return Stanford2D3DS(root, representation, inputs=["rgb"], panoramas_per_step=1, **settings)
 

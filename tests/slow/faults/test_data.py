@@ -50,7 +50,7 @@ def _module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
 
 
 def _colors(kind: str, root: Path) -> list[Path]:
-    """The files of the colors, or the meshes, in order."""
+    """Color images or meshes, in order."""
     pattern = {
         "folder": "images/**/*.*",
         "stanford": "area_*/pano/rgb/*.png",
@@ -154,7 +154,7 @@ def test_a_damaged_file_is_found(
     by_file = {problem.file: problem for problem in problems.listed()}
     assert str(path) in by_file, by_file
     finding = by_file[str(path)].finding
-    assert str(path) not in finding, "named once"
+    assert str(path) not in finding, "the path is named once"
     assert re.search(expected, finding), finding
     if damage not in (_narrower, _to_8_bits):  # its partners do not fit then
         assert len(by_file) == 1
@@ -164,7 +164,7 @@ def test_a_damaged_file_is_found(
 
 
 def _damage(kind: str, root: Path, *, headers: bool = True) -> list[Path]:
-    """Break two files: one in its header, the other one only in its pixels."""
+    """Two broken files: the first has a broken header, the other has to be decoded."""
     paths = [path for path in _colors(kind, root) if kind != "folder" or path.suffix == ".png"]
     broken = [paths[1], paths[-1]]
     for number, path in enumerate(broken):
@@ -216,7 +216,7 @@ def test_broken_files_are_refused_or_left_out_and_counted(
 
 
 def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:
-    """Return the data module in the state of `Trainer.fit` before it prepares the data."""
+    """Return a data module in the state in which `Trainer.fit` prepares its data."""
     trainer: Any = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING))
     data.trainer = trainer
     return data

@@ -1,4 +1,4 @@
-"""Full disks: existing files stay, partial files are removed, and the message has a remedy.
+"""Full disks: existing files stay, no partial file is left, and the message has a remedy.
 
 A limit on the size of files is real and needs no rights; a small disk is mounted where that is
 allowed.
@@ -80,7 +80,7 @@ class Pictures(lightning.Callback):
 
 @pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_full_disk_for_tensorboard_stops_with_a_checkpoint(
+def test_a_full_disk_for_tensorboard_ends_the_run_with_a_checkpoint(
     stanford_root: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
     logger = TensorBoardLogger(tmp_path, name="", version="tensorboard")
@@ -96,7 +96,7 @@ def test_a_full_disk_for_tensorboard_stops_with_a_checkpoint(
         trainer.fit(small_task(Faulty()), datamodule=data)
     for thread in {*threading.enumerate()} - before:  # the writer's end belongs to this test
         thread.join(10)
-    printed = capfd.readouterr().err
-    assert f"tangent-train resume={tmp_path}" in printed
+    output = capfd.readouterr().err
+    assert f"tangent-train resume={tmp_path}" in output
     content = torch.load(tmp_path / "checkpoints" / "last.ckpt", weights_only=True)
     assert content["state_dict"]

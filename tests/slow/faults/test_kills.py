@@ -1,6 +1,6 @@
 """Runs killed at random moments and resumed, compared with an undisturbed run.
 
-A run trains with dropout, validates, writes checkpoints all the time, evaluates and writes its
+A run trains with dropout, validates, writes checkpoints continually, evaluates and writes its
 results; SIGKILL comes at a moment drawn between its first checkpoint and its end, and comes again
 while every other run is resumed.
 """
@@ -181,7 +181,7 @@ def test_killed_runs_end_as_if_nothing_had_happened(stanford_root: Path, tmp_pat
     process = _start(run, stanford_root, _die_in_a_checkpoint)
     process.join(_PATIENCE_S)
     assert process.exitcode == -signal.SIGKILL, _log(run)
-    assert len(list(run.rglob(".partial-*"))) == 1, "half of a checkpoint, which is not read"
+    assert len(list(run.rglob(".partial-*"))) == 1, "a partial checkpoint, which is not read"
     _assert_whole(run)
     _await_end(_start(run, stanford_root), run)
     _assert_whole(run)

@@ -1,4 +1,4 @@
-"""Panoramas without a labeled pixel and classes that none has, in training and in results."""
+"""Panoramas without labels and classes without pixels, in training and in results."""
 
 from __future__ import annotations
 
@@ -55,7 +55,9 @@ def test_a_batch_without_labels_changes_nothing(root: Path, tmp_path: Path, half
 
 
 @pytest.mark.parametrize("absent", ["skip", "zero"])
-def test_panoramas_without_a_labeled_pixel(root: Path, tmp_path: Path, absent: Any) -> None:
+def test_panoramas_without_a_labeled_pixel_do_not_count(
+    root: Path, tmp_path: Path, absent: Any
+) -> None:
     for path in _label_files(root, "5[ab]"):
         _without_labels(path)
     data = small_data(root)

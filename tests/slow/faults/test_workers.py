@@ -1,4 +1,4 @@
-"""Workers of a loader that die or fail: the message and its remedy."""
+"""Loader workers that are killed or fail: messages and remedies."""
 
 from __future__ import annotations
 

@@ -67,10 +67,10 @@ def _read_table(path: Path) -> None:
 
 
 def _pose_seeds() -> list[bytes]:
-    matrix = [[0.0, 1, 0, 0.5], [0, 0, -1, 1.5], [-1, 0, 0, -2]]
-    pose = {"camera_rt_matrix": matrix, "camera_original_rotation": [1.5708, 0.0, 0.3]}
+    rotation = [[0.0, 1, 0, 0.5], [0, 0, -1, 1.5], [-1, 0, 0, -2]]
+    pose = {"camera_rt_matrix": rotation, "camera_original_rotation": [1.5708, 0.0, 0.3]}
     pose |= {"camera_location": [-0.5, 2.25, 1.5]}
-    square = pose | {"camera_rt_matrix": [*matrix, [0, 0, 0, 1]]}
+    square = pose | {"camera_rt_matrix": [*rotation, [0, 0, 0, 1]]}
     return _json(pose, square, {"camera_k_matrix": [[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]]})
 
 
@@ -79,8 +79,8 @@ def _read_pose(path: Path) -> None:
         assert read_camera_matrix(path).shape == (3, 3)
         return
     pose = read_panorama_pose(path)
-    matrix = pose.world_from_panorama
-    np.testing.assert_allclose(matrix @ matrix.T, np.eye(3), atol=1e-4)
+    rotation = pose.world_from_panorama
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-4)
     assert np.isfinite(pose.location_m).all()
 
 
@@ -210,7 +210,7 @@ def _read_image(path: Path) -> None:
         assert pixels.ndim in (2, 3)
         assert pixels.dtype.kind in "buif"
         assert 0 not in pixels.shape
-    with suppress(DataError):  # colors are refused
+    with suppress(DataError):  # color images are not depth
         depth = read_depth_m(path, 1000.0)
         assert 0 <= depth.min() <= depth.max() <= 1e4
 

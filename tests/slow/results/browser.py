@@ -27,7 +27,7 @@ DRAWN = """() => new Promise((done, failed) => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Start the system's Chromium; skip the test without it."""
+    """Open the Chromium of the system, or skip the test without one."""
     program = next(filter(None, map(shutil.which, PROGRAMS)), None)
     if program is None:
         pytest.skip(f"no browser: none of {', '.join(PROGRAMS)} is on the path")
@@ -43,7 +43,7 @@ class OpenReport:
 
     Attributes:
         page: Page of the browser.
-        problems: Errors, warnings and requests since the report was opened.
+        problems: Errors, warnings and requests since it was opened.
     """
 
     page: Page
@@ -116,15 +116,15 @@ class OpenReport:
 
 @contextmanager
 def opened(browser: Browser, path: Path) -> Iterator[OpenReport]:
-    """A report in a window of its own; afterwards nothing must have gone wrong or been fetched."""
+    """Open a report in a window; afterwards there must be no errors and no requests."""
     window = browser.new_context(viewport={"width": 600, "height": 800})
     window.set_default_timeout(20_000)
     report = OpenReport(window.new_page())
 
-    def store_message(message: ConsoleMessage) -> None:
+    def record(message: ConsoleMessage) -> None:
         report.problems.append(f"{message.type}: {message.text}")
 
-    report.page.on("console", store_message)
+    report.page.on("console", record)
     report.page.on("pageerror", lambda error: report.problems.append(str(error)))
     report.page.on("request", lambda request: report.problems.append(request.url[:200]))
     report.page.goto(path.as_uri())

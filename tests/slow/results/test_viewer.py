@@ -87,7 +87,7 @@ def view_of(
     x = (np.arange(width) + 0.5 - width / 2) / half
     y = (height / 2 - np.arange(height) - 0.5) / half
     right, up = np.meshgrid(x, y)
-    radius, direction = np.hypot(right, up), np.arctan2(up, right)
+    radius, azimuth = np.hypot(right, up), np.arctan2(up, right)
     edge = np.radians(width_deg) / 2
     angle = (
         np.arctan(radius * np.tan(edge))
@@ -95,8 +95,7 @@ def view_of(
         else 2 * np.arctan(radius * np.tan(edge / 2))
     )
     local = np.stack(
-        [np.cos(angle), np.sin(angle) * np.cos(direction), np.sin(angle) * np.sin(direction)],
-        axis=-1,
+        [np.cos(angle), np.sin(angle) * np.cos(azimuth), np.sin(angle) * np.sin(azimuth)], axis=-1
     )
     lon, lat = np.radians(lon_deg), np.radians(lat_deg)
     tilt = np.array([[np.cos(lat), 0, -np.sin(lat)], [0, 1, 0], [np.sin(lat), 0, np.cos(lat)]])

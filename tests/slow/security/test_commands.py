@@ -27,8 +27,8 @@ def test_names_of_classes_are_names(
     write_data_set(Path("theirs"), height=64)
     write_classes(Path("theirs"), dict(zip(names, (1, [2, 3], 255, 4), strict=True)))
     folder = ["data=folder", "data.root=theirs", "data.inputs=[rgb]", "data.num_workers=0"]
-    settings = [s for s in SETTINGS if not s.startswith(("experiment", "data", "representation"))]
-    widths = ["network=unet_small", "representation=tangent_economy_16", *settings, "level=5"]
+    small = [s for s in SETTINGS if not s.startswith(("experiment", "data", "representation"))]
+    widths = ["network=unet_small", "representation=tangent_economy_16", *small, "level=5"]
     with watched(forbidden) as happened:
         run_command(monkeypatch, "check", *folder, "level=5")
         run_command(monkeypatch, "train", *widths, *folder, "hydra.run.dir=run")

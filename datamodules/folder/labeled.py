@@ -1,4 +1,4 @@
-"""Folders of one's own images, label images and a list of classes, whatever the images are.
+"""User-defined folders of images, label images and a list of classes, for panoramas and photos.
 
 On disk::
 
@@ -35,15 +35,15 @@ _TRIED = 4
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
-class LabelledFolder(ImageDataModule):
-    """The files, splits and classes of a user's own images. Depth is clipped to 4 m.
+class LabeledFolder(ImageDataModule):
+    """Files, splits and classes of a user-defined data set. Depth is clipped to 4 m.
 
     Args:
-        test_fraction: Share of the scenes for test, unless there are lists, see `FolderSplits`;
+        test_fraction: Share of the scenes for the test, without lists, see `FolderSplits`;
             `validation_fraction` is a share of the training scenes.
         split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
-        depth_units_per_m: Units in a meter of depth files of whole numbers, 1000 for millimeters.
+        depth_units_per_m: Units per meter of integer depth files, 1000 for millimeters.
 
     Attributes:
         class_names: "unknown", then those of ``classes.json``.
@@ -63,19 +63,19 @@ class LabelledFolder(ImageDataModule):
         self.require("depth_units_per_m", self.depth_units_per_m > 0, "more than 0")
         self.require("test_fraction", 0 < self.test_fraction < 1, "above 0 to below 1")
         self.require("split_seed", self.split_seed >= 0, "0 or more")
-        # Now, not with the files: the network is made for as many classes.
+        # Read now, not with the images: the network needs the number of classes.
         self._classes = read_classes(self.root / "classes.json")
         self.class_names = (UNKNOWN_NAME, *self._classes.names)
 
     def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
         images = list_images(self.root, problems, with_depth="depth" in self.inputs)
-        # Before any are left out: the splits do not depend on what is broken.
+        # Before broken images are left out, so that the splits do not depend on them.
         division = FolderSplits(
             self.root, self.test_fraction, self.validation_fraction, self.split_seed
         )
         splits: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
-        # The rest is checked whatever is wrong with these.
+        # The images are checked even if these checks fail.
         with problems.noted():
             splits = division.divide(images, problems)
         with problems.noted():
@@ -88,18 +88,18 @@ class LabelledFolder(ImageDataModule):
         image_paths(self.root / "images", tell=print_on_rank_zero)
 
     def check(self) -> tuple[Problems, int]:
-        """See `LabeledData`; files that training would pass over are named too."""
+        """See `LabeledData`; also names files that training ignores."""
         problems, count = super().check()
         with problems.noted():
             note_ignored(self.root, problems)
         return problems, count
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
-        """The reader of the images.
+        """Return the reader of the images.
 
         Args:
-            images: All of the data set.
-            problems: Problems of what it reads beside them are added.
+            images: All images of the data set.
+            problems: Collects problems of the other files that it reads.
 
         Raises:
             DataError: The data set as a whole cannot be used.
@@ -114,7 +114,7 @@ class LabelledFolder(ImageDataModule):
         seen: set[int] = set()
         for files in images:
             with problems.noted(files.name):
-                reader.size("labels", files.labels)  # else it would be refused in other words
+                reader.size("labels", files.labels)  # a later check refuses it less clearly
                 stored = read_codes(files.labels, in_colors=classes.in_colors)
                 if classes.decode(stored, files.labels).any():
                     return
@@ -124,15 +124,15 @@ class LabelledFolder(ImageDataModule):
             raise DataError(
                 images[0].labels,
                 found=f"{shown}, in this file and the next",
-                expected=f"{classes.describe(classes.codes)}, as classes.json says",
+                expected=f"{classes.describe(classes.codes)}, from classes.json",
                 remedy="Correct classes.json: no pixel would have a class.",
             )
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class FolderPanoramas(LabelledFolder, PanoramaDataModule):
-    """A user's own panoramas, with the classes of ``classes.json``.
+class FolderPanoramas(LabeledFolder, PanoramaDataModule):
+    """User-defined panoramas, with the classes of ``classes.json``.
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
@@ -142,12 +142,12 @@ class FolderPanoramas(LabelledFolder, PanoramaDataModule):
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
-class FolderPhotos(LabelledFolder, PhotoDataModule):
-    """A user's own photos, with the classes of ``classes.json``.
+class FolderPhotos(LabeledFolder, PhotoDataModule):
+    """User-defined photos, with the classes of ``classes.json``.
 
     Args:
-        fov: Horizontal field of view, in degrees, of all photos that ``cameras.json`` does not
-            name; None for that of their EXIF data.
+        fov: Horizontal field of view, in degrees, of photos that ``cameras.json`` does not name;
+            None to read it from EXIF data.
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
@@ -162,7 +162,7 @@ class FolderPhotos(LabelledFolder, PhotoDataModule):
         self.require("fov", fine, "degrees, more than 0 and less than 180")
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
-        """See `LabelledFolder`."""
+        """See `LabeledFolder`."""
         cameras = read_folder_cameras(self.root / "cameras.json", self.fov)
         cameras.check_names(images, problems)
         return FolderReader(self._classes, self.depth_units_per_m, cameras)
