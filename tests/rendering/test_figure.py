@@ -51,8 +51,8 @@ def test_gray_of_16_bits_is_drawn_with_numbers() -> None:
 @pytest.mark.parametrize(
     ("panorama", "base_level", "message"),
     [
-        (np.zeros((32, 64), np.float32), 0, "gray or colors"),
-        (np.zeros((32, 64, 4), np.uint8), 0, "gray or colors"),
+        (np.zeros((32, 64), np.float32), 0, "gray or color panorama"),
+        (np.zeros((32, 64, 4), np.uint8), 0, "gray or color panorama"),
         (np.zeros((32, 64), np.uint8), 4, "base_level: found 4"),
     ],
 )
