@@ -201,10 +201,10 @@ def test_yaw_pitch_roll(
     room: Path, tmp_path: Path, rotation: list[float], forward: Any, right: Any
 ) -> None:
     render_with(input=room, output=tmp_path / "tan", base_level=0, faces=[3], rotation=rotation)
-    rotation = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid.rotation
-    assert rotation is not None
-    np.testing.assert_allclose(rotation @ (1, 0, 0), forward, atol=1e-12)
-    np.testing.assert_allclose(rotation @ (0, 1, 0), right, atol=1e-12)
+    found = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid.rotation
+    assert found is not None
+    np.testing.assert_allclose(found @ (1, 0, 0), forward, atol=1e-12)
+    np.testing.assert_allclose(found @ (0, 1, 0), right, atol=1e-12)
 
 
 def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
