@@ -49,7 +49,7 @@ def check(settings: Mapping[str, Any]) -> None:
             Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
-    summary = counted(len(listed), "problems") if listed else "No problems"
+    summary = counted(len(listed), "problems") if listed else "Nothing is wrong"
     if warnings:
         summary = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
     print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)

@@ -72,7 +72,7 @@ def keypoints(config: Mapping[str, Any]) -> None:
         report().write(output)
     for table in report().means():
         table.print()
-    print_text(f"Results: {output}" if done else "There are no results.")
+    print_text(f"Results are in {output}." if done else "There are no results.")
     if parsed.export:
         print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     if failed := len(set(pair_names) - set(done)):

@@ -162,7 +162,7 @@ def _finish(
     if pictures:
         folder.write_page(entries, pictures)
     folder.mean_shares(entries).print()
-    print_text(f"Results: {settings.output}")
+    print_text(f"Results are in {settings.output}.")
 
 
 class _Labeler:

@@ -74,13 +74,13 @@ def with_pretrained_network(
         changed["network"] = description.settings
         trust = parse_settings(Trust, settings).trust
         source = SettingsFile(path, trust, settings.keys() - {"network"})
-        notes.append(f"Network of {path}: {target} (to change it: network=…)")
+        notes.append(f"Network of {path}: {target} (another: network=…)")
     normalization = _normalization(description, changed["data"])
     if normalization is not None:
         changed["data"] = changed["data"] | {"normalization": normalization}
         mean, std = (" ".join(f"{value:.4g}" for value in v) for v in normalization.values())
         notes.append(
-            f"Normalization of {path}: mean {mean}, std {std} (to change it: data.normalization=…)"
+            f"Normalization of {path}: mean {mean}, std {std} (another: data.normalization=…)"
         )
     _print("\n".join(notes))
     return changed, source

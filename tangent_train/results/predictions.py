@@ -143,12 +143,12 @@ class PredictionFolder:
         """
         existing = [path for name in _RESULTS if (path := self.path / name).exists()]
         if existing:
-            without, keep = "a folder without earlier results", " set resume=true to keep them,"
+            without, keep = "a folder without earlier results", " resume=true to keep them,"
             raise SettingError(
                 "output",
                 found=existing[0],
                 expected=f"a readable {_SUMMARY} in the same folder" if resume else without,
-                remedy=f"Choose another folder,{'' if resume else keep} or set overwrite=true.",
+                remedy=f"Give another folder,{'' if resume else keep} or overwrite=true.",
             )
 
     def earlier(
@@ -177,7 +177,7 @@ class PredictionFolder:
                 "resume",
                 found=f"{changed[0]}, which differs from that of the results in {self.path}",
                 expected="the same settings",
-                remedy="Choose another folder, or set overwrite=true.",
+                remedy="Give another folder, or overwrite=true.",
             )
         return {name: entry for name, entry in entries.items() if self._is_complete(name, entry)}
 

@@ -57,7 +57,7 @@ def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
     classes: dict[str, Any] = {"door": 11, "wall": 12, "floor": 13, "sofa": 4}
     write_classes(root, classes)
     _, err = _checked(root, capsys)
-    assert "No problems" not in err
+    assert "Nothing is wrong" not in err
     assert "Warning: 75.0 % of the pixels for train are unknown." in err
     assert "No pixel for train is of 3 of 4 classes: door, wall, floor." in err
     assert "Warning: 100.0 % of the pixels for test are unknown." in err
@@ -66,5 +66,5 @@ def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
 def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:
     write_classes(root, [None, None, "wall", "floor", None])
     out, err = _checked(root, capsys)
-    assert out == f"No problems; 3 panoramas of {root} checked.\n"
+    assert out == f"Nothing is wrong; 3 panoramas of {root} checked.\n"
     assert "Warning" not in err

@@ -61,7 +61,7 @@ def test_two_panoramas_are_a_pair(
         assert int(row["putative"]) == kept["putative"] > 0
     pictures = sorted(path.name for path in (output / "matches").iterdir())
     assert pictures == ["000_a_b_as_given.png", "000_a_b_rotated.png"]
-    assert "Results: out (1)" in capsys.readouterr().out
+    assert "Results are in out (1)." in capsys.readouterr().out
 
 
 def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
@@ -100,9 +100,11 @@ def test_an_interrupted_run_goes_on(
     assert results(tmp_path / "out")["rows"][:2] == first
     run(*arguments, "max_pairs=1")  # takes nothing away
     assert len(pairs_in(tmp_path / "out")) == 3
-    with pytest.raises(SystemExit, match=r"ratio: found 0\.7; expected 0\.8, as for the results"):
+    with pytest.raises(
+        SystemExit, match=r"ratio: found 0\.7; expected 0\.8, with which the results"
+    ):
         run(*arguments, "ratio=0.7")
-    with pytest.raises(SystemExit, match=r"data: found .*; expected .*, as for the results"):
+    with pytest.raises(SystemExit, match=r"data: found .*; expected .*, with which the results"):
         run(*arguments, "pairing=consecutive")
 
 

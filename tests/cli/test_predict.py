@@ -109,11 +109,11 @@ def test_an_interruption_keeps_what_is_done(
     first = tmp_path / "out" / "labels" / "a.png"
     assert list(first.parent.iterdir()) == [first]
     printed = capsys.readouterr()
-    assert "1 of 3 images are done. resume=true" in printed.out
+    assert "1 of 3 images are done. Continue with resume=true" in printed.out
     assert printed.err == "tangent-predict: ended by SIGTERM\n"
     monkeypatch.setattr(Predictor, "predict", whole)
     written = first.stat().st_mtime_ns
-    with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
+    with pytest.raises(SystemExit, match="resume: found blend=nearest, which differs"):
         predict(resume="true", blend="nearest")
     assert predict(resume="true").keys() == {"a", "b", "c"}
     assert first.stat().st_mtime_ns == written

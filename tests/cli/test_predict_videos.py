@@ -115,7 +115,7 @@ def test_every_third_frame(tmp_path: Path, predict: Predict, capsys: Capture) ->
         predict(every=3, resume="true")
         assert f"4 images, {3 if missing else 4} done already" in capsys.readouterr().out
         assert set(re.findall(r"walk/\d{6}", page.read_text())) == {f"walk/{n}" for n in third}
-    with pytest.raises(SystemExit, match="every=2, another setting"):
+    with pytest.raises(SystemExit, match="every=2, which differs"):
         predict(every=2, resume="true")
     with pytest.raises(SystemExit, match="every: found 0"):
         predict(every=0, output="none")
@@ -148,7 +148,7 @@ def test_an_interrupted_video_is_resumed(
     with pytest.raises(SystemExit) as stopped:
         predict(input=video)
     assert stopped.value.code == 130
-    assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
+    assert "4 of 7 images are done. Continue with resume=true" in capsys.readouterr().out
     assert len(predicted(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
     monkeypatch.setattr("tangent_train.cli.input_files.read_frames", read_frames)

@@ -337,7 +337,7 @@ _IN = {"input": "in", "output": "tan"}
         ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},
-            "found jpg; .* others change pix",
+            "found jpg; .* other formats change pix",
         ),
         ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
         ({**_IN, "mask": "in/room.png"}, "null without colmap=true"),

@@ -166,7 +166,7 @@ def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:
     run_transfer("study_levels=[4,6]")
     files = {path.name for path in HERE.glob("angular_resolution.*")}
     assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "png")}
-    assert "against level 4" in (HERE / "angular_resolution.md").read_text()
+    assert "from level 4" in (HERE / "angular_resolution.md").read_text()
 
 
 def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> None:
@@ -176,5 +176,5 @@ def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> 
     run_transfer(*arguments)
     assert runs.started[:2] == [("evaluate", "P"), ("evaluate", "S")]
     assert runs.configs[0].checkpoint == runs.configs[2].init_from == str(given)
-    with pytest.raises(REFUSED, match=r"testing on fold 1.*; expected folds=\[1\]"):
+    with pytest.raises(REFUSED, match=r"trained on all folds but fold 1.*; expected folds=\[1\]"):
         run_transfer(*arguments, "folds=[1,2]")

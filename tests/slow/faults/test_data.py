@@ -250,7 +250,7 @@ def test_the_command_lists_problems_line_by_line(
     monkeypatch.chdir(root.parent)
     arguments = ("data=stanford2d3ds", "level=3", f"data.root='{root}'")
     run_command(monkeypatch, "check", *arguments)
-    assert "No problems; 14 panoramas" in capsys.readouterr().out
+    assert "Nothing is wrong; 14 panoramas" in capsys.readouterr().out
     cut, corrupted = _damage(kind, root)
     with pytest.raises(SystemExit) as left:
         run_command(monkeypatch, "check", *arguments, "data.skip_broken=true")
