@@ -41,6 +41,7 @@ _FIELDS = {
     "groups": GROUPS,
     "inputs": INPUTS | None,  # None for shapes, which have six fixed channels
     "normalization": NORMALIZATION,
+    "photo_level": int | None,  # for imported networks
     "predicts": Text,  # kind of labels, see `datamodules.core.labels`
     "score_kind": ScoreKind | None,  # for imported networks; None for logits
     "state_dict": dict,
@@ -55,7 +56,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
         path: Checkpoint. Tensors are memory-mapped; checksums are compared if they are needed.
         needed: Names of the fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
-            ``normalization``, ``predicts``, ``score_kind``, ``state_dict``.
+            ``normalization``, ``photo_level``, ``predicts``, ``score_kind``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, damaged, or not a checkpoint of this program.

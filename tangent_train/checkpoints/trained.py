@@ -67,6 +67,8 @@ class TrainedNetwork:
         size_multiple: Number that height and width of images must be multiples of.
         fixed_size: Rows and columns of the only image size that the network takes, into which
             larger images are divided; None if it takes other sizes.
+        photo_level: Level s with the pixels per degree of the photos that an imported network was
+            trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
         score_kind: Kind of the output of `inner`.
@@ -84,6 +86,7 @@ class TrainedNetwork:
     image_size: tuple[int, int]
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
+    photo_level: int | None = None
     groups: Groups | None = None
     score_kind: ScoreKind = "logits"
     settings: Mapping[str, Any] | None = None
@@ -100,6 +103,13 @@ class TrainedNetwork:
         return ClassScoreNetwork(
             self.inner, count, self.groups, self.fixed_size, self.score_kind
         ).eval()
+
+    @property
+    def photo_side(self) -> int | None:
+        """Side of the views if it does not depend on the level: fixed size, or imported network."""
+        if self.fixed_size is not None:
+            return max(self.fixed_size)
+        return None if self.photo_level is None else self.image_size[0]
 
     @property
     def in_channels(self) -> int:
@@ -152,6 +162,7 @@ _KINDS = {
     "image_size": list[int],
     "size_multiple": int,
     "fixed_size": list[int] | None,
+    "photo_level": int | None,
     "groups": GROUPS,
     "score_kind": ScoreKind,
     "settings": dict | None,
@@ -318,7 +329,8 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
     described["settings"] = described.pop("network")
-    names = ("class_names", "inputs", "normalization", "groups", "score_kind", "fixed_size")
+    of_network = "class_names", "inputs", "normalization", "groups", "score_kind"
+    names = (*of_network, "fixed_size", "photo_level")
     described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
     tensors = {
         name.removeprefix(_PREFIX): tensor

@@ -302,6 +302,8 @@ def _inputs(settings: PredictSettings) -> Inputs:
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
     views = kind(trained, settings.levels, settings.base_level, settings.blend, settings.rotations)
+    if isinstance(views, PanoramaViews):
+        print_text(f"A panorama is labeled in {views}.")
     device, count = settings.device, settings.images_per_forward
     return Predictor(trained, views, device, count, settings.min_confidence)
 
