@@ -45,7 +45,7 @@ def test_a_folder_with_modules_of_our_names(
     monkeypatch.chdir(tmp_path)
     Path("classes.json").write_text('["wall", "floor"]')
     torch.save(UNet(3, 2).state_dict(), "state.pt")
-    settings = ("network=unet", "weights=state.pt", "normalization=imagenet", "level=5")
+    settings = ("network=unet", "weights=state.pt", "normalization=imagenet", "levels=5")
     run_command(monkeypatch, "import", *settings, "classes=classes.json", "output=net.ckpt")
     monkeypatch.setenv("PYTHONSAFEPATH", "")
     others = [tmp_path / f"{name}.py" for name in ("datamodules", "models")]

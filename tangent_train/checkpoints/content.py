@@ -41,6 +41,7 @@ _FIELDS = {
     "groups": GROUPS,
     "inputs": INPUTS | None,  # None of shapes, whose six channels are all there is
     "normalization": NORMALIZATION,
+    "photo_level": int | None,  # of imported networks
     "predicts": Text,  # what the network gives, see `datamodules.core.labels`
     "score_kind": ScoreKind | None,  # of imported networks; None: logits
     "state_dict": dict,
@@ -55,7 +56,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
         path: The file; tensors are memory-mapped, and compared with their checksums if needed.
         needed: Which of its fields: ``config`` (the resolved settings of the run, plain values),
             ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
-            ``normalization``, ``predicts``, ``score_kind``, ``state_dict``.
+            ``normalization``, ``photo_level``, ``predicts``, ``score_kind``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, damaged, no checkpoint, or of another program.

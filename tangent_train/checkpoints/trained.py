@@ -67,6 +67,8 @@ class TrainedNetwork:
         size_multiple: Height and width of its images must be multiples of this.
         fixed_size: The only rows and columns it takes, into which larger images are divided; None
             where it takes others.
+        photo_level: Level s with the pixels per degree of the photos that an imported network was
+            trained on; None of a network that was trained here.
         groups: Scores of a photo network that make up every class, and in a last group those of no
             class: where they win, the label is 0. None where every score is a class.
         score_kind: Output of `inner`.
@@ -84,6 +86,7 @@ class TrainedNetwork:
     image_size: tuple[int, int]
     size_multiple: int = 1
     fixed_size: tuple[int, int] | None = None
+    photo_level: int | None = None
     groups: Groups | None = None
     score_kind: ScoreKind = "logits"
     settings: Mapping[str, Any] | None = None
@@ -98,6 +101,13 @@ class TrainedNetwork:
         count = len(self.class_names) - 1
         how = self.groups, self.fixed_size, self.score_kind
         return ClassScoreNetwork(self.inner, count, *how).eval()
+
+    @property
+    def photo_side(self) -> int | None:
+        """Side of its views if that does not depend on the level: of one size, or imported."""
+        if self.fixed_size is not None:
+            return max(self.fixed_size)
+        return None if self.photo_level is None else self.image_size[0]
 
     @property
     def in_channels(self) -> int:
@@ -143,6 +153,7 @@ _KINDS = {
     "image_size": list[int],
     "size_multiple": int,
     "fixed_size": list[int] | None,
+    "photo_level": int | None,
     "groups": GROUPS,
     "score_kind": ScoreKind,
     "settings": dict | None,
@@ -309,7 +320,8 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
     described["settings"] = described.pop("network")
-    names = ("class_names", "inputs", "normalization", "groups", "score_kind", "fixed_size")
+    of_network = "class_names", "inputs", "normalization", "groups", "score_kind"
+    names = (*of_network, "fixed_size", "photo_level")
     described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
     tensors = {
         name.removeprefix(_PREFIX): tensor

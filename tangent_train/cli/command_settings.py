@@ -176,9 +176,9 @@ class ImportSettings:
     unknown_wins: bool
     scores: ScoreKind | None
     image_size: tuple[int, ...] | None
-    fov: float
-    level: int | None
+    levels: tuple[int, ...] | None
     base_level: int | None
+    fov: float
     output: Path
     overwrite: bool
 

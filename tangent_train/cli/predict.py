@@ -302,7 +302,10 @@ def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
     of_forward = settings.device, settings.images_per_forward
-    return Predictor(trained, kind(trained, *how), *of_forward, settings.min_confidence)
+    views = kind(trained, *how)
+    if isinstance(views, PanoramaViews):
+        print_text(f"A panorama is labeled in {views}.")
+    return Predictor(trained, views, *of_forward, settings.min_confidence)
 
 
 def _check_projection(settings: PredictSettings) -> None:

@@ -61,6 +61,20 @@ def check_names(command: str, settings: Mapping[str, Any], references: str) -> N
             )
 
 
+def probable_setting(command: str, name: str) -> str:
+    """A sentence with the setting that a refused name probably means; "" without one.
+
+    Args:
+        command: The command.
+        name: The name, such as ``levels``, which is ``representation.levels`` of a run.
+    """
+    declared = declared_settings(command)
+    views = yaml.safe_load((config_folder() / "representation/tangent.yaml").read_text("utf-8"))
+    if "representation" in declared and name in views:
+        return f"Is representation.{name} meant? "
+    return nearest(name, _names(declared))
+
+
 def _undeclared(
     settings: Mapping[str, Any], declared: Mapping[str, Any], section: str = ""
 ) -> Iterator[tuple[str, Any]]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.registry import build_from_config
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import ERP, TANGENT, write_checkpoint
 
@@ -100,6 +101,30 @@ def test_the_file_gives_what_is_not_typed(
     section = read_settings(tmp_path / "out" / "config.yaml")["representation"]
     assert section == section | expected
     assert results(tmp_path / "out")["images"] == 2
+
+
+@pytest.mark.parametrize(
+    ("typed", "views"),
+    [
+        ([], 40),
+        (["level=4"], 20),
+        (["representation.levels=4"], 20),
+        (["representation.levels=3"], 20),
+        (["representation.rotations=2"], 80),
+        (["representation.base_level=1"], 160),
+    ],
+)
+def test_the_levels_of_an_imported_network(
+    typed: list[str], views: int, rooms: str, tmp_path: Path, run: Run
+) -> None:
+    """Those in the file, unless typed: one level halves the number of views."""
+    section = TANGENT | {"levels": [4, 3], "dim": 16}
+    network = write_checkpoint(tmp_path / "two.ckpt", section)
+    given = _written(tmp_path / "map.json", MAP)
+    run("evaluate", f"checkpoint={network}", *ROOMS, rooms, given, *typed, "hydra.run.dir=out")
+    stored = read_settings(tmp_path / "out" / "config.yaml")["representation"]
+    made: Any = build_from_config(stored, "representation")
+    assert sum(map(len, made.view_sets())) == views
 
 
 def test_the_network_judges_which_way_is_up(

@@ -40,7 +40,7 @@ def _write_imported(path: Path, classes: int, **stated: Any) -> Path:
     names = [f"thing {number}" for number in range(classes)]
     normalization = Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (64, 64))
-    import_network(photo, path, level=6, **stated)
+    import_network(photo, path, levels=6, **stated)
     return path
 
 

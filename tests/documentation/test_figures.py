@@ -117,7 +117,7 @@ def is_found(figure: str, files: list[str]) -> bool:
     return any(number.search(cell) for rows in tables for row in rows for cell in row)
 
 
-TO_DO = {"real_panoramas", "README"}
+TO_DO = {"README"}
 """Pages without data files so far."""
 
 PAGES = [page for page in sorted(RESULTS.glob("*.md")) if page.stem not in TO_DO]
