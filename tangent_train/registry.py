@@ -272,11 +272,12 @@ def _check_taken(
     found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"
     if file is not None and file.gave(name):
         raise DataError(file.path, found=f"{place}: {found}", expected=expected)
-    remedy = f"Remove it with ~{name}, or choose an option of {place}=."
-    if _is_typed(name):
-        remedy = f"{nearest(unknown[0], known)}Remove it."
-    elif place == "data":
-        remedy += " An experiment is for its data set; recipe=small is for other panoramas."
+    remedy = "Remove it."
+    if not _is_typed(name):
+        remedy = f"Remove it with ~{name}, or choose an option of {place}=."
+        if place == "data":
+            remedy += " An experiment is for its data set; recipe=small is for other panoramas."
+    remedy = nearest(unknown[0], known) + remedy
     raise SettingError(place, found=found, expected=expected, remedy=remedy)
 
 
