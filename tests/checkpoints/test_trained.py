@@ -113,7 +113,7 @@ def test_files_that_cannot_be_loaded_are_explained(
     ("content", "message"),
     [
         (None, "no such file"),
-        (b"not a checkpoint", r"a damaged file, or none of torch\.save"),
+        (b"not a checkpoint", r"a damaged file, or not a file of torch\.save"),
         ({"state_dict": {}}, "no config inside"),
         ([1, 2], "list instead of a mapping inside"),
     ],
