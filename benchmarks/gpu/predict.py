@@ -55,7 +55,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
     names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
     network, normalization = build_from_config(settings, "network"), Normalization.of("imagenet", 3)
     photo = PhotoNetwork(network, settings, names, normalization, (side, side))
-    return import_network(photo, path, level=level, base_level=1)
+    return import_network(photo, path, levels=level, base_level=1)
 
 
 def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:

@@ -63,7 +63,7 @@ def import_network(config: Mapping[str, Any]) -> None:
             network,
             output,
             fov_deg=settings.fov,
-            level=settings.level,
+            levels=settings.levels,
             base_level=settings.base_level,
             unknown_classes=settings.unknown_classes,
             unknown_wins=settings.unknown_wins,
@@ -112,7 +112,8 @@ def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
 
 def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
-    base_level, dim = trained.representation["base_level"], trained.representation["dim"]
+    from tangent_train.inference.representations import PanoramaViews
+
     names = trained.class_names[1:]
     mean, std = trained.normalization.mean, trained.normalization.std
     numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
@@ -124,8 +125,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -
         f"the network returns {_OUTPUTS[trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
-        f"photos of {settings.fov:g}° → panoramas of level {trained.level} as "
-        f"{20 * 4**base_level} tangent images (base level {base_level}) of {dim}×{dim}",
+        f"panoramas: {PanoramaViews(trained)}",
     ]
     if trained.source is not None and trained.source.trust:
         trust = ",".join(trained.source.trust)

@@ -12,6 +12,7 @@ import numpy as np
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from tangent_train.errors import SettingError, width_height
+from tangent_train.geometry import TangentGrid
 from tangent_train.inference.images import InputImage
 from tangent_train.registry import build_from_config
 from tangent_train.rendering import (
@@ -94,6 +95,25 @@ class PanoramaViews:
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
 
+    def __str__(self) -> str:
+        """Number and size of the views; of tangent images also angle and resolution by level."""
+        sets: Sequence[Any] = self.representation.view_sets()
+        rows, columns = self.image_size
+        text = f"{sum(map(len, sets))} views of {columns} × {rows}"
+        grids = [getattr(views, "grid", None) for views in sets]
+        tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
+        if not tangent:
+            return text
+        parts = [
+            f"level {level}: {math.degrees(2 * math.atan(grid.dim / 2 * grid.pitch)):.0f}° wide, "
+            f"{math.radians(1 / grid.pitch):.1f} pixels per degree in the middle"
+            for level, grid in tangent.items()
+        ]
+        if len(parts) > 1:
+            parts.append(f"levels={next(iter(tangent))} alone takes 1/{len(parts)} of the time")
+        base_level = next(iter(tangent.values())).base_level
+        return f"{text} at base level {base_level} ({'; '.join(parts)})"
+
     def __call__(self, image: InputImage) -> list[SourceViews]:
         """Return the sets of views of one panorama."""
         representation: Representation = self.representation
@@ -137,7 +157,7 @@ class PhotoViews:
             )
         self._crops = [
             _photo_representation(trained, level, base_level)
-            for level in level_list(levels, trained.level)
+            for level in level_list(levels, trained.photo_level or trained.level)
         ]
         self.image_size = max(crops.image_size for crops in self._crops)
         self.blend: Blend = blend
@@ -146,6 +166,46 @@ class PhotoViews:
         """Return crops that cover the photo. Photos smaller than a crop are mirrored at borders."""
         overlap = _OVERLAP if self.blend == "feather" else 0.0
         return [_covered(image, crops, overlap) for crops in self._crops]
+
+
+def wide_levels(side: int) -> list[int]:
+    """Return the levels of the wide views that photo networks get by default.
+
+    At level s and base level 0, 2^s pixels span 95.8°. The first level has the power of two nearest
+    to the side. The second is the next lower level, at which the same number of pixels spans twice
+    as much of the tangent plane. See docs/explanation/choosing_views.md.
+
+    Args:
+        side: Side of the network's images in pixels.
+
+    >>> wide_levels(512), wide_levels(640), wide_levels(384)
+    ([9, 8], [9, 8], [9, 8])
+    """
+    level = max(1, round(math.log2(side)))
+    return [level, level - 1]
+
+
+def images_of_side(side: int, level: int, base_level: int | None = None) -> dict[str, int]:
+    """Choose base level and side of tangent images: the fewest with a given side.
+
+    Args:
+        side: Side of the network's images in pixels.
+        level: Highest level s of the images.
+        base_level: Base level b; None for the fewest images.
+
+    Returns:
+        ``base_level`` and ``dim``, which differs from `side` only if images of that side would
+        leave gaps on the sphere.
+
+    >>> images_of_side(512, 9), images_of_side(512, 10)
+    ({'base_level': 0, 'dim': 512}, {'base_level': 1, 'dim': 512})
+    """
+    if base_level is None:  # a side of 2^(s−b−½) leaves no gaps
+        base_level = max(0, math.ceil(level - math.log2(side) - 0.5))
+    if not 0 <= base_level <= level:
+        return {"base_level": base_level, "dim": side}  # refused by `TangentGrid`
+    covers = side >= TangentGrid.least_dim(base_level, level)
+    return {"base_level": base_level, "dim": side if covers else 2 ** (level - base_level)}
 
 
 def panorama_settings(
@@ -161,32 +221,33 @@ def panorama_settings(
     Raises:
         SettingError: The representation does not support several levels.
     """
-    chosen = level_list(levels, trained.level)
-    level = max(chosen)
-    settings: dict[str, Any] = {k: v for k, v in trained.representation.items() if k != "levels"}
+    chosen = None if levels is None else level_list(levels, trained.level)
+    level = trained.level if chosen is None else max(chosen)
+    settings: dict[str, Any] = dict(trained.representation)
     kind = settings["_target_"]
     if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
-    if settings["_target_"] == _TANGENT and base_level not in (None, settings["base_level"]):
+    is_tangent = settings["_target_"] == _TANGENT
+    if is_tangent and base_level not in (None, settings["base_level"]):
         settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
     if level != trained.level:
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = level
-    if len(chosen) > 1:
-        if settings["_target_"] != _TANGENT:
-            raise SettingError(
-                "levels",
-                found=chosen,
-                expected="one level, for a network that does not take tangent images",
-                remedy="Give base_level= to use tangent images.",
-            )
-        settings["levels"] = chosen
-    if settings["_target_"] == _TANGENT and trained.fixed_size is not None:
-        side = max(trained.fixed_size)
-        if base_level is None and settings.get("dim") is None:
-            settings["base_level"] = max(0, math.ceil(level - math.log2(side)))
-        default = settings.get("dim") or 2 ** (level - settings["base_level"])
-        settings["dim"] = max(default, side)  # the network divides larger images
+    if is_tangent and chosen is not None:
+        settings["levels"] = chosen if len(chosen) > 1 else None
+    elif chosen is not None and len(chosen) > 1:
+        raise SettingError(
+            "levels",
+            found=chosen,
+            expected="one level, for a network that does not take tangent images",
+            remedy="Give base_level= to use tangent images.",
+        )
+    if is_tangent and (side := trained.photo_side) is not None:
+        dim = settings.get("dim")
+        of_side = images_of_side(side, level, base_level)
+        settings |= (
+            of_side if dim is None else {"dim": max(dim, side)}
+        )  # the network divides larger images
     return settings
 
 
@@ -234,7 +295,7 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     small = fixed is not None and any(n < least for n, least in zip(size, fixed, strict=True))
     if small or (fixed is None and any(side % multiple for side in size)):
         raise SettingError(
-            "level and base_level",
+            "levels and base_level",
             found=f"images of {width_height(size)}",
             expected=f"at least {width_height(fixed)}, the input size of the network's file"
             if fixed

@@ -5,21 +5,28 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
 from torchvision import models as torchvision_models
 
+import tangent_train as tt
 from models import UNet
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.photo_networks.importing import representation_of
-from tangent_train.inference.representations import PanoramaViews
-from tests.cli.tiny_runs import Run
+from tangent_train.inference.representations import (
+    PanoramaViews,
+    PhotoViews,
+    images_of_side,
+    wide_levels,
+)
+from tests.cli.tiny_runs import Predict, Run
 from tests.models.onnx_files import write_linear
 from tests.running import Capture, Patch
 from tests.tasks.small_networks import with_statistics
@@ -43,12 +50,12 @@ OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalizati
 
 @pytest.mark.parametrize("wins", [True, False])
 def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys: Capture) -> None:
-    """Blocks of one colour: the labels are those of every pixel's own scores."""
+    """Blocks of one color: the labels are those of every pixel's own scores."""
     unknown = ("unknown_classes=[background]", f"unknown_wins={wins}".lower())
     run("import", *OF_ONNX, *unknown, "fov=90", "output=ours.onnx")
-    said = capsys.readouterr().out
-    assert "3 classes: dark, green, bright\n" in said
-    assert f"background: {'written as unknown' if wins else 'never win'}" in said
+    printed = capsys.readouterr().out
+    assert "3 classes: dark, green, bright\n" in printed
+    assert f"background: {'written as unknown' if wins else 'never win'}" in printed
     trained = load_trained(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
@@ -56,8 +63,10 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
     scores = Predictor(trained, PanoramaViews(trained, levels=(7,))).predict(InputImage(rgb))
     labels = trained.labels(scores.labels())
-    own = rgb / 255 @ WEIGHT.T + BIAS
-    expected = own.argmax(axis=-1) if wins else own[..., 1:].argmax(axis=-1) + 1
+    scores_by_hand = rgb / 255 @ WEIGHT.T + BIAS
+    expected = (
+        scores_by_hand.argmax(axis=-1) if wins else scores_by_hand[..., 1:].argmax(axis=-1) + 1
+    )
     middle = np.arange(128).reshape(8, 16)[:, 6:10].ravel()  # away from the edges of the blocks
     np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])
     assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
@@ -104,9 +113,9 @@ def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: P
     monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
     given = ("network=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
-    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as told:
+    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as message:
         run("import", *given)
-    file = Path(str(told.value).rpartition("save it as ")[2].removesuffix("."))
+    file = Path(str(message.value).rpartition("save it as ")[2].removesuffix("."))
     network = torchvision_models.get_model(name, weights=None, weights_backbone=None)
     file.parent.mkdir(parents=True, exist_ok=True)
     torch.save(network.state_dict(), file)
@@ -123,7 +132,7 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: 
     network = UNet(3, 4, (16, 32, 64, 128, 256)).eval()
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=imagenet")
-    size = ("level=6", "base_level=1", "unknown_classes=[background]")
+    size = ("levels=6", "base_level=1", "unknown_classes=[background]")
     run("import", "network=unet_small", *given, *size, "output=net.ckpt")
     trained = load_trained(here / "net.ckpt")
     assert trained.normalization.mean == (0.485, 0.456, 0.406)
@@ -147,10 +156,10 @@ def test_a_network_of_ones_own_is_imported(here: Path, run: Run, capsys: Capture
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
     run("import", "--config-dir", "own", "network=mine", *given)
-    own = "tests.tasks.small_networks.with_statistics"
-    assert f"trust=[{own}]" in capsys.readouterr().out
-    assert load_trained(here / "net.ckpt", [own]).class_names == ("unknown", *NAMES)
-    with pytest.raises(DataError, match=f"trust={own}"):
+    scores_by_hand = "tests.tasks.small_networks.with_statistics"
+    assert f"trust=[{scores_by_hand}]" in capsys.readouterr().out
+    assert load_trained(here / "net.ckpt", [scores_by_hand]).class_names == ("unknown", *NAMES)
+    with pytest.raises(DataError, match=f"trust={scores_by_hand}"):
         load_trained(here / "net.ckpt")
 
 
@@ -167,6 +176,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
     trained = load_trained(here / "net.ckpt")
+    assert (trained.image_size, trained.representation["levels"]) == ((520, 520), [9, 8])
     photo = torch.randint(0, 256, (3, 520, 520), dtype=torch.uint8)
     mean, std = (torch.tensor(v)[:, None, None] for v in vars(trained.normalization).values())
     with torch.no_grad():
@@ -175,27 +185,153 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
 
 
+# Default views.
+
+
+def _angles_deg(trained: TrainedNetwork) -> list[int]:
+    """Width of the views of each level."""
+    section = trained.representation
+    grids = [TangentGrid(section["base_level"], n, section["dim"]) for n in section["levels"]]
+    return [round(math.degrees(2 * math.atan(grid.dim / 2 * grid.pitch))) for grid in grids]
+
+
 @pytest.mark.parametrize(
-    ("size", "fov", "expected"),
+    ("size", "levels", "side", "angles_deg"),
     [
-        ((512, 512), 60.0, (1, 10, 512)),
-        ((384, 384), 60.0, (2, 10, 384)),
-        ((512, 1024), 60.0, (2, 11, 512)),
-        ((128, 128), 45.0, (1, 8, 128)),
+        ((256, 256), [8, 7], 256, [96, 131]),
+        ((384, 384), [9, 8], 384, [79, 118]),
+        ((512, 512), [9, 8], 512, [96, 131]),
+        ((640, 640), [9, 8], 640, [108, 140]),
+        ((1024, 1024), [10, 9], 1024, [96, 131]),
+        ((512, 1024), [10, 9], 1024, [96, 131]),
+        ((480, 640), [9, 8], 640, [108, 140]),
     ],
 )
-def test_tangent_images_have_the_angular_resolution_of_the_photos(
-    size: tuple[int, int], fov: float, expected: tuple[int, int, int]
+def test_an_onnx_file_of_any_size_gets_wide_views(
+    size: tuple[int, int],
+    levels: list[int],
+    side: int,
+    angles_deg: list[int],
+    here: Path,
+    run: Run,
+    capsys: Capture,
 ) -> None:
-    _, *found = representation_of(size, fov).values()
-    assert tuple(found) == expected
-    grid = TangentGrid(*expected)
-    focal = camera_matrix_from_fov(fov, size)[0, 0]
-    assert abs(math.log2(1 / grid.pitch / focal)) < 0.6, "within half a level, and the base level's"
+    """Two levels at base level 0, with the longer side of the network's images."""
+    write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
+    run("import", *OF_ONNX, "output=ours.onnx")
+    trained = load_trained(here / "ours.onnx")
+    section = trained.representation
+    assert (section["base_level"], section["levels"], section["dim"]) == (0, levels, side)
+    assert trained.level == levels[0]
+    assert _angles_deg(trained) == angles_deg
+    text = capsys.readouterr().out
+    assert f"panoramas: 40 views of {side} × {side} at base level 0 (level {levels[0]}:" in text
+    assert f"level {levels[0]}: {angles_deg[0]}° wide" in text
+    assert f"levels={levels[0]} alone takes 1/2 of the time" in text
+
+
+@pytest.mark.parametrize("side", [16, 32, 45, 46, 91, 181, 182, 224, 362, 363, 520, 724, 725, 1448])
+def test_wide_views_leave_no_gaps(side: int) -> None:
+    """Also where the level changes, at 2^(s + ½)."""
+    levels = wide_levels(side)
+    chosen = images_of_side(side, levels[0])
+    assert chosen["base_level"] == 0
+    if side >= 91:  # smaller sides are rounded up to whole pixels
+        assert chosen["dim"] == side
+    for level in levels:
+        grid = TangentGrid(0, level, chosen["dim"])
+        assert 70 < math.degrees(2 * math.atan(grid.dim / 2 * grid.pitch)) < 150
+
+
+def test_an_unknown_size_is_512(here: Path, run: Run) -> None:
+    """Networks that take any size have views of one side too."""
+    torch.manual_seed(0)
+    torch.save(UNet(3, 4, (16, 32, 64, 128, 256)).state_dict(), here / "state.pt")
+    given = ("network=unet_small", "weights=state.pt", "classes=classes.json", "normalization=unit")
+    run("import", *given, "output=net.ckpt")
+    trained = load_trained(here / "net.ckpt")
+    assert (trained.fixed_size, trained.image_size) == (None, (512, 512))
+    assert trained.representation["levels"] == [9, 8]
+    run("import", *given, "image_size=256", "output=small.ckpt")
+    assert load_trained(here / "small.ckpt").representation["levels"] == [8, 7]
+    for settings, (count, side) in {
+        (None, None): (40, 512),
+        (9, None): (20, 512),
+        (8, None): (20, 512),
+        (10, None): (80, 512),
+        (None, 1): (160, 512),
+    }.items():
+        views = PanoramaViews(trained, *settings)
+        assert sum(map(len, views.representation.view_sets())) == count
+        assert views.image_size == (side, side)
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("given", "expected"),
+    [
+        (("levels=5",), (0, [5], 32)),
+        (("levels=[6,5]",), (1, [6, 5], 32)),
+        (("base_level=1",), (1, [5, 4], 32)),
+        (("levels=6", "base_level=0"), (0, [6], 64)),
+    ],
+)
+def test_levels_and_base_level_of_an_import(
+    given: tuple[str, ...], expected: tuple[int, list[int], int], here: Path, run: Run
+) -> None:
+    run("import", *OF_ONNX, *given, "output=ours.onnx")
+    section = load_trained(here / "ours.onnx").representation
+    assert (section["base_level"], section["levels"], section["dim"]) == expected
+
+
+@pytest.mark.parametrize(
+    ("size", "fov", "level", "photo_deg"),
+    [(512, 60, 10, 58), (384, 60, 10, 45), (128, 60, 8, 58)],
+)
+def test_photos_keep_their_angular_resolution(
+    size: int, fov: float, level: int, photo_deg: float, here: Path, run: Run
+) -> None:
+    """Crops of photos do not have the angle of the views of panoramas."""
+    write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, size, size))
+    run("import", *OF_ONNX, f"fov={fov}", "output=ours.onnx")
+    trained = load_trained(here / "ours.onnx")
+    assert trained.photo_level == level
+    camera = camera_matrix_from_fov(fov, (size, size))
+    (views,) = PhotoViews(trained)(
+        InputImage(np.zeros((size, size, 3), np.uint8), camera_matrix=camera)
+    )
+    left, _, right, _ = views.sets[0].boxes[0]  # type: ignore[attr-defined]
+    half = (right - left) / views.shape[1] * math.tan(math.radians(fov / 2))
+    assert round(math.degrees(2 * math.atan(half))) == photo_deg
+
+
+def test_labels_without_settings_are_those_of_both_levels(
+    here: Path, run: Run, predict: Predict, capsys: Capture
+) -> None:
+    """The same in tangent-predict and in Python; one setting halves the number of views."""
+    run("import", *OF_ONNX, "output=ours.onnx")
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    rgb = cv2.GaussianBlur(rgb, (0, 0), 3)
+    rgb = ((rgb.astype(np.float32) - 127) * 6 + 127).clip(0, 255).astype(np.uint8)
+    cv2.imwrite("room.png", rgb[..., ::-1])
+    labels: dict[str, Any] = {}
+    settings: dict[str, dict[str, Any]] = {
+        "default": {},
+        "both": {"levels": "[5,4]", "base_level": 0, "blend": "feather", "rotations": 1},
+        "half": {"levels": 5},
+    }
+    for name, given in settings.items():
+        capsys.readouterr()
+        predict(checkpoint="ours.onnx", input="room.png", output=name, **given)
+        count = 20 if name == "half" else 40
+        assert f"A panorama is labeled in {count} views of 32 × 32" in capsys.readouterr().out
+        labels[name] = cv2.imread(f"{name}/labels/room.png", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(labels["default"], labels["both"])
+    np.testing.assert_array_equal(labels["default"], tt.load("ours.onnx").labels(rgb))
+    assert (labels["default"] != labels["half"]).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
     [
         (("classes=three.json",), "^tangent-import: class names .*: found 3, for 4 scores; exp"),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
@@ -215,14 +351,14 @@ def test_tangent_images_have_the_angular_resolution_of_the_photos(
         ),
     ],
 )
-def test_what_does_not_fit_is_one_clear_message(
-    changes: tuple[str, ...], told: str, here: Path, run: Run
+def test_unusable_files_are_one_clear_message(
+    changes: tuple[str, ...], message: str, here: Path, run: Run
 ) -> None:
     (here / "three.json").write_text(json.dumps(NAMES[1:]))
     (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
     (here / "escapes.json").write_text(json.dumps([*NAMES[1:], "a\x1b[2J"]))
     before = set(here.iterdir())
-    with pytest.raises(SystemExit, match=told):
+    with pytest.raises(SystemExit, match=message):
         run("import", *OF_ONNX, "output=ours.onnx", *changes)
     assert set(here.iterdir()) == before
 

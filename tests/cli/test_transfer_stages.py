@@ -33,7 +33,7 @@ def rooms() -> DictConfig:
 
 @pytest.fixture(autouse=True, scope="module")
 def _hydra() -> Any:
-    """What a command finds of Hydra, with the default options."""
+    """Set Hydra's config to that of a command with the default options."""
     HydraConfig.instance().set_config(composed("transfer", return_hydra_config=True))
 
 
@@ -117,15 +117,18 @@ def test_photos_are_needed_to_train_on_but_not_to_test_a_given_network() -> None
 
 def test_the_plan_for_networks_of_photos() -> None:
     config = composed("transfer", "experiment=zero_shot", "checkpoint=/net.onnx")
-    own = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
-    size = {"base_level": 1, "level": 10, "dim": 512}
-    trained = trained_network(own | size, fixed_size=(512, 512))
-    stages = _stages(config, trained, representation=own | size)
+    tangent = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
+    size = {"base_level": 0, "level": 9, "dim": 512, "levels": [9, 8]}
+    trained = trained_network(tangent | size, fixed_size=(512, 512), photo_level=10)
+    stages = _stages(config, trained, representation=tangent | size)
     assert len(stages) == (1 + len(config.compare)) * len(config.conditions)
     for stage in stages.values():
         made = build_from_config(stage.config["representation"], "representation")
         assert made.erp_height == 1024
         check_size(trained, made.image_size)
+    assert _seen(stages, "S", "level", "levels", "dim") == ["Tang", 9, [9, 8], 512]
+    assert _seen(stages, "S-tangent-9-b0", "level", "levels") == ["Tang", 9, None]
+    assert _seen(stages, "S-tangent-10-b1", "level", "dim") == ["Tang", 10, 512]
 
 
 def test_the_study_has_a_stage_for_every_level(rooms: DictConfig) -> None:
@@ -168,7 +171,7 @@ def test_data_without_folds() -> None:
         ("class_map", "my_map.json"),
     ],
 )
-def test_impossible_settings(rooms: DictConfig, setting: str, value: Any) -> None:
+def test_impossible_settings_are_refused(rooms: DictConfig, setting: str, value: Any) -> None:
     changes: dict[str, Any] = {setting.replace(".", "__"): value}
     with pytest.raises(SettingError, match=rf"^{setting}: found"):
         _stages(rooms, **changes)

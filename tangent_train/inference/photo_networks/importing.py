@@ -26,11 +26,17 @@ from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
-from tangent_train.inference.representations import check_size
+from tangent_train.inference.representations import (
+    Levels,
+    check_size,
+    images_of_side,
+    wide_levels,
+)
 from tangent_train.registry import unregistered
+from tangent_train.rendering.representations.pinhole import level_list
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
-_LEVELS = (5, 13)
+_PHOTO_LEVELS = (5, 13)
 
 
 def import_network(
@@ -38,7 +44,7 @@ def import_network(
     path: Path,
     *,
     fov_deg: float = 60.0,
-    level: int | None = None,
+    levels: Levels = None,
     base_level: int | None = None,
     unknown_classes: Collection[str] = (),
     unknown_wins: bool = True,
@@ -48,23 +54,23 @@ def import_network(
     """Try a photo network, write it as a checkpoint and read it again.
 
     Args:
-        network: The network, in evaluation mode afterwards.
-        path: The file: ``.ckpt``, or ``.onnx`` of a network from such a file.
-        fov_deg: Horizontal field of view of the photos it was trained on.
-        level: Level s of the panoramas; None for the angular resolution of those photos.
-        base_level: Base level b of the tangent images; None for the size of those photos.
-        unknown_classes: Names of scores of no class, such as a background.
-        unknown_wins: True if these may win, which is then written as unknown (label 0).
-        image_size: The only rows and columns to give the network; None for its own size and, if it
-            takes others, any.
-        score_kind: Output of the network; None for the output that its library declares, or to find
-            it by trial.
+        network: The network; it is set to evaluation mode.
+        path: File to write: ``.ckpt``, or ``.onnx`` for a network from an ONNX file.
+        fov_deg: Horizontal field of view of the photos it was trained on, for labels of photos.
+        levels: Levels s of the tangent images; None for `wide_levels`.
+        base_level: Base level b of the tangent images; None for the fewest images.
+        unknown_classes: Names of scores that are not classes, such as a background.
+        unknown_wins: True if these scores may win; such pixels are unknown (label 0).
+        image_size: Fixed rows and columns of the network's images; None for the size of its
+            training, and for other sizes if it supports them.
+        score_kind: Kind of the network's output; None for the kind that its library declares, or to
+            find it by trial.
 
     Returns:
-        The network as its file gives it back.
+        The network, read from the file.
 
     Raises:
-        SettingError: A setting is impossible, or the names do not fit the scores.
+        SettingError: A setting is invalid, or the names do not fit the scores.
         NoRoomError: The disk is full.
     """
     if image_size not in (None, network.image_size) and network.fixed_size:
@@ -79,17 +85,23 @@ def import_network(
     names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
     scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
-    seen = representation_of(network.image_size, fov_deg, level, base_level, is_fixed=not multiple)
+    # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
+    side = min(network.image_size) if multiple else max(network.image_size)
+    chosen = wide_levels(side) if levels is None else level_list(levels, 0)
+    level = max(chosen)
+    seen: dict[str, Any] = {"_target_": _TANGENT, "level": level, "levels": chosen}
+    seen |= images_of_side(side, level, base_level)
     described = TrainedNetwork(
         inner=network.network,
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
-        level=seen["level"],
+        level=level,
         representation=seen,
         image_size=(seen["dim"], seen["dim"]),
         size_multiple=multiple or 1,
         fixed_size=None if multiple else network.image_size,
+        photo_level=_photo_level(network.image_size[1], fov_deg),
         groups=groups,
         score_kind=kind,
         settings=network.settings,
@@ -100,47 +112,30 @@ def import_network(
             write_metadata(network.network.path, temporary, described)
         else:
             _write_checkpoint(described, temporary)
-        trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
+        trained = load_trained(
+            temporary, unregistered(network.settings)
+        )  # the classes are from the user
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 
 
-def representation_of(
-    image_size: tuple[int, int],
-    fov_deg: float,
-    level: int | None = None,
-    base_level: int | None = None,
-    *,
-    is_fixed: bool = False,
-) -> dict[str, Any]:
-    """Settings of the tangent images that look most like the photos a network was trained on.
+def _photo_level(columns: int, fov_deg: float) -> int:
+    """Return the level s with the focal length nearest to that of photos.
 
-    Level s has the focal length nearest to that of the photos, ``2^s / R_v(−1)`` pixels; base level
-    b has the largest images that are not larger than the photos. The side of the images is the
-    shorter side of the photos: pixels beyond the default side overlap with other images. Images of
-    a network that takes one size only have its longer side, and are divided if it is not square.
+    The focal length of level s is ``2^s / R_v(−1)`` pixels.
 
     Args:
-        image_size: Rows and columns of the photos.
+        columns: Number of columns of the photos.
         fov_deg: Horizontal field of view of the photos.
-        level: Given level s.
-        base_level: Given base level b.
-        is_fixed: True if the network takes images of this size only.
 
     Raises:
-        SettingError: An impossible field of view, or levels that do not fit.
+        SettingError: The field of view is not between 0° and 180°.
     """
     if not 0 < fov_deg < 180:
         raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
-    if level is None:
-        focal = image_size[1] / 2 / math.tan(math.radians(fov_deg) / 2)
-        level = round(math.log2(focal * vertex_resolution(-1)))
-        level = min(max(level, _LEVELS[0]), _LEVELS[1])
-    side = max(image_size) if is_fixed else min(image_size)
-    if base_level is None:
-        base_level = max(0, math.ceil(level - math.log2(side)))
-    dim = max(side, 2 ** (level - base_level))
-    return {"_target_": _TANGENT, "base_level": base_level, "level": level, "dim": dim}
+    focal = columns / 2 / math.tan(math.radians(fov_deg) / 2)
+    level = round(math.log2(focal * vertex_resolution(-1)))
+    return min(max(level, _PHOTO_LEVELS[0]), _PHOTO_LEVELS[1])
 
 
 def _groups(

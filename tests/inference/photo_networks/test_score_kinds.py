@@ -43,7 +43,7 @@ def _network(path: Path, names: tuple[str, ...] = NAMES, **settings: Any) -> Pho
 
 def _imported(path: Path, names: tuple[str, ...] = NAMES, **settings: Any) -> TrainedNetwork:
     output = path.with_name("imported.onnx")
-    import_network(_network(path, names), output, level=5, base_level=0, **settings)
+    import_network(_network(path, names), output, levels=5, base_level=0, **settings)
     return load_trained(output)
 
 
@@ -242,7 +242,7 @@ def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path
     settings = {"_target_": "torch.nn.Conv2d", "in_channels": 3, "out_channels": 1}
     network = nn.Conv2d(3, 1, 1)
     photo = PhotoNetwork(network, settings | {"kernel_size": 1}, ["sky"], UNIT, (16, 24))
-    trained = import_network(photo, tmp_path / "net.ckpt", level=5, base_level=0)
+    trained = import_network(photo, tmp_path / "net.ckpt", levels=5, base_level=0)
     if suffix != "ckpt":
         export_network(trained, tmp_path / f"net.{suffix}")
     again, images = load_trained(tmp_path / f"net.{suffix}"), _images(32, 48)
@@ -332,7 +332,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     name = f"{LabelMaps.__module__}.{LabelMaps.__qualname__}"
     network, names = LabelMaps(), ("a", "b", "(void)", "c")
     photo = PhotoNetwork(network, {"_target_": name}, names, UNIT, (16, 24))
-    settings: dict[str, Any] = {"level": 5, "base_level": 0, "unknown_classes": ["(void)"]}
+    settings: dict[str, Any] = {"levels": 5, "base_level": 0, "unknown_classes": ["(void)"]}
     trained = import_network(photo, tmp_path / "net.ckpt", **settings)
     if suffix != "ckpt":
         export_network(trained, tmp_path / f"net.{suffix}")

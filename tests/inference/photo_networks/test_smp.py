@@ -122,7 +122,7 @@ def test_a_network_of_one_size_gets_images_of_this_size(tmp_path: Path) -> None:
     network = _load(tmp_path / "net", "unit")
     with pytest.raises(SettingError, match=r"found 512 × 512 .*, which .* Set image_size=\[rows"):
         import_network(network, tmp_path / "net.ckpt")
-    import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), level=9, base_level=0)
+    import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), levels=9, base_level=0)
     trained = load_trained(tmp_path / "net.ckpt")
     assert (trained.fixed_size, trained.image_size) == ((224, 224), (512, 512))
     images = torch.rand(1, 3, 224, 448)
