@@ -46,18 +46,6 @@ PRODUCT = (
 STILL_TO_DO = (  # folders and files that do not follow the rules yet
     "README.md",
     "docs",
-    "tangent_train/callbacks",
-    "tangent_train/cli",
-    "tangent_train/results",
-    "tangent_train/tasks",
-    "tangent_train/console.py",
-    "tangent_train/errors.py",
-    "tangent_train/files.py",
-    "tangent_train/imports.py",
-    "tangent_train/registry.py",
-    "tangent_train/setting_rules.py",
-    "tangent_train/threads.py",
-    "tests",
 )
 
 SECTION = re.compile(r"(Args|Attributes|Returns|Yields):\Z")
