@@ -248,7 +248,7 @@ class LabeledData(ABC, Generic[_Item]):
         return len(problems.without(items))
 
     def _find_all(self, problems: Problems) -> DatasetIndex[_Item]:
-        """Return the index of all items, checked as every data set is."""
+        """Return the index of all items; refuse invalid class names and an empty data set."""
         self.check_classes()
         index = self.find(problems)
         if not index.of() and not problems.items:

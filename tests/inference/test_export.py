@@ -35,7 +35,7 @@ def trained() -> TrainedNetwork:
 
 @pytest.fixture(scope="module")
 def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """It as files by suffix, not to be changed."""
+    """Its exported files by suffix; tests must not change them."""
     folder = tmp_path_factory.mktemp("exported")
     paths = {suffix: folder / f"net{suffix}" for suffix in SUFFIXES}
     for path in paths.values():
@@ -44,7 +44,7 @@ def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def _metadata(path: Path) -> Any:
-    """Read without this package's own code."""
+    """Run a file without code of this package."""
     if path.suffix == ".onnx":
         return json.loads(onnx.load(path).metadata_props[0].value)
     with safe_open(path, "numpy") as file:

@@ -221,7 +221,7 @@ def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
 
 
 def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
-    """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
+    """Depth is missing where 0 or NaN; 16-bit files in steps of 1/512 m give equal results."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
     panorama = sphere(32)
     steps = np.random.default_rng(0).integers(0, 2000, (32, 64), np.uint16)
