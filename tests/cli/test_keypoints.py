@@ -141,7 +141,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
         (["input={}", "pairing=every", "output=o"], "pairing: found every"),
         (["left={}", "right={}/a.png", "output=o"], "found 4; expected two panoramas"),
         (["input={}/a.png", "output=o"], "a.png: found 1; expected two panoramas or more"),
-        (["data=synthrooms", "output=o"], "found datamodules.SynthRooms; expected pairs:"),
+        (["data=synthrooms", "output=o"], "SynthRooms; expected a data set of pairs:"),
         (["margin=-1", "output=o"], "margin: found -1"),
     ],
 )
