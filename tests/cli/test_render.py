@@ -358,7 +358,7 @@ def test_settings_that_cannot_work(
     ("changes", "settings", "message"),
     [
         ({"face_003.png": None}, {}, r"found no face_003; expected one file for each"),
-        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*folder of their"),
+        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*cameras="),
         (
             {"face_003.png": (16, 16, 3)},
             {},

@@ -95,7 +95,7 @@ def _evaluation(content: dict[str, Any], path: Path, *typed: str) -> Callable[[P
 def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbidden: Path) -> None:
     """At every argument of every section, beside settings that the user types."""
     path, lighter = forbidden.parent / "x.ckpt", _light(content)
-    typed = ("data.fold=1", "trainer.max_epochs=1", "task.compile=null", "optimizer.lr=0.1")
+    typed = ("data.fold=1", "trainer.max_epochs=1", "task.compile=null")
     evaluated = _evaluation(lighter, path, *typed)
     at = list(places_of_arguments(content["config"]))
     assert ("data", "mask") in at
