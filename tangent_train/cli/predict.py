@@ -85,7 +85,7 @@ def predict(config: Mapping[str, Any]) -> None:
         done = _label(settings, decisive, inputs.part(shard), label, folder, part)
         part.save(done, done=True)
         count, entries = part.finished()
-        print_text(f"Shard {shard} is done: {count} of {shard.count} shards in all.")
+        print_text(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
             _finish(settings, inputs, label, folder, entries)

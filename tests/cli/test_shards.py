@@ -89,7 +89,7 @@ def test_an_interrupted_shard_resumes(run_shard: RunShard, monkeypatch: pytest.M
 
 @pytest.mark.parametrize("shard", ["17/16", "0/16", "1/2/3"])
 def test_there_is_no_such_shard(shard: str, run_shard: RunShard) -> None:
-    assert f"shard: found {shard}; expected 1/16 to 16/16" in run_shard("out", shard=shard)
+    assert f"shard: found {shard}; expected number/count, such" in run_shard("out", shard=shard)
     assert not Path("out").exists()
 
 

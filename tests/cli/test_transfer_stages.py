@@ -80,7 +80,7 @@ def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:
     assert tuned["trainer"]["max_epochs"] == 10
     assert (first["optimizer"]["lr"], first["trainer"]["max_epochs"]) == (3e-3, 20)
     assert first["scheduler"]["_target_"].endswith("OneCycleLR")
-    with pytest.raises(SettingError, match=r"fine_tuning\.optimizer\.lr: found null, a tenth"):
+    with pytest.raises(SettingError, match=r"fine_tuning\.optimizer\.lr: found null \(a tenth"):
         _stages(rooms, optimizer__lr=None)
 
 

@@ -83,6 +83,7 @@ def test_everything_known_of_a_network_comes_back(
         "image_size": [32, 32],
         "size_multiple": 4,
         "fixed_size": None,
+        "photo_level": None,
         "groups": None,
         "score_kind": "logits",
         "settings": UNET if suffix == ".safetensors" else None,
