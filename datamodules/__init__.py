@@ -54,6 +54,10 @@ def is_read(target: str) -> bool:
     return bool(file) and file.split(".")[1] not in _GENERATED
 
 
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
+
+
 def __getattr__(name: str) -> Any:
     # On demand: the processes that generate rooms need neither torch nor lightning.
     if name in _MODULES:

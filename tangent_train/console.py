@@ -1,4 +1,4 @@
-"""What commands print."""
+"""Print the messages of commands."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def print_text(text: str, *, error: bool = False) -> None:
     Control characters are escaped: names of files and classes are untrusted.
 
     Args:
-        text: Lines.
-        error: Print to standard error.
+        text: Lines to print.
+        error: True to print to standard error.
     """
     Console(stderr=error, soft_wrap=True, highlight=False).print(printable(text), markup=False)

@@ -7,9 +7,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from numbers import Integral
 
-_LONGEST = 400  # characters of what was found: a file may hold anything
+_LONGEST = 400
+"""Largest number of characters of the value found, which may come from a file."""
+
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
-"""Characters that terminals take for commands."""
+"""Characters that terminals interpret as commands."""
 
 
 def printable(text: str) -> str:
@@ -22,7 +24,7 @@ def printable(text: str) -> str:
 
 
 def counted(count: int, plural: str) -> str:
-    """A number of things in words; the plural ends in s.
+    """Return a number with its noun, whose plural ends in s.
 
     >>> counted(1, "panoramas"), counted(20, "photos")
     ('1 panorama', '20 photos')
@@ -31,15 +33,15 @@ def counted(count: int, plural: str) -> str:
 
 
 def first_line(error: object) -> str:
-    """The first line of an error's message: those of other libraries may be pages long."""
+    """Return the first line of an error's message: messages of other libraries may be long."""
     return str(error).strip().partition("\n")[0]
 
 
 def width_height(size: Sequence[float]) -> str:
-    """The size of an image as people read it.
+    """Return the size of an image as text.
 
     Args:
-        size: Rows and columns.
+        size: Rows and columns of the image.
 
     >>> width_height((1024, 2048))
     '2048 × 1024 (width × height)'
@@ -51,8 +53,8 @@ class _ExplainedError(ValueError):
     """An error with its subject, the value found, the values expected and the remedy.
 
     Args:
-        subject: The setting, file or folder; alone, the whole message (as when unpickled in
-            another process).
+        subject: Setting, file or folder. Without `found`, it is the whole message, e.g. when the
+            error is unpickled in another process.
         found: Value found.
         expected: Allowed values.
         remedy: Remedy, one sentence.
@@ -63,7 +65,7 @@ class _ExplainedError(ValueError):
     ) -> None:
         message = finding = str(subject)
         if found is not None:
-            # Of an OSError without its number and the path, which is the subject.
+            # For an OSError, only its reason: the path is the subject.
             shown = getattr(found, "strerror", None) or str(found)
             shown = shown if len(shown) <= _LONGEST else shown[:_LONGEST] + "…"
             finding = f"{shown}; expected {expected}"
@@ -85,10 +87,10 @@ class DataError(_ExplainedError):
 
 
 def at_least(name: str, value: object, least: int) -> int:
-    """A setting that has to be an integer of `least` or more, perhaps of NumPy.
+    """Return a setting that has to be an integer, also of NumPy, not less than `least`.
 
     Raises:
-        SettingError: It is something else.
+        SettingError: The value is not such an integer.
     """
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
         raise SettingError(name, found=value, expected=f"an integer of {least} or more")
@@ -97,15 +99,15 @@ def at_least(name: str, value: object, least: int) -> int:
 
 @contextmanager
 def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
-    """A block that imports packages of an extra of tangent-train.
+    """Explain a missing package in a block that imports packages of an extra of tangent-train.
 
     Args:
         extra: Name of the extra.
         subject: Setting or file that needs these packages.
-        remedy: Another remedy.
+        remedy: Further remedy.
 
     Raises:
-        SettingError: One is not installed.
+        SettingError: A package is not installed.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""Files: written atomically; those of torch, JSON and CSV."""
+"""Write files atomically; read and write files of torch, JSON and CSV."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ class NoRoomError(SettingError):
 
 
 def no_room(path: Path, error: BaseException) -> NoRoomError | None:
-    """Error with a remedy if a file did not fit on the disk.
+    """Return an error with a remedy if a file did not fit on the disk.
 
     Args:
-        path: The file.
-        error: The raised error.
+        path: File that was written.
+        error: Raised error.
 
     Returns:
-        None if it was raised for another reason.
+        Error with a remedy; None if `error` has another reason.
     """
     if not isinstance(error, OSError) or error.errno not in _FULL:
         return None
@@ -55,17 +55,17 @@ def no_room(path: Path, error: BaseException) -> NoRoomError | None:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path` that replaces it when the block succeeds.
+    """Yield a temporary path in the folder of `path`, which replaces it when the block succeeds.
 
-    The new file is on the disk before it takes the place of the old one, so that a power cut leaves
-    one of the two. A process that is killed leaves the temporary file behind, ``.partial-…``.
+    The new file is flushed to disk before it replaces the old one, so that a power cut leaves one
+    of the two. A process that is killed leaves the temporary file ``.partial-…``.
 
     Args:
-        path: The file to write; its folder is created. An existing file stays untouched until the
-            replacement is complete, and for good if the block raises.
+        path: File to write; its folder is created. An existing file is unchanged until it is
+            replaced, and if the block raises an error.
 
     Yields:
-        A path in the same folder with the same suffix, to be written by the block.
+        Path in the same folder with the same suffix, to be written by the block.
 
     Raises:
         NoRoomError: The disk is full.
@@ -100,11 +100,11 @@ def reserve(file: IO[bytes], size: int) -> None:
     allocate in advance.
 
     Args:
-        file: Open for reading and writing.
+        file: File, open for reading and writing.
         size: Final size of the file in bytes.
 
     Raises:
-        OSError: There is too little room.
+        OSError: There is not enough room.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(file.fileno(), 0, size)
@@ -112,7 +112,7 @@ def reserve(file: IO[bytes], size: int) -> None:
 
 def _sync(path: Path) -> None:
     """Flush a file, or the names in a folder, to the disk."""
-    if path.is_dir() and os.name == "nt":  # where folders cannot be opened
+    if path.is_dir() and os.name == "nt":  # folders cannot be opened there
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
     try:
@@ -128,13 +128,13 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 def write_text(path: Path, content: str) -> None:
-    """Write `content` to `path` atomically, UTF-8."""
-    # Names of files may contain bytes that are not text.
+    """Write `content` to `path` atomically, as UTF-8."""
+    # Names of files may contain bytes that are not UTF-8.
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
 def _refused(path: Path) -> OSError:
-    """The reason why a file cannot grow, which libraries do not report."""
+    """Return the error that keeps a file from growing, which libraries do not report."""
     try:
         with path.open("ab") as file:
             file.write(_PROBE)
@@ -145,17 +145,17 @@ def _refused(path: Path) -> OSError:
 
 
 def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = True) -> Any:
-    """Load a file of `torch.save` that holds tensors and plain values; nothing else is unpickled.
+    """Load tensors and plain values from a file of `torch.save`; nothing else is unpickled.
 
     Args:
-        path: The file.
-        expected: For the message.
-        mmap: Map the tensors into memory instead of reading them.
-        whole: Compare everything in the file with its checksums, which torch does not; this reads
-            all of it. Files of torch before version 1.6 have none.
+        path: File to load.
+        expected: Expected file, for the message.
+        mmap: True to map the tensors into memory instead of reading them.
+        whole: True to compare the whole file with its checksums, which torch does not do. Files of
+            torch before version 1.6 lack checksums.
 
     Raises:
-        DataError: It is missing, damaged, or holds other objects.
+        DataError: The file is missing, damaged, or contains other objects.
     """
     if not path.exists():
         raise DataError(path, found="no such file", expected=expected)
@@ -171,47 +171,47 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
     except Exception as error:
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
-            remedy = "Save its state_dict() alone: reading objects can run anything."
+            remedy = "Save only its state_dict(): reading objects can run arbitrary code."
         else:
-            found = "a damaged file, or none of torch.save"
+            found = "a damaged file, or not a file of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
     check_sum(path, damaged is None)
     return content
 
 
-def check_sum(path: Path, same: bool) -> None:
-    """Refuse a file whose content is another one than when it was written.
+def check_sum(path: Path, is_right: bool) -> None:
+    """Refuse a file whose content has changed since it was written.
 
     Args:
-        path: The file.
-        same: True if its checksum is right.
+        path: File, for the message.
+        is_right: True if the checksum is right.
 
     Raises:
-        DataError: It is not.
+        DataError: The checksum is wrong.
     """
-    if not same:
+    if not is_right:
         raise DataError(
             path,
             found="a damaged file, whose checksum is wrong",
             expected="the file as it was written",
-            remedy="Copy it again from where it was written.",
+            remedy="Copy the original file again.",
         )
 
 
 def crc32_of(parts: Iterable[bytes | memoryview]) -> str:
-    """CRC-32 of bytes, one after the other, as eight hexadecimal digits."""
+    """Return the CRC-32 of consecutive bytes as eight hexadecimal digits."""
     return f"{reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0):08x}"
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads`, with a `ValueError` for text that is nested too deeply or names a value twice.
+    """Parse JSON; refuse text that is nested too deeply, or repeats a name in a mapping.
 
     Args:
-        text: UTF-8, UTF-16 or UTF-32 where it is bytes.
+        text: Text, or its bytes in UTF-8, UTF-16 or UTF-32.
 
     Raises:
-        ValueError: The text is not JSON.
+        ValueError: The text is not JSON, or is refused.
     """
     try:
         return json.loads(text, object_pairs_hook=_unique)
@@ -220,24 +220,24 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A mapping that has every name once: readers differ in which of two values they take."""
+    """Build a mapping; refuse repeated names, of which programs read different values."""
     content = dict(pairs)
     if len(content) < len(pairs):
         ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
-        raise ValueError(f"{name!r} is there twice")
+        raise ValueError(f"{name!r} is repeated")
     return content
 
 
 def read_json(path: Path, expected: str, remedy: str = "") -> Any:
-    """The content of a JSON file.
+    """Read a JSON file.
 
     Args:
-        path: The file.
-        expected: For the message.
-        remedy: For the message.
+        path: File to read.
+        expected: Expected file, for the message.
+        remedy: Remedy, for the message.
 
     Raises:
-        DataError: It cannot be read, or is no JSON.
+        DataError: The file cannot be read, or is not JSON.
     """
     try:
         return parse_json(path.read_bytes())
@@ -250,14 +250,15 @@ _FORMULA = ("=", "+", "-", "@", "\t", "\r")
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence[Any]]) -> str:
-    r"""A table as CSV, its header first.
+    r"""Return a table as CSV, with a header.
 
-    Text that a spreadsheet would take for a formula is prefixed with ``'``: names of classes and
+    Text that a spreadsheet would evaluate as a formula is prefixed with ``'``: names of classes and
     files are untrusted.
 
     Args:
         columns: Names of the columns.
-        rows: Values in that order, or by column; None, or a missing one, is an empty cell.
+        rows: Values in the order of the columns, or by name; a missing value or None is an empty
+            cell.
 
     >>> csv_text(["class", "iou"], [{"class": "=1+1", "iou": -0.5}])
     "class,iou\n'=1+1,-0.5\n"

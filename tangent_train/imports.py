@@ -1,10 +1,10 @@
-"""Imports and calls of other libraries: without local files, downloads and output."""
+"""Import and call other libraries without local files, downloads and output."""
 
 from __future__ import annotations
 
 import io
 import logging
-import multiprocessing  # noqa: F401 - notes the working directory, where its processes start
+import multiprocessing  # noqa: F401 - stores the working directory, where its processes start
 import os
 import sys
 import warnings
@@ -17,37 +17,37 @@ from typing import Any
 
 
 def import_own_packages() -> None:
-    """Import our ``models`` and ``datamodules``, whatever else on the path is called so.
+    """Import ``models`` and ``datamodules`` of this package, not modules with these names.
 
     Raises:
-        ImportError: Another module of this name is imported already.
+        ImportError: Another module with such a name has been imported.
     """
     root = str(Path(__file__).parents[1])
     for name in ("datamodules", "models"):
         other = None if name in sys.modules else find_spec(name)
         sys.path.insert(0, root)
-        own = import_module(name)
+        package = import_module(name)
         sys.path.remove(root)
-        if own.__file__ != str(Path(root, name, "__init__.py")):
+        if package.__file__ != str(Path(root, name, "__init__.py")):
             raise ImportError(
-                f"{own.__file__} is imported, but tangent-train has a package of this name. "
+                f"{package.__file__} is imported, but tangent-train has a package of this name. "
                 "Import tangent_train first, or rename the other one."
             )
-        if other is not None and other.origin != own.__file__:
+        if other is not None and other.origin != package.__file__:
             sys.stderr.write(
-                f"{other.origin} is not used: tangent-train has a package of this name. Rename its "
-                "folder to use what is in it in a config.\n"
+                f"{other.origin} is not used: tangent-train has a package of this name. Rename it "
+                "to use its classes in a config.\n"
             )
 
 
 @contextmanager
 def elsewhere() -> Iterator[None]:
-    """A block with imports, for which the working directory is that of this package.
+    """Change the working directory to that of this package, for a block with imports.
 
-    Torch loads ``libcuda.so.1``, numba reads ``.numba_config.yaml`` and matplotlib ``matplotlibrc``
-    from the working directory while they are imported. A folder of other people's files may hold
-    any of these. OpenCV adds an empty entry to ``LD_LIBRARY_PATH``, with which further processes
-    would look for all their libraries there.
+    While they are imported, torch loads ``libcuda.so.1``, numba reads ``.numba_config.yaml`` and
+    matplotlib reads ``matplotlibrc`` from the working directory, which may contain untrusted files.
+    OpenCV adds an empty entry to ``LD_LIBRARY_PATH``, with which further processes would load
+    libraries from there; it is removed.
     """
     with chdir(Path(__file__).parent):
         try:
@@ -60,18 +60,18 @@ def elsewhere() -> Iterator[None]:
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Keep huggingface_hub, and all libraries that fetch through it, off the network in a block.
+    """Keep huggingface_hub, and libraries that download with it, off the network in a block.
 
-    What the block would fetch is an error of these libraries, unless it is in their local cache.
+    A download is an error of these libraries, unless the file is in their local cache.
     """
     try:
         from huggingface_hub import constants
-    except ImportError:  # nor is any library that fetches through it
+    except ImportError:  # no library downloads with it either
         yield
         return
     hub: Any = constants
     before = hub.HF_HUB_OFFLINE
-    hub.HF_HUB_OFFLINE = True  # the value of the environment variable, which is read at import
+    hub.HF_HUB_OFFLINE = True  # the environment variable is read only at import
     try:
         yield
     finally:
@@ -80,7 +80,7 @@ def offline() -> Iterator[None]:
 
 @contextmanager
 def hide_output() -> Iterator[None]:
-    """Hide log records, warnings and printed lines of a library whose results are verified."""
+    """Hide log records, warnings and printed lines in a block whose results are verified."""
     disabled = logging.root.manager.disable
     logging.disable()
     try:
@@ -93,10 +93,10 @@ def hide_output() -> Iterator[None]:
 
 
 def is_private(folder: Path) -> bool:
-    """True if a folder belongs to this user, and other users have no access to it.
+    """Return True if a folder belongs to this user, and other users have no access to it.
 
     Args:
-        folder: Existing folder. Windows keeps other users out of the folders of a user.
+        folder: Existing folder. On Windows, folders of a user are private.
     """
-    found = folder.stat()
-    return os.name == "nt" or (found.st_uid == os.geteuid() and not found.st_mode & 0o077)
+    status = folder.stat()
+    return os.name == "nt" or (status.st_uid == os.geteuid() and not status.st_mode & 0o077)

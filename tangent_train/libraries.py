@@ -1,7 +1,7 @@
-"""Callables of other libraries that settings in files may name, and their arguments.
+"""Classes and functions of other libraries that settings in files may name, and their arguments.
 
-Arguments are numbers, strings and lists of these; arguments that would read, fetch or run something
-(weights, URLs, files, plugins) are excluded.
+Arguments are numbers, strings and lists of these; arguments that would read, download or run
+something (weights, URLs, files, plugins) are excluded.
 """
 
 from __future__ import annotations
@@ -25,48 +25,48 @@ _BY_SIGNATURE = {
     "segmentation_models_pytorch": "DPT DeepLabV3 DeepLabV3Plus FPN Linknet MAnet PAN PSPNet "
     "Segformer UPerNet Unet UnetPlusPlus",
 }
-"""Classes all of whose named arguments may be given, except of this machine and weights."""
+"""Classes whose named arguments are allowed, except for weights and settings of this machine."""
 
 _NETWORKS = (
     "aux_logits aux_loss drop_path_rate drop_rate dropout dynamic_img_size features_only "
     "global_pool image_size img_size in_chans init_weights model_name num_classes out_indices "
     "patch_size stochastic_depth_prob transform_input width_mult"
 )
-"""Arguments of torchvision's makers of networks, and of timm's, which take files besides."""
+"""Allowed arguments of torchvision's and timm's functions that build networks."""
 
 
 def find(module: str, name: str) -> tuple[Any, dict[str, Any]] | None:
-    """Return a class or function with the kinds of its arguments in a file.
+    """Find a class or function, with the kinds of its arguments in a file.
 
     See `registry.build_from_config`.
 
     Args:
-        module: Its full name.
+        module: Full name of the module.
         name: Name in the module.
 
     Returns:
-        None where files may not name it.
+        Class or function, and kinds by argument; None if files may not name it.
 
     Raises:
-        SettingError: Its package is not installed.
+        SettingError: The package is not installed.
     """
-    simple = name in _BY_SIGNATURE.get(module, "").split()
-    timm = (module, name) == ("timm", "create_model")
-    if not (simple or timm or _is_of_torchvision(module, name)):
+    is_listed = name in _BY_SIGNATURE.get(module, "").split()
+    is_timm = (module, name) == ("timm", "create_model")
+    if not (is_listed or is_timm or _is_torchvision_network(module, name)):
         return None
-    made = import_named(f"{module}.{name}", "network")
-    parameters = inspect.signature(made).parameters.values()
+    target = import_named(f"{module}.{name}", "network")
+    parameters = inspect.signature(target).parameters.values()
     named = [p.name for p in parameters if p.kind is not p.VAR_KEYWORD]
-    kinds = dict.fromkeys(named if simple else _NETWORKS.split(), _SIMPLE)
+    kinds = dict.fromkeys(named if is_listed else _NETWORKS.split(), _SIMPLE)
     weights = [n for n in named if "weights" in n or n == "pretrained"]
     local = [n for n in named if module == "lightning" and not from_file(f"trainer.{n}")]
-    return made, kinds | dict.fromkeys(local, NoneType) | dict.fromkeys(weights, Weights)
+    return target, kinds | dict.fromkeys(local, NoneType) | dict.fromkeys(weights, Weights)
 
 
-def _is_of_torchvision(module: str, name: str) -> bool:
+def _is_torchvision_network(module: str, name: str) -> bool:
     if module not in ("torchvision.models", "torchvision.models.segmentation"):
         return False
     from torchvision.models import get_model_builder, list_models
 
-    made = getattr(import_module(module), name, None)
-    return name in list_models() and get_model_builder(name) is made
+    builder = getattr(import_module(module), name, None)
+    return name in list_models() and get_model_builder(name) is builder

@@ -1,12 +1,12 @@
-"""Building objects from settings, and the registry of those that files may name.
+"""Build objects from settings; register the classes and functions that files may name.
 
-``_target_`` of a config section names the object to build. Config folders and the command line are
-the user's own: Hydra builds their sections, and they may name any class or function. Files are
-untrusted plain data: they may name registered classes and give their arguments, as far as the
-argument types allow, and are never interpreted: no interpolations, no positional arguments, no
-paths, no URLs. `build_from_config` is the only code that builds objects from settings.
+``_target_`` of a config section names the class or function. Config folders and the command line
+belong to the user: Hydra builds their sections, and they may name any class. Files are untrusted
+plain data: they may name registered classes, with arguments that the annotations allow, and are not
+interpreted: no interpolations, positional arguments, paths or URLs. `build_from_config` is the only
+code that builds objects from settings.
 
-This module imports nothing heavy: networks and data sets import it.
+This module imports nothing heavy, because networks and data sets import it.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.imports import offline
 
 _HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
-"""Packages whose public names files may give, where they are registered."""
+"""Packages whose registered public names may be in files."""
 
 _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]{0,99})?", re.ASCII)
-"""A text among the arguments in a file: no path, no address, nothing to interpret."""
+"""Text that is allowed as an argument in a file: not a path, address or code."""
 
 _DEEPEST = 12
 _PLAIN = (bool, int, float, str, NoneType)
@@ -43,49 +43,49 @@ _HYDRA = {
     "_partial_": None,
     "_recursive_": bool,
 }
-"""Names in a section that are not arguments, with the kinds of value that any file may give."""
+"""Names in a section that are not arguments, with the kinds of value that are allowed in files."""
 
 _CALLED_LATER = ("mixer", "optimizer", "scheduler")
-"""Sections of a file that may be ``_partial_``: functions that still take an argument."""
+"""Sections of a file that may be ``_partial_``: functions that take further arguments later."""
 
 
 class Text:
-    """A kind of value: text that is only displayed, such as class names."""
+    """Kind of value: text that is only displayed, such as class names."""
 
 
 class Weights:
-    """A kind of argument: names pretrained weights; null for a file, whose own tensors are used."""
+    """Kind of argument: pretrained weights; null in a file, which contains the tensors."""
 
 
 class _Object:
-    """A kind of argument: an object, made from a section of its own."""
+    """Kind of argument: an object, built from an inner section."""
 
 
 _registered: set[Any] = set()
 _Registered = TypeVar("_Registered", bound=Callable[..., Any])
 
 
-def registered(made: _Registered) -> _Registered:
-    """Let settings in files name a class or function.
+def registered(target: _Registered) -> _Registered:
+    """Allow a class or function in settings from files.
 
-    They may give its arguments by name, as the annotations say: numbers, words (`Literal` or
-    ``str``), sequences and mappings of these, and other registered objects. A `Path` is not taken
-    from files, nor is an argument that may be `Any`.
+    Files may contain its named arguments as far as the annotations allow: numbers, words (`Literal`
+    or ``str``), sequences and mappings of these, and other registered objects. Arguments annotated
+    as `Path` or `Any` are not taken from files.
     """
-    _registered.add(made)
-    return made
+    _registered.add(target)
+    return target
 
 
 @dataclass(frozen=True)
 class SettingsFile:
-    """The file that settings come from, with settings and names that the user typed.
+    """The file that settings come from, with exceptions that the user typed.
 
     Attributes:
-        path: The file, for messages.
-        trust: Full names of classes and functions that it may name besides the registered ones;
-            their arguments may be any plain values.
-        user_settings: Settings (``data.fold``) of the user; with all below them, they do not come
-            from the file.
+        path: File, for messages.
+        trust: Full names of classes and functions that the file may name besides the registered
+            ones; their arguments may be any plain values.
+        user_settings: Settings (``data.fold``) that, with all settings below them, come from the
+            user instead of the file.
     """
 
     path: Path
@@ -93,12 +93,12 @@ class SettingsFile:
     user_settings: Collection[str] = ()
 
     def gave(self, place: str) -> bool:
-        """True if the value at a place comes from the file, False if it is the user's."""
+        """Return True if the value of a setting comes from the file, False if from the user."""
         return not any(f"{place}.".startswith(f"{name}.") for name in self.user_settings)
 
     def refused(self, place: str, value: Any, expected: str) -> DataError:
         """Return the error for an invalid value of the file."""
-        remedy = f"On the command line {place}=… may be anything."
+        remedy = f"To use it, type {place}=…."
         return DataError(self.path, found=f"{place}={value!r}", expected=expected, remedy=remedy)
 
 
@@ -107,21 +107,21 @@ def build_from_config(
 ) -> Any:
     """Build the object that a section of a config describes.
 
-    The user's own sections are built by `hydra.utils.instantiate` with all of its conventions, and
+    The user's sections are built by `hydra.utils.instantiate` with all of its conventions, and
     ``_convert_: all`` as the default. A section that comes from a file, even in part, is built here
-    and never interpreted.
+    without interpretation.
 
     Args:
-        settings: ``_target_``, and its arguments by name, which may be such sections themselves.
+        settings: Section with ``_target_`` and its arguments by name, which may be sections too.
             ``_partial_: true`` returns a function that takes further arguments.
-        place: Place of the section, for messages.
-        file: File of the settings; None for the user's own, which may name anything.
-        **given: Further arguments, handed on as they are.
+        place: Name of the section, e.g. ``data``, for messages.
+        file: File of the settings; None for the user's settings, which may name any class.
+        **given: Further arguments, passed on unchanged.
 
     Raises:
         SettingError: The class or function cannot be imported, gets text for a number, or does not
-            take its arguments; other errors of a user's own class are raised as they are.
-        DataError: The file gives forbidden or invalid settings.
+            take its arguments. Other errors of user-defined classes are raised unchanged.
+        DataError: The file contains forbidden or invalid settings.
     """
     maker, kinds = _resolve(settings, place, file)
     weights = [name for name, kind in kinds.items() if kind is Weights and file is not None]
@@ -149,20 +149,20 @@ def build_from_config(
 
 
 def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, Any]) -> Any:
-    """Build a section of the user's own config as Hydra does."""
+    """Build a section of the user's config as Hydra does."""
     from hydra.utils import instantiate
 
     check_arguments(section, place)
-    # References of the config are resolved already; Hydra would resolve what they gave twice.
-    whole = {"_convert_": "all", **section, "_partial_": True}
-    whole = without_interpolation(without_interpolation(whole))
+    # References of the config have been resolved; Hydra would resolve their values again.
+    plain = {"_convert_": "all", **section, "_partial_": True}
+    plain = without_interpolation(without_interpolation(plain))
     try:
-        make = instantiate(whole)
+        make = instantiate(plain)
     except Exception as error:
         inside = re.search(r"^full_key: (\S+)$", str(error), re.MULTILINE)
         name = f"{place}.{inside[1]}" if inside else place
         places = {re.sub(r"\.(?=\d)", "", at): at for _, at in _sections(section, place)}
-        at = places.get(re.sub(r"[][]", "", name), place)  # of items, Hydra writes x[0] or x0
+        at = places.get(re.sub(r"[][]", "", name), place)  # Hydra writes items as x[0] or x0
         sections = {at: inner for inner, at in _sections(section, place)}
         _refuse(error.__cause__ or error, sections[at], at, None)
     make = partial(make.func, *make.args, **make.keywords | given)
@@ -170,11 +170,11 @@ def _instantiated(section: Mapping[str, Any], place: str, given: Mapping[str, An
 
 
 def check_arguments(section: Any, place: str) -> None:
-    """Refuse arguments that the classes in a section of the user's own config do not take.
+    """Refuse arguments that the classes in a section of the user's config do not take.
 
     Args:
-        section: The section, or None.
-        place: Place of the section, for messages.
+        section: Section to check, or None.
+        place: Name of the section, for messages.
 
     Raises:
         SettingError: A class cannot be imported, or gets an unknown argument or text for a number.
@@ -188,7 +188,7 @@ def check_arguments(section: Any, place: str) -> None:
 
 
 def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]:
-    """A section and the sections in it that Hydra builds, with their places."""
+    """Yield a section and the sections inside it that Hydra builds, with their names."""
     if isinstance(value, Mapping) and "_target_" in value:
         yield value, place
     inner: Iterable[tuple[Any, Any]] = enumerate(value) if isinstance(value, list) else ()
@@ -201,28 +201,28 @@ def _sections(value: Any, place: str) -> Iterator[tuple[Mapping[str, Any], str]]
 def _refuse(
     error: BaseException, section: Mapping[str, Any], place: str, source: SettingsFile | None
 ) -> NoReturn:
-    """Raise an error of building an object: in one line, unless a user's own class raised it.
+    """Raise an error of building an object, in one line unless a user-defined class raised it.
 
-    A class that hands its arguments on to another one may raise an error about a setting.
+    A class that passes its arguments on to another one may raise an error about a setting.
     """
     if isinstance(error, DataError | SettingError):
         raise error
     name = section["_target_"]
-    foreign = _find(name) is None and not name.startswith("lightning.")
-    of_hydra = type(error).__module__.startswith(("hydra.", "omegaconf."))
+    is_foreign = _find(name) is None and not name.startswith("lightning.")
+    is_of_hydra = type(error).__module__.startswith(("hydra.", "omegaconf."))
     unknown = re.search(r"unexpected keyword argument '(\w+)'$", str(error))
-    of_setting = of_hydra or (unknown is not None and unknown[1] in section)
-    if source is None and not of_setting and (foreign or isinstance(error, OSError)):
+    is_of_setting = is_of_hydra or (unknown is not None and unknown[1] in section)
+    if source is None and not is_of_setting and (is_foreign or isinstance(error, OSError)):
         raise error
     reason = f"{type(error).__name__}: {str(error).partition(chr(10))[0]}"
-    found, expected = f"{name} cannot be made ({reason})", "settings that it takes"
+    found, expected = f"{name} cannot be made ({reason})", "settings that it accepts"
     if source is not None:
         raise DataError(source.path, found=f"{place}: {found}", expected=expected) from error
     raise SettingError(place, found=found, expected=expected) from error
 
 
 def without_interpolation(value: Any) -> Any:
-    """Plain values that OmegaConf reads as they are."""
+    """Escape plain values so that OmegaConf reads them literally."""
     if isinstance(value, Mapping):
         return {name: without_interpolation(inner) for name, inner in value.items()}
     if isinstance(value, list | tuple):
@@ -231,7 +231,7 @@ def without_interpolation(value: Any) -> Any:
 
 
 def named_arguments(settings: Any) -> Any:
-    """Settings with positional arguments (``_args_``) by name, which files have to give."""
+    """Return settings with named instead of positional arguments (``_args_``), as files need."""
     if isinstance(settings, list):
         return [named_arguments(value) for value in settings]
     if not isinstance(settings, Mapping):
@@ -248,7 +248,7 @@ def named_arguments(settings: Any) -> Any:
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """A sentence with the known name that is nearest to a misspelt one; "" without one.
+    """Return a question with the known name most similar to a misspelled one, or "".
 
     >>> nearest("levl", ["seed", "level"])
     'Is level meant? '
@@ -260,10 +260,10 @@ def nearest(name: str, known: Iterable[str]) -> str:
 def _check_taken(
     maker: Any, target: str, arguments: Collection[str], place: str, file: SettingsFile | None
 ) -> None:
-    """Refuse arguments that a class or function does not have, such as those of another one."""
+    """Refuse arguments that a class or function does not have, e.g. those of another one."""
     try:
         known = inspect.signature(maker).parameters
-    except (TypeError, ValueError):  # it is not written in Python
+    except (TypeError, ValueError):  # not written in Python
         return
     unknown = [name for name in arguments if name not in known]
     if not unknown or any(one.kind is one.VAR_KEYWORD for one in known.values()):
@@ -272,14 +272,21 @@ def _check_taken(
     found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"
     if file is not None and file.gave(name):
         raise DataError(file.path, found=f"{place}: {found}", expected=expected)
-    raise SettingError(
-        place,
-        found=found,
-        expected=expected,
-        remedy=f"{nearest(unknown[0], known)}Remove it with ~{name}, or choose an option of "
-        f"{place}=. Experiments have settings of their own data set; recipe=small is for any "
-        "panoramas.",
-    )
+    remedy = "Remove it."
+    if not _is_typed(name):
+        remedy = f"Remove it with ~{name}, or choose an option of {place}=."
+        if place == "data":
+            remedy += " An experiment is for its data set; recipe=small is for other panoramas."
+    remedy = nearest(unknown[0], known) + remedy
+    raise SettingError(place, found=found, expected=expected, remedy=remedy)
+
+
+def _is_typed(name: str) -> bool:
+    """Return True if the user added a setting on the command line."""
+    from hydra.core.hydra_config import HydraConfig
+
+    overrides = HydraConfig.get().overrides.task if HydraConfig.initialized() else ()
+    return any(text.lstrip("+").startswith(f"{name}=") for text in overrides)
 
 
 def resolve_target(settings: Any, place: str, file: SettingsFile | None = None) -> Any:
@@ -291,12 +298,12 @@ def import_named(target: Any, place: str) -> Any:
     """Import an object by its full name.
 
     Raises:
-        SettingError: It cannot be imported.
+        SettingError: The object cannot be imported.
     """
     try:
         return resolve_name(str(target))
     except (ImportError, AttributeError, ValueError) as error:
-        remedy = "Install its package, or add the folder it is in to PYTHONPATH."
+        remedy = "Install its package, or add its folder to PYTHONPATH."
         if str(target).partition(".")[0] in sys.modules:
             remedy = "Correct the name."
         raise SettingError(
@@ -308,17 +315,17 @@ def import_named(target: Any, place: str) -> Any:
 
 
 def unregistered(settings: Any) -> tuple[str, ...]:
-    """Return the names in a section, and in sections inside it, that a file may not use.
+    """Return the classes in a section, and in sections inside it, that files may not name.
 
     Args:
-        settings: The section, whose names are known to be right.
+        settings: Section, whose classes exist.
     """
     if not isinstance(settings, Mapping):
         return ()
     target = settings.get("_target_")
-    own = (target,) if target is not None and _find(target) is None else ()
-    inner = [name for value in settings.values() for name in unregistered(value)]
-    return tuple(dict.fromkeys((*own, *inner)))
+    names = [target] if target is not None and _find(target) is None else []
+    names += [name for value in settings.values() for name in unregistered(value)]
+    return tuple(dict.fromkeys(names))
 
 
 def check_fields(
@@ -327,17 +334,17 @@ def check_fields(
     """Return the fields of a mapping in a file, each of its kind.
 
     Args:
-        path: The file, for the message.
-        content: The mapping.
-        kinds: Kind of every field; of a field that may be missing, a union with None.
-        expected: Expected file.
+        path: File, for the message.
+        content: Content of the file.
+        kinds: Kind of each field; a union with None if the field may be missing.
+        expected: Expected file, for the message.
         where: Place in the file, for the message.
 
     Returns:
-        These fields; None where they are missing.
+        Values of the fields; None for missing ones.
 
     Raises:
-        DataError: It is not a mapping, or a field is missing or of another kind.
+        DataError: The content is not a mapping, or a field is missing or of another kind.
     """
     inside = f"in {where}" if where else "inside"
     if not isinstance(content, Mapping):
@@ -352,14 +359,14 @@ def check_fields(
 
 
 def check_plain(path: Path, value: Any, place: str, depth: int = 0) -> Any:
-    """Plain values of a file: numbers, texts, lists and mappings of these.
+    """Return the plain values of a file: numbers, texts, lists and mappings of these.
 
-    Names in mappings are texts without a dot: ``a.b`` is always the value ``b`` in the mapping
-    ``a``, so that a place in a file has one name, and a name one place.
+    Names in mappings are texts without a dot, so that ``a.b`` is always the value ``b`` in the
+    mapping ``a``.
 
     Args:
-        path: The file, for the message.
-        value: The values.
+        path: File, for the message.
+        value: Values to check.
         place: Place of the values in the file, for the message.
         depth: Number of mappings and lists around the values.
 
@@ -400,14 +407,14 @@ def _resolve(settings: Any, place: str, file: SettingsFile | None) -> tuple[Any,
         file.path,
         found=f"{place}._target_={target}, which would be called",
         expected="networks, data and tasks that are registered here",
-        remedy=f"If you know it, and trust who made the file: trust={target}",
+        remedy=f"If you know this class, and trust the author of the file: trust={target}",
     )
 
 
 def _argument(
     value: Any, place: str, file: SettingsFile, kind: Any, kinds: Collection[str] = ()
 ) -> Any:
-    """A value from settings that a file gave at least in part, with the objects in it built."""
+    """Check a value from settings that come from a file at least in part, and build its objects."""
     if file.gave(place):
         _check_argument(value, place, file, kind, kinds)
     else:
@@ -425,51 +432,51 @@ def _check_argument(
     value: Any, place: str, file: SettingsFile, kind: Any, kinds: Collection[str]
 ) -> None:
     section, _, name = place.rpartition(".")
-    if name in ("_convert_", "_recursive_"):  # values are plain, and sections are built, anyway
+    if name in ("_convert_", "_recursive_"):  # without effect here
         kind = _HYDRA[name]
     if name == "_partial_" and section.rpartition(".")[2] in _CALLED_LATER:
         kind = bool
     if kind is None:
         raise file.refused(place, value, f"one of its settings ({', '.join(kinds)})")
     if kind is _Object and isinstance(value, Mapping) and "_target_" in value:
-        return  # `build_from_config` looks at it
+        return  # `build_from_config` checks it
     if value is not None and kind is not Any and not _fits(value, kind):
         raise file.refused(place, value, f"{inspect.formatannotation(kind)} in a file")
 
 
 def _check_whole(value: Any, place: str, kind: Any) -> None:
-    """Refuse text for a whole number or boolean, perhaps optional."""
-    whole = set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
-    if whole and isinstance(value, str):
+    """Refuse text for a whole number or boolean, also for an optional one."""
+    is_whole = set() < set(get_args(kind) or (kind,)) - {NoneType} <= {bool, int}
+    if is_whole and isinstance(value, str):
         raise SettingError(place, found=value, expected=inspect.formatannotation(kind))
 
 
 def _find(target: str) -> tuple[Any, Mapping[str, Any]] | None:
-    """A callable that every file may name, with the kinds of its arguments."""
+    """Return a class or function that all files may name, with the kinds of its arguments."""
     module, _, name = target.rpartition(".")
     if module in _HOMES:
         home = import_module(module)
-        made = getattr(home, name) if name in home.__all__ else None
-        return (made, _kinds(made)) if made in _registered else None
+        named = getattr(home, name) if name in home.__all__ else None
+        return (named, _kinds(named)) if named in _registered else None
     from tangent_train import libraries
 
     return libraries.find(module, name)
 
 
-def _kinds(made: Any) -> dict[str, Any]:
-    """By the name of an argument what a file may give for it; also those handed on to bases."""
-    if is_dataclass(made):  # each field by the names of the module that declares it
-        hints = get_type_hints(made)
-        return {one.name: _kind(hints[one.name]) for one in fields(made) if one.init}
+def _kinds(target: Any) -> dict[str, Any]:
+    """Return the kind of value that a file may contain for each argument, also for base classes."""
+    if is_dataclass(target):  # annotations are resolved in the module that declares a field
+        hints = get_type_hints(target)
+        return {one.name: _kind(hints[one.name]) for one in fields(target) if one.init}
     kinds: dict[str, Any] = {}
-    for base in inspect.getmro(made) if inspect.isclass(made) else (made,):
+    for base in inspect.getmro(target) if inspect.isclass(target) else (target,):
         function = vars(base).get("__init__") if inspect.isclass(base) else base
         if function is None:
             continue
         hints = get_type_hints(function)
         arguments = inspect.signature(function).parameters.values()
-        of_base = {a.name: _kind(hints[a.name]) for a in arguments if a.name in hints}
-        kinds = {**{n: k for n, k in of_base.items() if n != "settings"}, **kinds}
+        inherited = {a.name: _kind(hints[a.name]) for a in arguments if a.name in hints}
+        kinds = {**{n: k for n, k in inherited.items() if n != "settings"}, **kinds}
         if not any(a.kind is a.VAR_KEYWORD for a in arguments):
             break
     return kinds
@@ -479,7 +486,7 @@ def _kind(hint: Any) -> Any:
     members = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     if any(m in (Any, object) or Any in get_args(m) for m in members):
         return NoneType
-    if Path in members:  # text would be one
+    if Path in members:  # text would be a path
         members = tuple(m for m in members if m not in (Path, str)) or (NoneType,)
     plain = [member for member in members if _is_plain(member)]
     return Union[tuple(plain)] if set(plain) - {NoneType} else _Object  # noqa: UP007 - of a list
@@ -493,17 +500,17 @@ def _is_plain(hint: Any) -> bool:
 
 
 def is_text(value: Any) -> bool:
-    """True for text of one line without control characters, such as a class name: a `Text`."""
+    """Return True for one line of text without control characters, such as a class name."""
     return isinstance(value, str) and "\n" not in value and printable(value) == value
 
 
 def is_class_name(value: Any) -> bool:
-    """True for a `Text` that can be written as UTF-8; names of files may hold other bytes."""
+    """Return True for a `Text` that can be written as UTF-8; names of files may not."""
     return is_text(value) and not any("\ud800" <= letter <= "\udfff" for letter in value)
 
 
 def _fits(value: Any, kind: Any) -> bool:
-    """Return True for a value of a kind: a type of plain values, or `Text`."""
+    """Return True if a value is of a kind: a type of plain values, or `Text`."""
     origin, arguments = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
         return any(_fits(value, one) for one in arguments)

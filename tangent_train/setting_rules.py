@@ -1,7 +1,7 @@
-"""One table of what each setting may do: when a run is resumed, reported, shared, or read.
+"""Rules for settings that may differ when a run is resumed, reported, or shared in a transfer.
 
-The rule of a setting is that of its longest prefix in the table: ``trainer.precision`` has its own,
-all other settings below ``trainer`` that of ``trainer``.
+The rule of a setting is that of its longest prefix in the table: ``trainer.precision`` has a rule,
+and settings below ``trainer`` that are not listed have the rule of ``trainer``.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Literal
 
 Purpose = Literal["resume", "report", "transfer", "evaluation"]
-"""A run and itself when it is resumed; runs of one group of a report (folds and seeds); a stage of
-a transfer and one that can stand in for it, if it trains, and if it only evaluates a network."""
+"""Relation of two runs: a resumed run and its beginning; runs of one group in a report (folds and
+seeds); the same stage of a transfer before and now, if it trains, and if it only evaluates."""
 
 _ALWAYS = "resume report transfer evaluation"
 _RULES = (
-    # Where files are, how a run is watched, how fast it is: no result depends on these.
+    # Paths, logging and speed: results do not depend on these.
     (
         _ALWAYS,
         "checkpoint checkpoint_every_n_steps choices logger panels resume trust validation_images",
@@ -25,16 +25,16 @@ _RULES = (
     (_ALWAYS, "trainer.accelerator trainer.enable_model_summary trainer.enable_progress_bar"),
     (_ALWAYS, "trainer.log_every_n_steps trainer.num_sanity_val_steps trainer.strategy"),
     ("resume transfer evaluation", "init_from name"),
-    # What the runs of a group are the mean over.
+    # Reports compute means over these.
     ("report", "data.fold data.seed seed"),
-    # Of the evaluation: it comes after the training that is resumed.
+    # Settings of the evaluation, which follows the resumed training.
     ("resume", "data.test_rotation task.absent_class"),
     ("resume", "representation.blend representation.levels representation.rotations"),
-    # Of the training: an evaluation does not depend on it.
+    # Settings of the training: an evaluation does not depend on these.
     ("evaluation", "callbacks optimizer scheduler task.backbone_lr_factor"),
     ("resume evaluation", "task.images_per_chunk trainer.devices trainer.num_nodes"),
     ("resume evaluation", "trainer.max_epochs trainer.max_steps"),
-    # A resumed run may go on for longer, or elsewhere, but takes the same steps.
+    # A resumed run may be longer, or run on other devices, but takes the same steps.
     ("resume", "trainer"),
     ("", "trainer.accumulate_grad_batches trainer.limit_train_batches trainer.overfit_batches"),
     ("", "trainer.gradient_clip_algorithm trainer.gradient_clip_val"),
@@ -42,7 +42,7 @@ _RULES = (
 )
 _MAY_DIFFER = {name: purposes.split() for purposes, names in _RULES for name in names.split()}
 
-_OF_THE_TRAINER = (
+_TRAINER_SETTINGS = (
     "accelerator barebones callbacks default_root_dir devices enable_autolog_hparams fast_dev_run "
     "inference_mode limit_predict_batches limit_test_batches logger max_time model_registry "
     "num_nodes plugins profiler strategy"
@@ -50,12 +50,12 @@ _OF_THE_TRAINER = (
 OF_THIS_MACHINE = (
     *("callbacks", "logger"),
     *("data.label_table", "data.root", "data.store", "task.compile"),
-    *(f"trainer.{name}" for name in _OF_THE_TRAINER.split()),
+    *(f"trainer.{name}" for name in _TRAINER_SETTINGS.split()),
 )
-"""Paths, processes, sockets, and what is looked at: never taken from a file."""
+"""Settings of this machine (paths, processes, logging), which are not taken from a file."""
 
 _OR_PATHS = ("data.mask",)
-"""Settings whose text is a path: numbers are taken from a file."""
+"""Settings whose value may be a path, which is not taken from a file; numbers are."""
 
 
 def may_differ(name: str, purpose: Purpose) -> bool:
@@ -63,7 +63,7 @@ def may_differ(name: str, purpose: Purpose) -> bool:
 
     Args:
         name: Name of the setting, ``section.setting``.
-        purpose: Relation of the two.
+        purpose: Relation of the two runs.
     """
     while name and name not in _MAY_DIFFER:
         name = name.rpartition(".")[0]
@@ -71,19 +71,18 @@ def may_differ(name: str, purpose: Purpose) -> bool:
 
 
 def from_file(name: str, value: Any = None) -> bool:
-    """Return True if the settings in a file may give a setting.
+    """Return True if a setting may be taken from a file.
 
     Args:
         name: Name of the setting, ``section.setting``.
-        value: Its value: a mask may be a latitude, or a path of this machine.
+        value: Value of the setting: a mask may be a latitude, or a path on this machine.
     """
-    return not (
-        _are_paths(name, value) or any(f"{name}.".startswith(f"{own}.") for own in OF_THIS_MACHINE)
-    )
+    is_local = any(f"{name}.".startswith(f"{local}.") for local in OF_THIS_MACHINE)
+    return not (is_local or _are_paths(name, value))
 
 
 def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Settings of nested sections as ``section.setting``, with their values."""
+    """Yield settings of nested sections as ``section.setting``, with their values."""
     for key, value in config.items():
         name = f"{prefix}{key}"
         if isinstance(value, Mapping):
@@ -95,13 +94,13 @@ def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple
 def differing_settings(
     now: Mapping[str, Any], before: Mapping[str, Any], purpose: Purpose
 ) -> list[tuple[str, Any, Any]]:
-    """Settings that differ and must not, with their new and old values, sorted by name.
+    """Return settings that differ and must not, with new and old values, sorted by name.
 
-    A setting that one of the two does not have is None there.
+    The value of a missing setting is None.
 
     Args:
-        now: A resolved config.
-        before: Another one.
+        now: Resolved config of the new run.
+        before: Resolved config of the earlier run.
         purpose: Relation of the two runs.
     """
     new, old = dict(flat_settings(now)), dict(flat_settings(before))

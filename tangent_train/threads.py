@@ -18,18 +18,18 @@ def in_threads(
     workers: int | None = None,
     ahead: int | None = None,
 ) -> Generator[_Result]:
-    """Results of some work on each item, in order.
+    """Work on items in threads; yield the results in order.
 
-    Items are taken in the thread that asks for results, which is thus one stage of a pipeline if
-    the items themselves are made one by one. An error of the work comes in the place of its result;
-    one of the items comes after the results of those before it. Closing drops what has not begun.
+    Items are taken in the thread that iterates over the results, so that generators can form a
+    pipeline. An error of the work is raised in place of its result, an error of the items after
+    the results of earlier items. Closing cancels work that has not begun.
 
     Args:
-        work: Called in other threads.
-        items: Taken as they are needed.
+        work: Function that is called in other threads.
+        items: Items, taken as they are needed.
         workers: Number of threads; None for one per core.
-        ahead: Most items between who makes them and who asks for results, which bounds the memory;
-            None for four per thread.
+        ahead: Largest number of items that have been taken but not yielded, which bounds the
+            memory; None for four per thread.
     """
     workers = workers or os.cpu_count() or 1
     ahead = 4 * workers if ahead is None else ahead

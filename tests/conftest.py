@@ -20,7 +20,7 @@ from tests.datamodules.data_files import write_png
 
 SLOW = Path(__file__).parent / "slow"
 
-INSTANCES_PER_CLASS = 40  # the table is longer than 256 entries: two bytes of the colour count
+INSTANCES_PER_CLASS = 40  # the table is longer than 256 entries: two bytes of the color count
 ROOMS = {
     "1": ("office_1", "office_1", "office_2", "hallway_1"),
     "2": ("office_1", "conferenceRoom_1"),
@@ -47,11 +47,11 @@ def fabricate(
     height: int = 32,
     photos: int = 0,
 ) -> Path:
-    """Panoramas of boxes whose colour and depth tell their class, with every trap of the format.
+    """Panoramas of boxes whose color and depth tell their class, with every trap of the format.
 
     Each has a missing region (label #0D0D0D, depth 65535, black), a patch with one black channel,
-    and every other one an alpha channel. Photos likewise: the left half of a panorama, with a pose
-    file whose camera sees 60° of it; the next one 2° more.
+    and every other one an alpha channel. A photo is the left half of a panorama, with a pose file
+    whose camera sees 60° of it; the next one 2° more.
     """
     names = ["<UNK>_0_<UNK>_0_0"]
     names += [f"{c}_{i}_office_1_1" for c in CLASSES for i in range(INSTANCES_PER_CLASS)]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def decoded(content: bytes | None) -> NDArray[np.uint8]:
-    """``(H, W, 3)`` RGB or ``(H, W)`` grey pixels of an encoded image, without transparency."""
+    """``(H, W, 3)`` RGB or ``(H, W)`` gray pixels of an encoded image, without transparency."""
     assert content is not None
     pixels: Any = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_ANYCOLOR)
     assert pixels is not None

@@ -28,7 +28,7 @@ def composed(command: str, *overrides: str, **more: Any) -> DictConfig:
 
 
 def composed_settings(command: str, *overrides: str) -> dict[str, Any]:
-    """Likewise, as plain values."""
+    """The config of a command line as plain values."""
     settings: Any = OmegaConf.to_container(composed(command, *overrides), resolve=True)
     return dict(settings)
 

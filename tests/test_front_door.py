@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
+import datamodules
+import models
 import tangent_train
 from models import UNet
 from tests.cli.tiny_runs import run_command
@@ -23,7 +25,8 @@ def test_names_come_from_their_packages() -> None:
     assert tangent_train.load is network.load
     for name in ("apply", "equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)
-    assert set(tangent_train.__all__) <= set(dir(tangent_train))
+    for package in (tangent_train, datamodules, models):
+        assert set(package.__all__) <= set(dir(package))
     with pytest.raises(AttributeError, match="no attribute 'missing'"):
         _ = tangent_train.missing
 

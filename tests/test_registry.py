@@ -1,4 +1,4 @@
-"""Objects of the user's own config: all conventions of Hydra, and errors in one line."""
+"""Objects of the user's config: all conventions of Hydra, and errors in one line."""
 
 from __future__ import annotations
 

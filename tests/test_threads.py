@@ -47,7 +47,7 @@ def test_an_error_of_the_work_takes_the_place_of_its_result() -> None:
         next(done)
 
 
-def test_what_has_not_begun_is_dropped_when_the_results_are_closed() -> None:
+def test_work_that_has_not_begun_is_dropped_when_the_results_are_closed() -> None:
     begun = []
 
     def work(number: int) -> None:

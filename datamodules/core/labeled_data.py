@@ -248,7 +248,7 @@ class LabeledData(ABC, Generic[_Item]):
         return len(problems.without(items))
 
     def _find_all(self, problems: Problems) -> DatasetIndex[_Item]:
-        """Return the index of all items, checked as every data set is."""
+        """Return the index of all items; refuse invalid class names and an empty data set."""
         self.check_classes()
         index = self.find(problems)
         if not index.of() and not problems.items:
@@ -307,6 +307,8 @@ class LabeledData(ABC, Generic[_Item]):
     def source(self, split: Split) -> SplitReader[_Item, Any]:
         """Return the source of a split; with `in_memory`, read everything now."""
         if split not in self._readers:
+            if split not in self.index().splits:
+                raise SettingError("split", found=split, expected=", ".join(self.index().splits))
             reader = SplitReader(self.index(), split, self.transforms(split))
             if self.in_memory:
                 reader.keep_in_memory(self.root)

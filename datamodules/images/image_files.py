@@ -140,13 +140,13 @@ class NamedFiles:
             self._found.setdefault(name, []).append(path)
 
     def path(self, name: str) -> Path:
-        """Return the file of a name, existing or not.
+        """Return the path of a file that has a name, or would have it if it is missing.
 
         Args:
-            name: Path of the file in the folder.
+            name: Path of the file relative to the folder.
 
         Raises:
-            DataError: There are several.
+            DataError: Several files have this name after `composed`.
         """
         paths = self._found.get(composed(name), [self.folder / name])
         if len(paths) > 1:

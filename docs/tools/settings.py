@@ -113,7 +113,8 @@ def _prose(file: Path) -> str:
 
 
 def _text(comment: str) -> str:
-    return re.sub(r"([|<*\[\]])", r"\\\1", comment)
+    escaped = re.sub(r"([|<*\[\]])", r"\\\1", comment)
+    return re.sub(r"docs/([\w/-]+\.md)", r"[\1](../\1)", escaped)
 
 
 if __name__ == "__main__":

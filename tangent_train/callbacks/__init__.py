@@ -1,1 +1,1 @@
-"""Lightning callbacks: checkpoints, pictures and curves, results, progress."""
+"""Lightning callbacks: checkpoints, pictures, progress."""

@@ -1,4 +1,4 @@
-"""Checkpoints: their content, when they are written, and exact resuming."""
+"""Write checkpoints, and resume from them exactly."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from tangent_train.files import atomic_path
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Write beside the old checkpoint and rename.
+    """Writes a checkpoint under a temporary name in its folder and renames it.
 
-    Lightning's own writes to the system's temporary folder, often another disk: moving from there
-    is a copy that a kill cuts off.
+    Lightning's class writes to the system's temporary folder, often on another disk. Moving the
+    file from there is a copy, which is incomplete if the process is killed.
     """
 
     def save_checkpoint(
@@ -35,22 +35,22 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
         Args:
             checkpoint: Tensors and plain values.
-            path: The file.
-            storage_options: Not used.
+            path: File to write.
+            storage_options: Ignored.
         """
         with atomic_path(Path(path)) as temporary:
             torch.save(checkpoint, temporary)
 
     def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file. Lightning's own would remove a whole folder."""
+        """Remove a file; Lightning's method would also remove a whole folder."""
         Path(path).unlink(missing_ok=True)
 
 
 class CheckpointContents(Callback):
-    """Store in every checkpoint what later commands need, the random state and an early end.
+    """Stores plain values, the random state and an early end of the training in checkpoints.
 
     Args:
-        contents: Nested dicts and lists of plain values, by name.
+        contents: Values by name that later commands need: nested dicts and lists of plain values.
     """
 
     def __init__(self, contents: dict[str, Any]) -> None:
@@ -63,11 +63,11 @@ class CheckpointContents(Callback):
     ) -> None:
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
-        # A resumed run may get more time.
+        # A resumed run may have more time.
         timers = [one for one in trainer.callbacks if isinstance(one, Timer)]  # type: ignore[attr-defined]
         out_of_time = any((timer.time_remaining() or 0) <= 0 for timer in timers)
         checkpoint["stopped"] = trainer.should_stop and not out_of_time
-        # Data has generators of its own, see `sample_rng`.
+        # Samples have separate generators, see `sample_rng`.
         cuda = [torch.cuda.get_rng_state()] if torch.cuda.is_available() else []
         state = {"cpu": torch.get_rng_state(), "cuda": cuda}
         checkpoint["random"] = [state] * trainer.world_size
@@ -77,12 +77,12 @@ class CheckpointContents(Callback):
     def on_load_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Take the generators' states, and whether a callback had ended the training."""
+        """Read the states of the generators, and if a callback had ended the training."""
         self._random_states = checkpoint.get("random")
         self._stopped = checkpoint.get("stopped") is True
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Restore them: the random state (dropout) continues, on as many processes as before."""
+        """Restore the random state (dropout), if the number of processes is the same."""
         trainer.should_stop |= self._stopped
         states = self._random_states
         if states is not None and len(states) == trainer.world_size:
@@ -93,75 +93,76 @@ class CheckpointContents(Callback):
 
 
 class LastCheckpoint(Checkpoint):
-    """Keep ``last.ckpt`` at the newest state from which training can resume.
+    """Writes ``last.ckpt``, the newest state from which training can resume.
 
-    Written before the first step, after every epoch, every so many steps, and on SIGTERM (what a
-    cluster sends before it kills): after the current step, or at the end of the epoch once its
-    steps are done. A run can always be resumed exactly; an interrupted run prints the command.
+    It is written before the first step, after every epoch, after every `every_n_steps` steps, and
+    on SIGTERM, which a cluster sends before it kills a process: after the current step, or at the
+    end of the epoch if its steps are done. An interrupted run prints the command that resumes it.
 
     Args:
-        folder: The checkpoints' folder of a run.
-        every_n_steps: Optimizer steps between checkpoints within an epoch; None for none.
-        typed: Settings that the resuming command needs besides the folder.
+        folder: Folder of the checkpoints of a run.
+        every_n_steps: Number of optimizer steps between checkpoints within an epoch; None for
+            checkpoints at the end of epochs only.
+        overrides: Settings that the resuming command needs besides the folder.
 
     Attributes:
-        has_begun: Whether training has begun, with everything restored.
+        has_begun: True if training has begun, with everything restored.
 
     Raises:
-        SettingError: Fewer than one step.
+        SettingError: `every_n_steps` is less than 1.
     """
 
     def __init__(
-        self, folder: Path | str, every_n_steps: int | None = None, typed: Sequence[str] = ()
+        self, folder: Path | str, every_n_steps: int | None = None, overrides: Sequence[str] = ()
     ) -> None:
         if every_n_steps is not None:
             at_least("checkpoint_every_n_steps", every_n_steps, 1)
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
-        self.typed = typed
+        self.overrides = overrides
         self.has_begun = False
-        self._told_to_end = False
+        self._got_sigterm = False
         self._processes: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Save the untrained state of a new run, and listen for SIGTERM.
+        """Save the untrained state of a new run, and handle SIGTERM.
 
-        Not by Lightning's handler: it communicates with the other processes inside the signal
+        Lightning's handler is not used: it communicates with the other processes inside the signal
         handler, which can deadlock.
         """
 
-        def listen(number: int, _: object) -> None:
+        def handle(number: int, _: object) -> None:
             if trainer.strategy.launcher is not None:
                 trainer.strategy.launcher.kill(number)
-            self._told_to_end = True
+            self._got_sigterm = True
 
         self.has_begun = True
-        self._told_to_end = False
-        if trainer.world_size > 1:  # a group of its own on the CPU: no waiting for a GPU
+        self._got_sigterm = False
+        if trainer.world_size > 1:  # a separate group on the CPU, which does not wait for a GPU
             self._processes = torch.distributed.new_group(backend="gloo")
         if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, listen)  # Lightning puts back what there was before
+            signal.signal(signal.SIGTERM, handle)  # Lightning restores the previous handler
         if trainer.global_step == 0:
             trainer.save_checkpoint(self.path, weights_only=False)
 
     def on_train_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        stepped = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
-        ends_epoch = batch_idx + 1 == trainer.num_training_batches  # saved in a moment
-        if not stepped or ends_epoch:
+        is_step = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
+        is_last = batch_idx + 1 == trainer.num_training_batches  # saved at the end of the epoch
+        if not is_step or is_last:
             return
-        due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
-        ending = self._any_told_to_end(trainer)
-        if due or ending:
+        is_due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
+        is_ending = self._is_any_ended(trainer)
+        if is_due or is_ending:
             trainer.save_checkpoint(self.path, weights_only=False)
-        if ending:
+        if is_ending:
             raise SIGTERMException
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the state after every epoch."""
         trainer.save_checkpoint(self.path, weights_only=False)
-        if self._any_told_to_end(trainer):
+        if self._is_any_ended(trainer):
             raise SIGTERMException
 
     def on_exception(
@@ -170,25 +171,25 @@ class LastCheckpoint(Checkpoint):
         """Print how to resume the run."""
         if trainer.is_global_zero and self.has_begun and self.path.is_file():
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
-            command = shlex.join([f"resume={self.path.parent.parent}", *self.typed])
-            text = f"{self.path} has all up to {saved}; resume with\n  tangent-train {command}"
+            command = shlex.join([f"resume={self.path.parent.parent}", *self.overrides])
+            text = f"{self.path} contains all up to {saved}; resume with\n  tangent-train {command}"
             print_text(text, error=True)
 
-    def _any_told_to_end(self, trainer: Trainer) -> bool:
-        """Whether some process got SIGTERM: all end after the same step."""
-        told = torch.tensor(int(self._told_to_end))
+    def _is_any_ended(self, trainer: Trainer) -> bool:
+        """Return True if any process got SIGTERM, so that all end after the same step."""
+        count = torch.tensor(int(self._got_sigterm))
         if trainer.world_size > 1:
-            torch.distributed.all_reduce(told, group=self._processes)
-        return bool(told)
+            torch.distributed.all_reduce(count, group=self._processes)
+        return bool(count)
 
 
 class BestCheckpoint(ModelCheckpoint):
-    """Keep ``best.ckpt``, the epoch with the best validation score; none without validation.
+    """Writes ``best.ckpt``, the epoch with the best validation score; no file without validation.
 
     Args:
-        folder: Output folder, of a resumed run whose folder was moved too.
-        monitor: The score.
-        mode: ``max`` or ``min``: the better value.
+        folder: Folder of the checkpoints, also of a resumed run whose folder was moved.
+        monitor: Name of the score.
+        mode: ``max`` if a larger score is better, ``min`` if a smaller one is.
     """
 
     def __init__(
@@ -205,7 +206,7 @@ class BestCheckpoint(ModelCheckpoint):
         )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the best score; the path of its file is not taken from a file."""
+        """Restore the best score; the path of its checkpoint is not read from a file."""
         score = state_dict["best_model_score"]
         if score is None:
             return

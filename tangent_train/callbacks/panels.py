@@ -1,4 +1,4 @@
-"""Pictures of the test."""
+"""Write pictures of test predictions."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from tangent_train.results.pictures import evenly_spread
 
 
 class PredictionPanels(Callback):
-    """Writes pictures of a few predictions of the test, see `Task.picture`.
+    """Writes pictures of test predictions, see `Task.picture`.
 
     Args:
         folder: Output folder.
         count: Number of images, spread over the test split.
 
     Attributes:
-        images: Compressed images for the viewer of the report; after the test those of all
-            processes, in the order of the split.
+        images: Compressed images for the report's viewer; after the test those of all processes,
+            in the order of the split.
 
     Raises:
-        SettingError: Less than 0.
+        SettingError: `count` is negative.
     """
 
     def __init__(self, folder: Path | str, count: int = 6) -> None:
@@ -43,18 +43,18 @@ class PredictionPanels(Callback):
         task: Any = pl_module
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
         chosen = evenly_spread(self.count, len(source))
-        found = zip(batch.index.tolist(), task.targets(batch), outputs, strict=True)
-        for index, target, prediction in found:
+        predictions = zip(batch.index.tolist(), task.targets(batch), outputs, strict=True)
+        for index, target, prediction in predictions:
             if index in chosen:
-                self._show(source, index, task, target, prediction)
+                self._write_panel(source, index, task, target, prediction)
 
-    def _show(self, source: Any, index: int, task: Any, *labels: Any) -> None:
+    def _write_panel(self, source: Any, index: int, task: Any, *labels: Any) -> None:
         name, image = source.name(index), source.read(index)
         panel = task.picture(image, *labels)
         if panel is None:
             return
         encoded = cv2.imencode(".png", cv2.cvtColor(panel, cv2.COLOR_RGB2BGR))[1]
-        file = f"{index}_{name.replace('/', '_')}.png"  # other names may have "_" in them
+        file = f"{index}_{name.replace('/', '_')}.png"  # with the index, the name is unique
         write_bytes(self.folder / file, encoded.tobytes())
         self._encoded[index] = task.report_image(name, image, *labels)
 
@@ -64,5 +64,5 @@ class PredictionPanels(Callback):
         if torch.distributed.is_available() and torch.distributed.is_initialized():
             parts *= trainer.world_size
             torch.distributed.all_gather_object(parts, self._encoded)
-        together = {index: image for part in parts for index, image in part.items()}
-        self.images = [together[index] for index in sorted(together)]
+        gathered = {index: image for part in parts for index, image in part.items()}
+        self.images = [gathered[index] for index in sorted(gathered)]

@@ -1,4 +1,4 @@
-"""Pictures of the validation, in every logger that shows images."""
+"""Log pictures of validation predictions."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from tangent_train.errors import at_least
 from tangent_train.results.pictures import evenly_spread
 
 _MOST_ROWS = 256
-"""Larger images are shown smaller: a log holds the pictures of all validations."""
+"""Larger images are reduced: a log contains the pictures of all validations."""
 
 
 class ValidationPictures(Callback):
-    """Log pictures of a few validation images after every validation.
+    """Logs pictures of validation images after every validation, see `Task.picture`.
 
-    ``val_images/<name>``, see `Task.picture`; always the same images, spread over those of the
-    first process.
+    Their names are ``val_images/<name>``. The images are the same in every validation, spread over
+    the images of the first process.
 
     Args:
         count: Number of images.
 
     Raises:
-        SettingError: The number is less than 0.
+        SettingError: `count` is negative.
     """
 
     def __init__(self, count: int = 4) -> None:
@@ -52,7 +52,7 @@ class ValidationPictures(Callback):
         if panel is None:
             return
         tag = f"val_images/{source.name(index).replace('/', '_')}"
-        # Lightning logs a validation at this step (one less than `global_step` then).
+        # The step at which Lightning logs the validation, one less than `global_step`.
         step = trainer.fit_loop.epoch_loop._batches_that_stepped
         for logger in trainer.loggers:
             log_image(logger, tag, panel, step)
@@ -62,7 +62,7 @@ def log_image(logger: Logger, name: str, image: Any, step: int) -> None:
     """Log an image to a logger that shows images; do nothing for others.
 
     Args:
-        logger: The logger.
+        logger: Logger of any class.
         name: Name of the image.
         image: uint8 RGB ``(H, W, 3)``.
         step: Number of optimizer steps.

@@ -1,4 +1,4 @@
-"""Progress of a run: a bar on a terminal, lines elsewhere."""
+"""Print the progress of a run: as a bar on a terminal, as lines elsewhere."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from datamodules.core.progress import PlainLines
 class ProgressBar(RichProgressBar):
     """Lightning's bar with rate and time left, without the logger's version.
 
-    Where the output is no terminal, a line is printed after every epoch, and after a minute
-    without one.
+    If the output is not a terminal, a line is printed after every epoch, and after every minute
+    without a line.
     """
 
     def __init__(self) -> None:
@@ -29,44 +29,46 @@ class ProgressBar(RichProgressBar):
         self._epochs = 0
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
-        """Metrics shown behind the bar."""
-        figures = dict(super().get_metrics(trainer, pl_module))
-        figures.pop("v_num", None)
-        return figures
+        """Return the metrics that are printed after the bar."""
+        metrics = dict(super().get_metrics(trainer, pl_module))
+        metrics.pop("v_num", None)
+        return metrics
 
     def on_train_start(self, *args: Any) -> None:
-        """Time the epochs from here."""
+        """Start to time the epochs."""
         super().on_train_start(*args)
         self._begun = time.monotonic()
 
     def on_train_batch_end(self, *args: Any) -> None:
-        """A line a minute."""
+        """Print a line per minute."""
         super().on_train_batch_end(*args)
-        self._tell(f"Epoch {args[0].current_epoch + 1}", args[4], args[0].num_training_batches)
+        self._print_steps(
+            f"Epoch {args[0].current_epoch + 1}", args[4], args[0].num_training_batches
+        )
 
     def on_validation_batch_end(self, *args: Any) -> None:
-        """A line a minute."""
+        """Print a line per minute."""
         super().on_validation_batch_end(*args)
-        self._tell("Validation", args[4], args[0].num_val_batches[0])
+        self._print_steps("Validation", args[4], args[0].num_val_batches[0])
 
     def on_test_batch_end(self, *args: Any) -> None:
-        """A line a minute."""
+        """Print a line per minute."""
         super().on_test_batch_end(*args)
-        self._tell("Test", args[4], args[0].num_test_batches[0])
+        self._print_steps("Test", args[4], args[0].num_test_batches[0])
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """A line with the metrics and the time left."""
+        """Print a line with the metrics and the time left."""
         super().on_train_epoch_end(trainer, pl_module)
         self._epochs += 1
         done, last = trainer.current_epoch + 1, trainer.max_epochs or -1
         parts = [f"Epoch {done} of {last}" if last > 0 else f"Epoch {done}"]
         metrics = self.get_metrics(trainer, pl_module)
         parts += [f"{name} {value:.3f}" for name, value in metrics.items()]
-        each = (time.monotonic() - self._begun) / self._epochs
-        parts += [f"{timedelta(seconds=round(each * (last - done)))} left"] * (last > done)
+        seconds = (time.monotonic() - self._begun) / self._epochs * (last - done)
+        parts += [f"{timedelta(seconds=round(seconds))} left"] * (last > done)
         if trainer.is_global_zero:
             self._lines.print(", ".join(parts), at_once=True)
 
-    def _tell(self, what: str, index: int, total: float) -> None:
+    def _print_steps(self, stage: str, index: int, total: float) -> None:
         if self.trainer.is_global_zero:
-            self._lines.print(f"{what}: {index + 1} of {total} steps")
+            self._lines.print(f"{stage}: {index + 1} of {total} steps")

@@ -1,5 +1,5 @@
-"""Reading untrusted files: checkpoints, exported networks, the settings of runs.
+"""Read untrusted files: checkpoints, exported networks, settings of runs.
 
-Files are plain data. Tensors and plain values are read, settings are compared with those that files
-may have (`tangent_train.registry`), and are not interpreted again.
+Files are plain data: tensors and plain values. Settings are checked against those that files may
+give (`tangent_train.registry`), and are not interpreted again.
 """

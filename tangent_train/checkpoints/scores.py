@@ -1,4 +1,4 @@
-"""The scores of any network as those of its classes, at every pixel of the image."""
+"""Convert the output of networks to scores of classes at every pixel."""
 
 from __future__ import annotations
 
@@ -15,29 +15,31 @@ from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.errors import SettingError
 
 _LABEL_MAP = 3
-"""Dimensions of label maps without an axis of scores."""
+"""Number of dimensions of label maps without an axis of scores."""
 
 _CERTAIN = 20.0
-"""Score of a pixel's class where the network gives nothing but labels."""
+"""Score of a pixel's class if the network returns labels."""
 
 Groups = Sequence[Sequence[int]]
-"""For every class, the scores whose probabilities add up to that of the class."""
+"""Indices of the scores of each class, whose probabilities are added up."""
 
 
 class ClassScoreNetwork(nn.Module):
-    """A network whose result is the score of every class.
+    """A network whose output is converted to the scores of classes.
 
     Args:
-        network: Maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict with those under
-            ``"out"`` (torchvision's), or to label maps.
-        num_classes: K.
-        groups: The network's scores that make up each class; scores in no group never win, nor do
-            classes without scores.
-        tile: Rows and columns of the only images that the network takes: larger ones are divided.
-        kind: Output of the network; groups contain the place K of kinds that have it.
+        network: Network that maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict
+            with these under ``"out"`` (as in torchvision), or to label maps.
+        num_classes: Number K of classes.
+        groups: Indices of the network's scores for each class, including index K of kinds that
+            have it. Scores in no group, and classes without scores, never win. None if each score
+            is a class.
+        tile: Rows and columns of the only image size that the network takes; larger images are
+            divided. None if it takes other sizes.
+        kind: Kind of the network's output.
 
     Attributes:
-        num_scores: Scores of a pixel: K, or the number of groups.
+        num_scores: Number of scores of a pixel: K, or the number of groups.
     """
 
     def __init__(
@@ -56,22 +58,22 @@ class ClassScoreNetwork(nn.Module):
         self._kind = kind
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        """Scores ``(B, num_scores, h, w)``.
+        """Return the scores ``(B, num_scores, h, w)``.
 
         Args:
-            images: ``(B, C, h, w)``, normalized.
-            *arguments: For the network.
-            **settings: For the network.
+            images: Normalized images ``(B, C, h, w)``.
+            *arguments: Further arguments of the network.
+            **settings: Further arguments of the network, by name.
 
         Raises:
-            SettingError: The network has another number of scores.
+            SettingError: The network returns another number of scores.
         """
         size = (images.shape[-2], images.shape[-1])
         if self._tile in (None, size):
-            return self._of(images, *arguments, **settings)
-        return _tiled(self._of, images, self._tile)
+            return self._class_scores(images, *arguments, **settings)
+        return _tiled_scores(self._class_scores, images, self._tile)
 
-    def _of(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
+    def _class_scores(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
         returned = self.network(images, *arguments, **settings)
         groups = self._groups
         needed = self.num_scores if groups is None else 1 + max(k for g in groups for k in g)
@@ -81,7 +83,7 @@ class ClassScoreNetwork(nn.Module):
             raise SettingError(
                 "class names of the network",
                 found=f"{self.num_scores}, for {count} scores",
-                expected="one for every score",
+                expected="one name for each score",
             )
         if groups is None:
             return scores
@@ -89,25 +91,25 @@ class ClassScoreNetwork(nn.Module):
 
 
 def plain_scores(returned: Any) -> Tensor:
-    """Scores or label maps that a network returned, which torchvision's keep in a dict."""
+    """Return scores or label maps from a network's output, which is a dict in torchvision."""
     scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
     return scores
 
 
 def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
-    """Scores whose softmax is the probability of every class.
+    """Convert scores so that their softmax is the probability of each class.
 
     Args:
         scores: Scores ``(B, K, h, w)`` or label maps.
-        kind: See `ScoreKind`.
-        num_labels: K of label maps.
+        kind: Kind of the scores.
+        num_labels: Number K of labels in label maps.
 
     Returns:
-        ``(B, K, h, w)``, or ``(B, K + 1, h, w)`` of the kinds with a place K.
+        Scores ``(B, K, h, w)``, or ``(B, K + 1, h, w)`` for kinds with an index K.
     """
     if kind == "labels":
         values = scores if scores.ndim == _LABEL_MAP else scores[:, 0]
-        known = (values >= 0) & (values < num_labels)  # never true of NaN
+        known = (values >= 0) & (values < num_labels)  # False for NaN
         labels = torch.where(known, values.long(), num_labels)
         return functional.one_hot(labels, num_labels + 1).movedim(-1, 1) * _CERTAIN
     if kind == "probabilities":
@@ -120,17 +122,17 @@ def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
 
 
 def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:
-    """The logarithm of a sum of probabilities, up to what all classes of a pixel share."""
+    """Return the logarithm of a sum of probabilities, up to a constant of the pixel."""
     if not group:
-        # Below all others at every pixel, and so in every mean of pixels. Not minus infinity, which
-        # is not a number when it is weighted by 0.
+        # Less than all others at every pixel, and so in means over pixels. Not minus infinity,
+        # which becomes NaN when it is weighted by 0.
         return scores.amin(1, keepdim=True) - _CERTAIN
     chosen = scores[:, list(group)]
     return chosen if len(group) == 1 else chosen.logsumexp(1, keepdim=True)
 
 
-def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
-    """The mean scores of the evenly spaced tiles that cover larger images."""
+def _tiled_scores(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
+    """Return the mean scores of evenly spaced tiles that cover larger images."""
     starts = [
         torch.linspace(0, side - part, -(-side // part)).round().int().tolist()
         for side, part in zip(images.shape[-2:], tile, strict=True)
@@ -139,20 +141,20 @@ def _tiled(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
     count = images.new_zeros(images.shape[-2:])
     for top in starts[0]:
         for left in starts[1]:
-            place = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
-            scores = network(images[place])
+            area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
+            scores = network(images[area])
             if not count.any():
                 total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
-            total[place] += scores
-            count[place] += 1
+            total[area] += scores
+            count[area] += 1
     result: Tensor = total / count
     return result
 
 
 _PROBED = {1: (127, 131), 2: (67, 71), 4: (37, 41), 8: (17, 19), 14: (11, 13), 16: (11, 13)}
 _PROBED |= dict.fromkeys((32, 64, 128), (5, 7))
-"""Candidate multiples, and the factors to try each with: primes, so that a tried side is a
-multiple of nothing else. 14 is for transformers with such patches."""
+"""Candidate multiples, and the factors to try each with. They are primes, so that a side has no
+other divisors; 14 is for transformers with patches of 14 pixels."""
 
 
 def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
@@ -160,24 +162,24 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
 
     Args:
         network: Network in evaluation mode on the CPU that returns a tensor.
-        in_channels: Channels of its images.
+        in_channels: Number of input channels.
 
     Returns:
-        1, 2, 4, 8, 14, 16, 32, 64 or 128; None when it takes no such size.
+        1, 2, 4, 8, 14, 16, 32, 64 or 128; None if the network takes no multiple of these.
     """
-    found = None
-    if any(True for _ in network.parameters()):  # none of an ONNX file
+    multiple = None
+    if any(True for _ in network.parameters()):  # False for an ONNX file
         shapes_only: nn.Module = copy.deepcopy(network).to("meta")
-        found = _least_multiple(shapes_only, in_channels, "meta")
-    # Some networks depend on values, which the meta device does not have.
-    return found or _least_multiple(network, in_channels, "cpu")
+        multiple = _least_multiple(shapes_only, in_channels, "meta")
+    # Some networks depend on values, which tensors on the device meta do not have.
+    return multiple or _least_multiple(network, in_channels, "cpu")
 
 
 @torch.no_grad()
 def _least_multiple(network: nn.Module, in_channels: int, device: str) -> int | None:
     for multiple, counts in _PROBED.items():
         size = torch.Size(multiple * count for count in counts)
-        with suppress(Exception):  # each network refuses sizes in its own words
+        with suppress(Exception):  # networks refuse sizes with different errors
             scores = network(torch.zeros(1, in_channels, *size, device=device))
             if scores.shape[-2:] == size:
                 return multiple

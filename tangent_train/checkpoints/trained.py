@@ -1,4 +1,4 @@
-"""Trained networks from files: checkpoints, and what `tangent-export` writes."""
+"""Load trained networks from checkpoints and from files that `tangent-export` wrote."""
 
 from __future__ import annotations
 
@@ -33,19 +33,19 @@ from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
 from tangent_train.registry import SettingsFile, Text, build_from_config, check_fields, check_plain
 
 METADATA_KEY = "tangent_train"
-"""Names the JSON text: in an ONNX file's ``metadata_props``, in safetensors' ``__metadata__``."""
+"""Key of the JSON text in an ONNX file's ``metadata_props`` or safetensors' ``__metadata__``."""
 
 CHECKSUM_KEY = "tangent_train_crc32"
-"""Names the checksum of the tensors there."""
+"""Key of the checksum of the tensors in the same metadata."""
 
 _PREFIX = "network."
-"""Begins the names of the network's tensors in a checkpoint."""
+"""Prefix of the names of the network's tensors in a checkpoint."""
 
 _PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
 """Settings that name trained weights, in models, torchvision, segmentation-models-pytorch, timm."""
 
-_OF_THE_DATA = ("num_classes", "classes", "in_channels")
-"""Settings that the data decides."""
+_FROM_DATA = ("num_classes", "classes", "in_channels")
+"""Settings that are taken from the data."""
 
 _EXPORTED = "a network written by tangent-export"
 _TRAINED = "a checkpoint written by tangent-train"
@@ -56,25 +56,25 @@ class TrainedNetwork:
     """A trained network with everything needed to use it.
 
     Attributes:
-        inner: The network as it was trained or imported, in evaluation mode; see `network`.
-        class_names: K + 1 names of the labels, the unknown class first; score k is that of label
+        inner: Network as it was trained or imported, in evaluation mode; see `network`.
+        class_names: Names of the K + 1 labels, the unknown class first; score k is that of label
             k + 1.
         inputs: Inputs of the network, see `datamodules.core.inputs.Input`.
         normalization: Normalization of RGB and depth.
-        level: Level s it was trained at.
-        representation: The section of the config it was trained with.
-        image_size: Rows and columns of the images that representation evaluates on.
-        size_multiple: Height and width of its images must be multiples of this.
-        fixed_size: The only rows and columns it takes, into which larger images are divided; None
-            where it takes others.
+        level: Level s of the training.
+        representation: Section ``representation`` of the training's config.
+        image_size: Rows and columns of the images in an evaluation of that representation.
+        size_multiple: Number that height and width of images must be multiples of.
+        fixed_size: Rows and columns of the only image size that the network takes, into which
+            larger images are divided; None if it takes other sizes.
         photo_level: Level s with the pixels per degree of the photos that an imported network was
-            trained on; None of a network that was trained here.
-        groups: Scores of a photo network that make up every class, and in a last group those of no
-            class: where they win, the label is 0. None where every score is a class.
-        score_kind: Output of `inner`.
-        settings: The section of the config that makes it, complete; None where only the computation
+            trained on; None for other networks.
+        groups: Indices of a photo network's scores for each class, and in a last group those of no
+            class: where they win, the label is 0. None if each score is a class.
+        score_kind: Kind of the output of `inner`.
+        settings: Complete section of the config that builds `inner`; None if only the computation
             is known (ONNX).
-        source: The file that `representation` and `settings` come from.
+        source: File that `representation` and `settings` come from.
     """
 
     inner: nn.Module
@@ -94,28 +94,37 @@ class TrainedNetwork:
 
     @cached_property
     def network(self) -> ClassScoreNetwork:
-        """Scores of K classes ``(B, K, h, w)``, and perhaps of none, see `groups`.
+        """Network that returns scores of K classes ``(B, K, h, w)``.
 
-        Images are ``(B, C, h, w)`` float32, normalized.
+        With `groups`, a further score is that of no class. Images are ``(B, C, h, w)`` float32,
+        normalized.
         """
         count = len(self.class_names) - 1
-        how = self.groups, self.fixed_size, self.score_kind
-        return ClassScoreNetwork(self.inner, count, *how).eval()
+        return ClassScoreNetwork(
+            self.inner, count, self.groups, self.fixed_size, self.score_kind
+        ).eval()
 
     @property
     def photo_side(self) -> int | None:
-        """Side of its views if that does not depend on the level: of one size, or imported."""
+        """Side of the views if it does not depend on the level: fixed size, or imported network."""
         if self.fixed_size is not None:
             return max(self.fixed_size)
         return None if self.photo_level is None else self.image_size[0]
 
     @property
     def in_channels(self) -> int:
-        """Channels of its images."""
+        """Number of input channels."""
         return len(channel_names(self.inputs))
 
     def labels(self, best: Tensor) -> NDArray[np.unsignedinteger]:
-        """Labels 1 … K of the best scores 0 … K - 1; 0 where an unknown class won, or none."""
+        """Convert indices of the best scores to labels.
+
+        Args:
+            best: Indices of scores.
+
+        Returns:
+            Labels from 1 to K; 0 where an unknown class, or no class, had the best score.
+        """
         labels: NDArray[np.unsignedinteger] = best.cpu().numpy()
         labels = labels + labels.dtype.type(1)
         labels[labels >= len(self.class_names)] = 0
@@ -127,13 +136,13 @@ class NetworkDescription:
     """The description of the network that training starts from.
 
     Attributes:
-        class_names: Names of its labels.
+        class_names: Names of the labels.
         inputs: Inputs of the network; None for shapes.
         normalization: ``mean`` and ``std`` of the inputs.
-        groups: See `TrainedNetwork`.
-        score_kind: See `TrainedNetwork`.
-        settings: The section of a config that makes it, for any data: null where the data decides
-            (see `completed_settings`), and without other pretrained weights.
+        groups: Indices of scores, see `TrainedNetwork`.
+        score_kind: Kind of the output, see `TrainedNetwork`.
+        settings: Section of a config that builds the network. Settings that depend on the data (see
+            `completed_settings`) and those of other pretrained weights are null.
     """
 
     class_names: tuple[str, ...]
@@ -158,21 +167,21 @@ _KINDS = {
     "score_kind": ScoreKind,
     "settings": dict | None,
 }
-"""Metadata of an exported network."""
+"""Fields in the metadata of an exported network, with their kinds."""
 
 
 def completed_settings(
     settings: Any, in_channels: int, num_classes: int, *, restored: bool = False
 ) -> Any:
-    """Complete the null settings of a network, and of networks inside it, from the data.
+    """Complete null settings of a network, and of networks inside it, from the data.
 
     Args:
-        settings: Resolved; ``in_channels``, and ``num_classes`` or ``classes`` may be null.
-        in_channels: Channels of the images.
-        num_classes: Scores of the network.
-        restored: True if a checkpoint has the tensors, so that no others are fetched first.
+        settings: Resolved settings; ``in_channels``, ``num_classes`` and ``classes`` may be null.
+        in_channels: Number of input channels.
+        num_classes: Number of scores of the network.
+        restored: True if the tensors come from a checkpoint: pretrained weights are not fetched.
     """
-    known = dict.fromkeys(_OF_THE_DATA, num_classes) | {"in_channels": in_channels}
+    known = dict.fromkeys(_FROM_DATA, num_classes) | {"in_channels": in_channels}
     unwanted = _PRETRAINED if restored else ()
 
     def complete(value: Any) -> Any:
@@ -187,16 +196,16 @@ def completed_settings(
 
 
 def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
-    """A trained network, on the CPU and in evaluation mode, from a file of this package.
+    """Load a trained network, on the CPU and in evaluation mode, from a file of this package.
 
     Args:
-        path: A checkpoint; or what `tangent-export` wrote, known by its suffix ``.onnx`` or
+        path: Checkpoint, or a file of `tangent-export` with the suffix ``.onnx`` or
             ``.safetensors``.
-        trust: Full names of classes that the file may name besides those that are registered.
+        trust: Full names of classes that the file may name besides the registered ones.
 
     Raises:
-        DataError: There is no such file, it holds something else, it names other code, its network
-            cannot be made, or a package to read it is missing.
+        DataError: The file is missing, has other content, names classes that are not allowed, or
+            its network cannot be built; or a package to read it is missing.
     """
     suffix, source = path.suffix.lower(), SettingsFile(path, trust)
     try:
@@ -208,12 +217,12 @@ def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
     except SettingError as error:
         found = f"{error.subject}: {error.found}"
         raise DataError(path, found=found, expected=error.expected, remedy=error.remedy) from error
-    except (AttributeError, TypeError, ValueError) as error:  # of sections that do not fit
+    except (AttributeError, TypeError, ValueError) as error:  # invalid sections
         raise DataError(path, found=f"{error}", expected=_TRAINED) from error
 
 
 def describe_network(path: Path) -> NetworkDescription | None:
-    """The description of the network in a file of this package; None for other files.
+    """Return the description of the network in a file of this package; None for other files.
 
     Raises:
         DataError: The file is missing, or its description cannot be used.
@@ -222,7 +231,7 @@ def describe_network(path: Path) -> NetworkDescription | None:
         metadata = _metadata(path)
         if METADATA_KEY not in metadata:
             return None
-        content = _described(path, metadata)
+        content = _parse_metadata(path, metadata)
     else:
         names = ("class_names", "config", "groups", "inputs", "normalization", "score_kind")
         plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True, whole=False)
@@ -238,25 +247,25 @@ def describe_network(path: Path) -> NetworkDescription | None:
         normalization=content["normalization"],
         groups=content["groups"],
         score_kind=content["score_kind"] or "logits",
-        settings=_for_any_data(content["settings"]),
+        settings=_without_data_settings(content["settings"]),
     )
 
 
-def _for_any_data(section: Any) -> Any:
-    """Settings of a network, and of networks inside them, without what the data decides."""
+def _without_data_settings(section: Any) -> Any:
+    """Set settings that depend on the data, and pretrained weights, to null."""
     if not isinstance(section, Mapping) or "_target_" not in section:
         return section
-    open_ones = (*_OF_THE_DATA, *_PRETRAINED)
     return {
-        name: None if name in open_ones else _for_any_data(value) for name, value in section.items()
+        name: None if name in (*_FROM_DATA, *_PRETRAINED) else _without_data_settings(value)
+        for name, value in section.items()
     }
 
 
 def metadata_of(trained: TrainedNetwork) -> dict[str, Any]:
-    """Metadata of a network, plain values.
+    """Return the metadata of a network as plain values.
 
-    The fields of `TrainedNetwork`, except for ``inner`` and ``source``, under their names;
-    ``normalization`` with ``mean`` and ``std``; ``tangent_train_version``.
+    These are the fields of `TrainedNetwork`, except for ``inner`` and ``source``;
+    ``normalization`` is a mapping of ``mean`` and ``std``; ``tangent_train_version`` is added.
     """
     content = {name: getattr(trained, name) for name in _KINDS}
     content["normalization"] = asdict(trained.normalization)
@@ -264,7 +273,7 @@ def metadata_of(trained: TrainedNetwork) -> dict[str, Any]:
 
 
 def _check_tensors(path: Path, metadata: Mapping[str, str], checksum: str) -> None:
-    """Refuse other tensors than the written ones; other programs write no checksum."""
+    """Refuse tensors with a wrong checksum; other programs write no checksum."""
     check_sum(path, metadata.get(CHECKSUM_KEY, checksum) == checksum)
 
 
@@ -272,9 +281,9 @@ def write_metadata(source: Path, path: Path, trained: TrainedNetwork) -> None:
     """Write an ONNX file with the metadata of a network, and the checksum of its tensors.
 
     Args:
-        source: An ONNX file without external tensors.
-        path: The file to write.
-        trained: The network that it computes.
+        source: ONNX file without external tensors.
+        path: File to write.
+        trained: Network that the ONNX file computes.
     """
     import onnx
 
@@ -286,36 +295,36 @@ def write_metadata(source: Path, path: Path, trained: TrainedNetwork) -> None:
 
 
 def tensor_checksum(tensors: Mapping[str, Tensor]) -> str:
-    """CRC-32 of the numbers in contiguous tensors, in the order of their names."""
+    """Return the CRC-32 of the numbers in contiguous tensors, in the order of their names."""
     ordered = (tensors[name].reshape(-1).view(torch.uint8) for name in sorted(tensors))
     return crc32_of(tensor.numpy().data for tensor in ordered)
 
 
 def _from_onnx(source: SettingsFile) -> TrainedNetwork:
     network = OnnxNetwork(source.path)
-    described = _described(source.path, network.metadata) | {"settings": None}
+    described = _parse_metadata(source.path, network.metadata) | {"settings": None}
     _check_tensors(source.path, network.metadata, network.checksum)
-    return _trained(described, network, source)
+    return _build_trained(described, network, source)
 
 
 def _from_safetensors(source: SettingsFile) -> TrainedNetwork:
     metadata = _metadata(source.path)
-    described = _described(source.path, metadata)
+    described = _parse_metadata(source.path, metadata)
     tensors = load_file(source.path)
     _check_tensors(source.path, metadata, tensor_checksum(tensors))
-    return _trained(described, _network(described, tensors, source), source)
+    return _build_trained(described, _build_network(described, tensors, source), source)
 
 
 def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
-    """A network with the sizes of images it takes, found by trial."""
+    """Load a network, and find by trial the sizes of images that it takes."""
     path = source.path
     content = read_checkpoint(path)
     if content["predicts"] != PIXEL_CLASSES:
         raise DataError(
             path,
             found=f"a network that predicts {content['predicts'] or 'something else'}",
-            expected=f"one that predicts {PIXEL_CLASSES}",
-            remedy=f"tangent-evaluate checkpoint={path} takes networks of all tasks.",
+            expected=f"a network that predicts {PIXEL_CLASSES}",
+            remedy=f"Networks of all tasks: tangent-evaluate checkpoint={path}.",
         )
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
@@ -328,7 +337,7 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
         for name, tensor in content["state_dict"].items()
         if str(name).startswith(_PREFIX)
     }
-    trained = _trained(described, _network(described, tensors, source), source)
+    trained = _build_trained(described, _build_network(described, tensors, source), source)
     if trained.fixed_size is not None:
         return trained
     multiple = size_multiple_of(trained.network, trained.in_channels)
@@ -336,10 +345,10 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     return replace(trained, size_multiple=multiple or 1, fixed_size=fixed)
 
 
-def _network(
+def _build_network(
     described: dict[str, Any], tensors: Mapping[str, Tensor], source: SettingsFile
 ) -> nn.Module:
-    """A network with the tensors of its file; its settings are completed in place."""
+    """Build a network with the tensors of its file; complete its settings in place."""
     if described["settings"] is None:
         raise DataError(source.path, found="no settings of the network", expected=_EXPORTED)
     channels, classes = len(channel_names(described["inputs"])), len(described["class_names"]) - 1
@@ -353,15 +362,15 @@ def _network(
             source.path,
             found=f"other tensors than those of its network ({error})",
             expected=f"the tensors of {settings['_target_']}",
-            remedy="Is the package of the network of another version than in training?",
+            remedy="Install the version of the network's package that it was trained with.",
         ) from error
     return network.eval()
 
 
-def _trained(
+def _build_trained(
     described: Mapping[str, Any], network: nn.Module, source: SettingsFile
 ) -> TrainedNetwork:
-    # An impossible representation is refused now, not when it is used.
+    # Built to refuse an impossible representation before it is used.
     representation = build_from_config(described["representation"], "representation", source)
     rows, columns = described.get("image_size", representation.image_size)
     normalization, fixed = described["normalization"], described.get("fixed_size")
@@ -379,8 +388,8 @@ def _trained(
     return TrainedNetwork(**{**described, **known})
 
 
-def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
-    """The description of a network in the metadata of its file."""
+def _parse_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Parse the description of a network in the metadata of its file."""
     where = f"'{METADATA_KEY}' of its metadata"
     try:
         content = parse_json(metadata.get(METADATA_KEY, ""))
@@ -389,14 +398,14 @@ def _described(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:
             path,
             found=f"no JSON in {where} ({error})",
             expected=_EXPORTED,
-            remedy="It holds the classes and normalization of the network. tangent-import writes "
-            "it for a network of another program.",
+            remedy="These are the classes and normalization of the network. tangent-import writes "
+            "them for a network of another program.",
         ) from error
     return check_fields(path, check_plain(path, content, where), _KINDS, _EXPORTED, where)
 
 
 def _metadata(path: Path) -> dict[str, str]:
-    """Metadata of a safetensors file."""
+    """Read the metadata of a safetensors file."""
     try:
         with safe_open(path, framework="pt") as file:
             return file.metadata() or {}

@@ -1,1 +1,1 @@
-"""The commands: compose a config, build its objects and run them."""
+"""Commands: compose a config, build its objects and run them."""

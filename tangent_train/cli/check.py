@@ -1,4 +1,4 @@
-"""``tangent-check``: all problems of a data set, in one table."""
+"""``tangent-check``: list all problems of a data set."""
 
 from __future__ import annotations
 
@@ -17,41 +17,41 @@ from tangent_train.results.tables import Table, percent
 def check(settings: Mapping[str, Any]) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
-    On a terminal the problems are a table, elsewhere lines of file, finding and remedy with tabs
-    between them; progress, the shares of the classes and the summary go to standard error then.
+    On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding
+    and remedy, separated by tabs; everything else then goes to standard error.
 
     Args:
-        settings: The composed ``check.yaml``.
+        settings: Composed ``check.yaml``.
     """
     representation = build_from_config(settings["representation"], "representation")
     data = build_from_config(settings["data"], "data", representation=representation)
     terminal = sys.stdout.isatty()
-    with redirect_stdout(sys.stderr):  # progress is none of the problems that are listed
+    with redirect_stdout(sys.stderr):  # where progress is printed
         problems, count = data.check()
     listed = problems.listed()
-    # Names of files may hold line ends, terminal escapes and invalid bytes.
-    read = f"{counted(count, data.noun)} of {repr(str(data.root))[1:-1]} checked"
+    # Names of files may contain line ends, terminal escapes and invalid bytes.
+    checked = f"{counted(count, data.noun)} of {repr(str(data.root))[1:-1]} checked"
     rows = [[repr(text)[1:-1] for text in problem[:3]] for problem in listed]
     if rows and terminal:
         Table("", ("file", "finding", "remedy"), rows, text_columns=range(3), lines=True).print()
     for row in () if terminal else rows:
         sys.stdout.write("\t".join(row) + "\n")
-    labelled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
+    labeled = {split: counts for split, counts in data.label_counts.items() if counts.any()}
     warnings = sorted(problems.warnings) + [
         doubt
-        for split, counts in labelled.items()
+        for split, counts in labeled.items()
         for doubt in label_doubts(split, counts, data.class_names)
     ]
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
-        if labelled:
-            shares = [[percent(share) for share in n / n.sum()] for n in labelled.values()]
+        if labeled:
+            shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
             columns = zip(data.class_names, *shares, strict=True)
-            Table("Pixels of each class, %", ["class", *labelled], list(map(list, columns))).print()
+            Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
-    found = counted(len(listed), "problems") if listed else "Nothing is wrong"
+    summary = counted(len(listed), "problems") if listed else "Nothing is wrong"
     if warnings:
-        found = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
-    print_text(f"{found}; {read}.", error=bool(listed or warnings) and not terminal)
+        summary = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"
+    print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)

@@ -1,6 +1,6 @@
 """Settings of the commands, checked before torch is imported.
 
-Importing this takes a few hundredths of a second, importing a command seconds.
+Importing this module takes a few hundredths of a second; importing a command takes seconds.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
     """Refuse settings of a wrong type, and inputs that do not exist.
 
     Args:
-        command: The command, such as predict.
-        config: Its composed config, resolved.
-        overrides: Settings that the user typed. Folders of data that an experiment names are
-            checked later, with the data set that the user may have put in place of its own.
+        command: Name of the command, e.g. predict.
+        config: Composed config of the command, resolved.
+        overrides: Settings that the user typed. A data folder that is not among them, such as one
+            from an experiment, is checked later by its data set.
 
     Raises:
         DataError: A file or folder is missing.
-        SettingError: A setting is of another type.
+        SettingError: A setting has another type.
     """
     kind = SETTINGS[command]
     settings = parse_settings(kind, config)
@@ -38,7 +38,7 @@ def check_settings(command: str, config: Mapping[str, Any], overrides: Sequence[
             one.metadata["check"](one.name, value)
     images = ("left", "right", "input") if command == "keypoints" else ()
     if any(config[name] is not None for name in images):
-        return  # instead of a data set
+        return  # images take the place of the data set
     typed_names = names_of(overrides)
     for prefix, section in (("", config), ("photos.", config.get("photos") or {})):
         data = section.get("data") or {}
@@ -83,10 +83,10 @@ class InputSettings:
     """Settings of a command that takes images and videos.
 
     Attributes:
-        input: See `datamodules.images.image_files.image_paths`.
-        crop: The part of the sphere that panoramas show, see `area_of_crop`; None for that of
-            their GPano tags.
-        every: Step between the frames of a video: 1 takes all, n the first and every n-th one.
+        input: Images, see `datamodules.images.image_files.image_paths`.
+        crop: Part of the sphere that panoramas show, see `area_of_crop`; None for the part that
+            their GPano tags name.
+        every: Step between the frames of a video: 1 for all, n for the first and every n-th one.
     """
 
     input: str | Path | None = field(metadata=_IMAGES)
@@ -185,7 +185,7 @@ class ImportSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class KeypointSettings:
-    """Settings of ``configs/keypoints.yaml``, except for data and fields of `Comparer`."""
+    """Settings of ``configs/keypoints.yaml``, except for the fields of `Comparer`."""
 
     data: dict[str, Any] | None = None
     output: Path
@@ -220,7 +220,7 @@ class RunSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class TrainSettings(RunSettings):
-    """See ``configs/train.yaml``; `name` is a folder."""
+    """See ``configs/train.yaml``; `name` may contain folders."""
 
     name: str | Path
     init_from: Path | None = field(metadata=_EXISTS)
@@ -237,7 +237,7 @@ class ClassMapSettings:
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(RunSettings):
-    """See ``configs/evaluate.yaml``; stages of a transfer may have no class map."""
+    """See ``configs/evaluate.yaml``; a stage of a transfer may lack a class map."""
 
     network: dict[str, Any] | None = None  # type: ignore[assignment]
     checkpoint: Path = field(metadata=_EXISTS)

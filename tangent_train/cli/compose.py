@@ -1,4 +1,4 @@
-"""Finding configs, and taking paths literally, before anything heavy is imported."""
+"""Find configs and quote paths on the command line, before anything heavy is imported."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from functools import cache
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import get_type_hints
 
@@ -18,30 +19,53 @@ from tangent_train.cli.command_settings import SETTINGS
 from tangent_train.registry import without_interpolation
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
-"""Text that Hydra reads as this text, without quotes."""
+"""Text that Hydra reads literally without quotes."""
 
-_OF_A_SWEEP = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
-"""One of several values, and the comma after it."""
+_OPTIONS_WITH_VALUE = "--config-dir -cd --config-name -cn --config-path -cp --package -p --info -i"
+
+_SWEEP_VALUE = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
+"""One value of a sweep, and the comma after it."""
 
 
 def config_folder() -> Path:
-    """Return the Hydra tree: the copy inside the wheel first, the checkout's second."""
+    """Return the folder of the configs: the copy inside the wheel, else that of the checkout."""
     package = Path(__file__).resolve().parents[1]
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def overrides_first(arguments: Sequence[str]) -> list[str]:
+    """Move options behind the overrides: Hydra refuses overrides on both sides of an option.
+
+    Args:
+        arguments: Command line after the program's name.
+
+    >>> overrides_first(["level=7", "--config-dir", "own", "seed=1", "-m"])
+    ['level=7', 'seed=1', '--config-dir', 'own', '-m']
+    """
+    options = [
+        argument.startswith("-") or before in _OPTIONS_WITH_VALUE
+        for before, argument in pairwise(["", *arguments])
+    ]
+    return [
+        a
+        for wanted in (False, True)
+        for a, o in zip(arguments, options, strict=True)
+        if o is wanted
+    ]
 
 
 def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
     """Quote the values of settings that are paths, so that Hydra takes them literally.
 
     A setting is a path if the class that takes it declares it as `Path`. Then everything after
-    ``=`` is the path, except for ``~/``, which is the home folder; for ``null`` or nothing, which
-    are no path; and for Hydra's quotes around the whole value. In a sweep, commas separate paths.
-    The folders of Hydra (``hydra.run.dir``) keep their ``${…}``.
+    ``=`` is the path, with three exceptions: ``~/`` is the home folder, ``null`` or nothing is
+    null, and Hydra's quotes around the whole value are removed. In a sweep, commas separate paths.
+    In the folders of Hydra (``hydra.run.dir``), ``${…}`` is still replaced.
 
     Args:
-        command: The command, such as predict.
-        arguments: Its command line.
+        command: Name of the command, e.g. predict.
+        arguments: Command line after the program's name.
 
     >>> literal_paths("predict", ["input=holiday (1)/a=b,c.jpg", "level=7", "depth=null"])
     ["input='holiday (1)/a=b,c.jpg'", 'level=7', 'depth=null']
@@ -53,7 +77,7 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
         if _PLAIN.fullmatch(value) or not re.fullmatch(r"\w[\w.]*", setting):
             literal.append(argument)
         elif re.fullmatch(r"hydra\..*\bdir", setting):
-            is_quoted = _in_quotes(value) is not None
+            is_quoted = _unquoted(value) is not None
             text = value if is_quoted else QuotedString(value, Quote.single).with_quotes()
             literal.append(f"{name}={text}")
         elif _is_path(command, setting, value, arguments):
@@ -65,17 +89,17 @@ def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:
 
 
 def values_of_sweep(value: str, arguments: Sequence[str]) -> list[str]:
-    """Return the values between commas in a sweep; without ``-m``, the whole value."""
+    """Split a value at its commas in a sweep (``-m``); else return the whole value."""
     if {"-m", "--multirun", "hydra.mode=MULTIRUN"}.isdisjoint(arguments):
         return [value]
-    return _OF_A_SWEEP.findall(f"{value},")[:-1]
+    return _SWEEP_VALUE.findall(f"{value},")[:-1]
 
 
 def path_text(value: str) -> str:
-    """Return the path that a value on a command line stands for, see `literal_paths`."""
-    within = _in_quotes(value)
-    if within is not None:
-        return re.sub(r"(\\*)\1\\\$\{", r"\1${", within)
+    """Return the path that a value on a command line means, see `literal_paths`."""
+    unquoted = _unquoted(value)
+    if unquoted is not None:
+        return re.sub(r"(\\*)\1\\\$\{", r"\1${", unquoted)
     return str(Path.home()) + value[1:] if re.match("~(/|$)", value) else value
 
 
@@ -90,17 +114,17 @@ def _quoted_path(value: str) -> str:
     return "null" if value.lower() in ("", "null") else quoted(path_text(value))
 
 
-def _in_quotes(value: str) -> str | None:
-    """Text in Hydra's quotes; None if they are not around the whole value."""
+def _unquoted(value: str) -> str | None:
+    """Return the text inside Hydra's quotes; None if they are not around the whole value."""
     if len(value) > 1 and value[0] == value[-1] and value[0] in "'\"":
         with suppress(HydraException):
-            found = OverridesParser.create().parse_override(f"x={value}").value()
-            return found if isinstance(found, str) else None
+            text = OverridesParser.create().parse_override(f"x={value}").value()
+            return text if isinstance(text, str) else None
     return None
 
 
 def _is_path(command: str, setting: str, value: str, arguments: Sequence[str]) -> bool:
-    """True for a setting that is declared as `Path`, unless it may be a number and is one."""
+    """Return True for a setting declared as `Path`, unless it may be a number and is one."""
     *groups, name = setting.split(".")
     if groups:
         declared = _annotations(groups, name, "\0".join(arguments))
@@ -115,10 +139,10 @@ def _is_path(command: str, setting: str, value: str, arguments: Sequence[str]) -
 
 
 def _annotations(groups: Sequence[str], name: str, arguments: str) -> str:
-    """Annotations of a name in the source code of what may take it.
+    """Find the annotations of an argument in the source code of the classes that may take it.
 
-    These are the modules of the classes and functions that the options of a section's group name,
-    in any folder of configs. Nothing is imported: torch takes seconds.
+    The options of a section's group, in every folder of configs, name these classes and functions.
+    Nothing is imported: torch takes seconds.
     """
     folders = config_folder(), *re.findall(r"(?:--config-dir|-cd)[=\0]([^\0]+)", arguments)
     files = [
@@ -126,23 +150,23 @@ def _annotations(groups: Sequence[str], name: str, arguments: str) -> str:
     ]
     named = r"^ *_target_: *['\"]?([\w.]+)|\._target_=([\w.]+)"
     texts = (*(file.read_text("utf-8") for file in files), arguments)
-    targets = {"".join(found) for text in texts for found in re.findall(named, text, re.MULTILINE)}
+    targets = {"".join(both) for text in texts for both in re.findall(named, text, re.MULTILINE)}
     modules = {target.rpartition(".")[0] for target in targets}
     sources = "\n".join(map(_source, modules))
-    found = re.findall(rf"\b{name}: ([\w.|\[\] ]+)", sources)
+    hints = re.findall(rf"\b{name}: ([\w.|\[\] ]+)", sources)
     unions = [
-        re.findall(rf"^{one.strip()} = (.*)", sources, re.MULTILINE)
-        for one in found
-        if one.strip().isidentifier()
+        re.findall(rf"^{hint.strip()} = (.*)", sources, re.MULTILINE)
+        for hint in hints
+        if hint.strip().isidentifier()
     ]
-    return f"{found} {unions}"
+    return f"{hints} {unions}"
 
 
 @cache
 def _source(module: str) -> str:
-    """Return the source code of a module, and of all modules below it in our packages."""
+    """Return the source code of a module; in our packages also of the modules below it."""
     top, *rest = module.split(".")
-    # Of a whole package: finding a module in it would import the package.
+    # The top package only: finding a module inside it would import the package.
     spec = find_spec(top) if top.isidentifier() else None
     if spec is None:
         return ""
@@ -150,5 +174,5 @@ def _source(module: str) -> str:
     pattern = "**/*.py" if top in ("datamodules", "models") else "__init__.py"
     files = [file for folder in folders for file in folder.glob(pattern)]
     files += [folder.with_suffix(".py") for folder in folders] or [Path(str(spec.origin))]
-    found = (file for file in files if file.suffix == ".py" and file.is_file())
-    return "\n".join(file.read_text("utf-8", errors="replace") for file in found)
+    existing = (file for file in files if file.suffix == ".py" and file.is_file())
+    return "\n".join(file.read_text("utf-8", errors="replace") for file in existing)

@@ -1,4 +1,4 @@
-"""``tangent-evaluate``: a checkpoint on the test fold of its data."""
+"""``tangent-evaluate``: evaluate a checkpoint on the test fold of its data."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ def evaluate(
     """Evaluate a checkpoint on the test fold of its data.
 
     Args:
-        settings: Settings of the run, and ``checkpoint``, ``class_map`` and ``unmapped``; a stage
-            of a transfer has no others.
+        settings: Settings of the run, and ``checkpoint``, ``class_map`` and ``unmapped``. A stage
+            of a transfer may lack the last two.
         source: File that settings come from, see `registry.build_from_config`.
-        trained: Network of a file without settings of a run, if it is loaded already.
+        trained: Network of a file without settings of a run, if it has been loaded.
 
     Raises:
         SettingError: The checkpoint does not fit the data.

@@ -1,4 +1,4 @@
-"""``tangent-export``: a trained network for other programs."""
+"""``tangent-export``: write a trained network for other programs."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from tangent_train.inference.export import export_network
 
 
 def export(config: Mapping[str, Any]) -> None:
-    """Write a trained network to a file and print its largest difference from PyTorch.
+    """Write a trained network to a file, and print the largest difference from PyTorch's scores.
 
     Args:
-        config: The composed ``export.yaml``.
+        config: Composed ``export.yaml``.
 
     Raises:
         DataError: The checkpoint cannot be used.
@@ -41,8 +41,8 @@ def export(config: Mapping[str, Any]) -> None:
     print_text(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
         f"images: {trained.in_channels} channels, {sides}; scores: {trained.network.num_scores} "
-        f"classes\nlargest difference to PyTorch: {written.difference:.1e} of the range of the "
+        f"classes\nlargest difference from PyTorch: {written.difference:.1e} of the range of the "
         "scores"
     )
     if output.suffix.lower() == ".onnx" and sees_rays(trained.network):
-        print_text(f"{output.name} has no cross-image attention; .safetensors keeps it.")
+        print_text(f"{output.name} lacks the cross-image attention; .safetensors contains it.")

@@ -1,4 +1,4 @@
-"""Input of ``tangent-predict`` and ``tangent-render``: images, and the frames of videos."""
+"""Find the images and videos that ``tangent-predict`` and ``tangent-render`` read."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tangent_train.results.predictions import frame_name
 
 
 def is_video(path: Path) -> bool:
-    """True if the suffix of a file is that of a video."""
+    """Return True if a file has the suffix of a video."""
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
@@ -25,10 +25,9 @@ class Inputs:
     """Images and videos by name.
 
     Attributes:
-        files: All files, sorted.
-        videos: Jobs of the videos among them: the number of frames, rows
-            and columns, or an error.
-        every: See `InputSettings`.
+        files: Files of all images and videos, sorted.
+        videos: Jobs of the videos; their value is the number of frames, rows and columns.
+        every: Step between frames, see `InputSettings`.
     """
 
     files: dict[str, Path]
@@ -42,15 +41,15 @@ class Inputs:
         is_result: Callable[[Path], bool],
         check_size: Callable[[Path, tuple[int, int]], object],
     ) -> Inputs:
-        """The files that settings name, without results of this command.
+        """Find the files that settings name, without results of this command.
 
         Args:
             settings: Settings of the command.
-            is_result: True for files that the command wrote.
-            check_size: Refuses videos by their rows and columns.
+            is_result: Function that returns True for a file that the command wrote.
+            check_size: Function that takes a file with its rows and columns, and may refuse them.
 
         Raises:
-            DataError: There are none, or only results.
+            DataError: No files are found, or only results.
             SettingError: `every` is invalid.
         """
         every = at_least("every", settings.every, 1)
@@ -63,7 +62,7 @@ class Inputs:
             return frames, rows, columns
 
         files = {
-            # A folder of images may have the name of a video, whose frames get a folder too.
+            # Frames get a folder with the name of their video, which may also be one of images.
             name + path.suffix if is_video(path) and path.with_suffix("").is_dir() else name: path
             for name, path in zip(short_names(paths), paths, strict=True)
         }
@@ -71,14 +70,14 @@ class Inputs:
         return cls(files, {name: job.then(size) for name, job in videos.items()}, every)
 
     def part(self, shard: Shard) -> Inputs:
-        """Return the inputs of a shard; a video is not divided."""
+        """Return the inputs of a shard; videos are not divided."""
         names = shard.part(list(self.files))
         files = {name: self.files[name] for name in names}
         videos = {name: job for name, job in self.videos.items() if name in files}
         return Inputs(files, videos, self.every)
 
     def names(self) -> list[str]:
-        """Names of all images and frames; a video that cannot be read is one."""
+        """Return the names of all images and frames; an unreadable video counts as one."""
         names = []
         for name in self.files:
             video = self.videos.get(name)
@@ -86,7 +85,11 @@ class Inputs:
         return names
 
     def missing(self, done: Container[str]) -> Iterator[Job]:
-        """Images, and frames with what gives their pixels, that are not done yet."""
+        """Yield jobs for images and frames that are not done; frames have a pixel reader as value.
+
+        Args:
+            done: Names of images and frames that are done.
+        """
         for name, path in self.files.items():
             if name in self.videos:
                 yield from self._frames(self.videos[name], done)

@@ -1,4 +1,4 @@
-"""Work on many files: a progress bar, and errors that do not stop the others."""
+"""Work on many files with a progress bar; an error in one file does not stop the others."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.threads import in_threads
 
 _THREADS = min(4, os.cpu_count() or 1)
-"""Images that are read ahead, and that are written meanwhile, at most: all are in memory."""
+"""Largest number of images that are read ahead, and that wait to be written, in memory."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class Job:
 
     Attributes:
         item: Name of the item.
-        path: The file that it is from.
-        value: Input of the next step; finally the result.
-        error: Message if there is no result.
+        path: File that the item comes from.
+        value: Input of the next step; after the last step, the result.
+        error: Message of a failed step; empty if all succeeded.
     """
 
     item: Any
@@ -35,7 +35,7 @@ class Job:
     error: str = ""
 
     def then(self, step: Callable[[Job], Any]) -> Job:
-        """The job after its next step, which is left out after an error."""
+        """Return the job after its next step; after an error, the step is skipped."""
         if self.error:
             return self
         try:
@@ -53,19 +53,19 @@ def run_jobs(
     before: Callable[[Job], Any] | None = None,
     after: Callable[[Job], Any] | None = None,
 ) -> Generator[Job]:
-    """Do some work for every item, with its rate and the time left on a bar.
+    """Work on items, showing a progress bar with the rate and the time left.
 
     Args:
         description: Label of the progress bar.
-        jobs: The items.
-        count: How many there are.
-        work: Done here, one by one. Takes a job, and a function to call with the share of the work
-            done since the last call.
-        before: Done in other threads for the next items.
-        after: Done in other threads for the last items.
+        jobs: Jobs of the items.
+        count: Number of jobs.
+        work: Function that does the work in this thread, one item at a time. It takes a job, and a
+            function to call with the share of the work done since the last call.
+        before: Step that other threads do ahead of the work.
+        after: Step that other threads do after the work.
 
     Yields:
-        Finished jobs in order; errors have been printed.
+        Finished jobs in order; their errors have been printed.
     """
     with progress_bar() as bar:
         task = bar.add_task(description, total=count, unit="", before=0, rate="")
@@ -93,10 +93,10 @@ _Item = TypeVar("_Item")
 
 @dataclass(frozen=True)
 class Shard:
-    """One of several parts of a list, which differ in length by one item at most.
+    """One of several parts of a list, whose lengths differ by at most one item.
 
     Attributes:
-        number: 1 to `count`.
+        number: Number of the part, from 1 to `count`.
         count: Number of parts.
     """
 
@@ -104,31 +104,32 @@ class Shard:
     count: int
 
     @classmethod
-    def of(cls, setting: Any) -> Shard | None:
-        """The part that a setting names; without one, there are no parts.
+    def parse(cls, setting: Any) -> Shard | None:
+        """Return the part that a setting names; None for null.
 
         Args:
-            setting: As ``3/16``, or None.
+            setting: Value of ``shard``, e.g. ``3/16``, or None.
 
         Raises:
-            SettingError: There is no such part.
+            SettingError: The setting does not name a part.
 
-        >>> Shard.of("3/16")
+        >>> Shard.parse("3/16")
         Shard(number=3, count=16)
         """
         if setting is None:
             return None
-        named = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
-        number, count = map(int, named.groups()) if named else (0, 0)
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
+        number, count = map(int, match.groups()) if match else (0, 0)
         if not 1 <= number <= count:
-            raise SettingError("shard", found=setting, expected="1/16 to 16/16, or of others; null")
+            expected = "number/count, such as 1/16 to 16/16, or null"
+            raise SettingError("shard", found=setting, expected=expected)
         return cls(number, count)
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
 
     def part(self, items: Sequence[_Item]) -> list[_Item]:
-        """Its items of a list: every `count`-th.
+        """Return the items of a list that belong to the part: every `count`-th.
 
         >>> Shard(2, 3).part("abcdefg")
         ['b', 'e']

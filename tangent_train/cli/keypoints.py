@@ -1,4 +1,4 @@
-"""``tangent-keypoints``: keypoints of pairs of panoramas, matched and scored."""
+"""``tangent-keypoints``: match and score keypoints of pairs of panoramas."""
 
 from __future__ import annotations
 
@@ -25,28 +25,28 @@ from tangent_train.registry import build_from_config, check_fields, resolve_targ
 from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
 from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
-_OF_IMAGES = ("left", "right", "input", "pairing")
+_IMAGE_SETTINGS = ("left", "right", "input", "pairing")
 
 
 def keypoints(config: Mapping[str, Any]) -> None:
-    """Compare keypoints of panoramas and of tangent images on pairs, and write the figures.
+    """Compare keypoints of panoramas and of tangent images on pairs, and write the scores.
 
     Args:
-        config: The composed ``keypoints.yaml``.
+        config: Composed ``keypoints.yaml``.
 
     Raises:
         SettingError: A setting is missing or invalid.
-        DataError: There are no pairs.
+        DataError: No pairs are found.
     """
-    given, comparer = parse_settings(KeypointSettings, config), parse_settings(Comparer, config)
-    output = given.output
-    colmap()  # a missing pycolmap is an error now rather than after minutes
+    parsed, comparer = parse_settings(KeypointSettings, config), parse_settings(Comparer, config)
+    output = parsed.output
+    colmap()  # refuses a missing pycolmap before minutes of work
     data, pairs = _pairs(config)
     names = ("export", *(field.name for field in fields(Comparer)))
     settings = {name: config[name] for name in names} | {"data": data}
     done = earlier_results(output, settings)
     pairs.make_files()
-    pair_names = pairs.names[: given.max_pairs]
+    pair_names = pairs.names[: parsed.max_pairs]
 
     def report() -> KeypointReport:
         rows = [row for name in pairs.names for row in done.get(name, ())]
@@ -59,12 +59,12 @@ def keypoints(config: Mapping[str, Any]) -> None:
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
-            if given.export:
+            if parsed.export:
                 _export(output / "export", pairs.files, pair, comparison)
-        except (DataError, MemoryError) as error:  # of this pair; a SettingError is of all
-            print_text(f"Pair {name}: {error or 'too little memory'}")
+        except (DataError, MemoryError) as error:  # a SettingError would concern all pairs
+            print_text(f"Pair {name}: {error or 'not enough memory'}")
             continue
-        if index < given.pictures:
+        if index < parsed.pictures:
             for condition in comparison.images:
                 file = f"{index:03}_{file_name(name)}_{condition}.png"
                 write_bytes(output / "matches" / file, matches_png(comparison, condition))
@@ -73,32 +73,36 @@ def keypoints(config: Mapping[str, Any]) -> None:
     for table in report().means():
         table.print()
     print_text(f"Results are in {output}." if done else "There are no results.")
-    if given.export:
+    if parsed.export:
         print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     if failed := len(set(pair_names) - set(done)):
         sys.exit(f"tangent-keypoints: {failed} of {count} pairs could not be used, see above")
 
 
 def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
-    """Settings of the pairs, and the pairs: the user's own images, or those of a data set."""
-    images = {name: config[name] for name in _OF_IMAGES}
+    """Return the settings of the pairs, and the pairs, from images or from a data set."""
+    images = {name: config[name] for name in _IMAGE_SETTINGS}
     if any(images[name] is not None for name in ("left", "right", "input")):
         return images, ImagePairs(**images)
     if not issubclass(resolve_target(config["data"], "data"), PanoramaPairs):
         raise SettingError(
             "data",
             found=config["data"]["_target_"],
-            expected="pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
+            expected="a data set of pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
         )
     return config["data"], build_from_config(config["data"], "data")
 
 
 def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
-    """Scores of the finished pairs, by name.
+    """Return the scores of the finished pairs in a folder, by name.
+
+    Args:
+        output: Output folder.
+        settings: Settings that the scores depend on.
 
     Raises:
-        DataError: Its ``results.json`` is something else.
-        SettingError: They are of other settings, or there are other files only.
+        DataError: ``results.json`` was not written by this command.
+        SettingError: The scores are of other settings, or the folder has only other files.
     """
     path, expected = output / "results.json", "results of tangent-keypoints"
     if not path.exists():
@@ -117,8 +121,8 @@ def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list
             raise SettingError(
                 name,
                 found=value,
-                expected=f"{before.get(name)}, as for the results in {output}",
-                remedy="Give another output, or remove that folder.",
+                expected=f"{before.get(name)}, with which the results in {output} were made",
+                remedy="Choose another output, or remove that folder.",
             )
     return done
 
@@ -129,14 +133,14 @@ def _export(
     """Add the unrotated pair to the database of every representation.
 
     Raises:
-        DataError: A file is a part of a panorama.
+        DataError: A file shows only a part of the sphere.
     """
     images = []
     for file in (pair.left.file, pair.right.file):
         shape = read_image_size(file)
         if abs(shape[1] - 2 * shape[0]) > 1:
             found = f"{width_height(shape)}, a part of a panorama"
-            raise DataError(file, found=found, expected="a whole panorama: COLMAP has no partial")
+            raise DataError(file, found=found, expected="a whole panorama for COLMAP")
         images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
     for name, matched in comparison.found[AS_GIVEN].items():
         path = folder / file_name(name) / "database.db"
@@ -145,12 +149,12 @@ def _export(
 
 
 def _root(files: Sequence[Path]) -> Path:
-    """The folder that holds all images, directly or in its folders."""
+    """Return the innermost folder that contains all images."""
     return Path(os.path.commonpath([file.absolute().parent for file in files]))
 
 
 def file_name(name: str) -> str:
-    """A name as part of the name of a file, at most 80 characters.
+    """Replace characters of a name that do not belong in a file name; at most 80 are kept.
 
     >>> file_name("hall/a – hall/b")
     'hall_a_hall_b'

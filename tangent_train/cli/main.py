@@ -1,7 +1,7 @@
 """Entry points of the console scripts.
 
-Nothing heavy is imported before Hydra has composed the settings: ``--help`` and a misspelt override
-answer at once. ``python -m tangent_train.cli.main train …`` is ``tangent-train …``.
+Nothing heavy is imported before Hydra has composed the settings: ``--help`` and a misspelled
+override return immediately. ``python -m tangent_train.cli.main train …`` is ``tangent-train …``.
 """
 
 from __future__ import annotations
@@ -31,20 +31,19 @@ if TYPE_CHECKING:
 
 _NOT_BUILT = {
     "check": ("network", "optimizer", "task", "trainer"),
-    "evaluate": ("optimizer",),
     "prepare": ("network", "optimizer", "task", "trainer"),
 }
-"""Sections of a run that a command does not build: added settings are checked all the same."""
+"""Sections that a command does not build; settings that the user adds to them are still checked."""
 
 
 def _main(command: str) -> None:
-    """Compose the config ``<command>.yaml`` with the command line and hand it to the command."""
+    """Compose ``<command>.yaml`` with the command line and run the command with the result."""
     _prepare_process()
     import hydra
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangent_train.cli.compose import config_folder, literal_paths
+    from tangent_train.cli.compose import config_folder, literal_paths, overrides_first
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.run_folder import folders
@@ -52,16 +51,16 @@ def _main(command: str) -> None:
     from tangent_train.cli.stored import stored_run
 
     end_with_first_process()
-    typed = sys.argv[1:]
-    arguments = typed[1:] if __name__ == "__main__" else typed
+    typed_arguments = sys.argv[1:]
+    arguments = typed_arguments[1:] if __name__ == "__main__" else typed_arguments
     visible_gpus = os.environ.get("CUDA_VISIBLE_DEVICES")
-    with _refusals(command), _errors_once(), ended_by_sigterm(), folders:
+    with _errors_as_messages(command), _thread_errors_once(), ended_by_sigterm(), folders:
         stored = stored_run(command, arguments)
 
         def job(config: DictConfig) -> float | None:
-            # Lightning starts further processes with this command line: it must be the typed one.
-            sys.argv[1:] = typed
-            with _refusals(command):
+            # Lightning starts further processes with this command line: it must be the user's.
+            sys.argv[1:] = typed_arguments
+            with _errors_as_messages(command):
                 return _run(command, config, stored, visible_gpus)
 
         if stored is not None:
@@ -69,13 +68,13 @@ def _main(command: str) -> None:
         folder = config_folder()
         arguments = ["logger=none" if a == "logger=null" else a for a in arguments]
         if command == "import":
-            # A setting, not a choice of Hydra's group of this name: for that it takes no mapping.
+            # As a mapping, Hydra reads it as a setting instead of an option of the group network.
             arguments = [re.sub("^network=(.+)", r"network={name:\1}", a) for a in arguments]
-        for k, argument in enumerate(arguments):  # Hydra takes no null for a group here
+        for k, argument in enumerate(arguments):  # Hydra refuses null for a group on a command line
             group = re.fullmatch(r"(\w+)(@[\w.]+)?=null", argument)
             if group is not None and (folder / group[1]).is_dir():
                 arguments[k] = f"~{argument.removesuffix('=null')}"
-        sys.argv[1:] = literal_paths(command, arguments)
+        sys.argv[1:] = literal_paths(command, overrides_first(arguments))
         try:
             os.environ["HYDRA_FULL_ERROR"] = "1"  # Hydra raises what it would print
             run = hydra.main(version_base="1.3", config_path=str(folder), config_name=command)(job)
@@ -91,16 +90,15 @@ def _main(command: str) -> None:
                 cause = f"{cause}. {probable_setting(command, unknown[1])}".strip()
             sys.exit(printable(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause)))
         finally:
-            sys.argv[1:] = typed
+            sys.argv[1:] = typed_arguments
 
 
 def _prepare_process() -> None:
-    """Print what the encoding of the output lacks escaped; start no module of this folder."""
+    """Escape characters that the output cannot encode; never import from the working directory."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    # Of all processes that are started, whatever starts them: the working directory is not on their
-    # path, as it is not on that of the console scripts.
+    # Console scripts do not have the working directory on their path; nor do processes they start.
     os.environ["PYTHONSAFEPATH"] = "1"
 
 
@@ -117,11 +115,11 @@ keypoints = partial(_main, "keypoints")
 
 
 def report() -> None:
-    """``tangent-report <run folders>``: tables and a chart over runs."""
+    """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
     from tangent_train.cli.report import report as write_report
 
     _prepare_process()
-    with _refusals("report"):
+    with _errors_as_messages("report"):
         write_report(sys.argv[1:])
 
 
@@ -136,15 +134,15 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from tangent_train.registry import check_arguments
 
     composed: Any = OmegaConf.to_container(config)
-    whole = OmegaConf.to_container(HydraConfig.instance().cfg)
-    check_names(command, composed, f"{composed} {whole} {folder_settings}")
+    hydra_settings = OmegaConf.to_container(HydraConfig.instance().cfg)
+    check_names(command, composed, f"{composed} {hydra_settings} {folder_settings}")
     if in_sweep():
         return run_job(command, config, () if stored is None else stored.added, visible_gpus)
-    logging.getLogger().handlers.clear()  # Hydra's would print again what Lightning prints
+    logging.getLogger().handlers.clear()  # with Hydra's handlers, messages are printed twice
     if "SUBMITIT_EXECUTOR" in os.environ:
-        # SLURM warns every process; submitit's ends this one, with SIGTERM, for a last checkpoint.
+        # SLURM signals every process. submitit's then sends SIGTERM here, for a last checkpoint.
         signal.signal(signal.SIGUSR2, signal.SIG_IGN)
-    name = "import_network" if command == "import" else command  # a word of Python
+    name = "import_network" if command == "import" else command  # import is a keyword
     settings: Any = OmegaConf.to_container(config, resolve=True)
     settings = {n: value for n, value in settings.items() if n in declared_settings(command)}
     if command == "import" and isinstance(settings["network"], dict):
@@ -153,40 +151,40 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     check_settings(command, settings, HydraConfig.get().overrides.task)
     with elsewhere():
         run = getattr(import_module(f"tangent_train.cli.{name}"), name)
-        import_module("datamodules.core.split_module")  # for commands that import no library yet
+        import_module("datamodules.core.split_module")  # some commands have not imported it yet
     for override in HydraConfig.get().overrides.task:
         section = override.lstrip("+").partition(".")[0]
         if override[0] == "+" and section in _NOT_BUILT.get(command, ()):
             check_arguments(settings.get(section), section)
-    if command == "transfer":  # its stages keep the references of the config
+    if command == "transfer":  # its stages need the config with its references
         return run(config)
     return run(settings) if stored is None else run(*stored.settings(settings))
 
 
 @contextmanager
-def _refusals(command: str) -> Iterator[None]:
+def _errors_as_messages(command: str) -> Iterator[None]:
     """Exit with a one-line message if a setting or a file cannot be used."""
     try:
         yield
         sys.stdout.flush()
-    except BrokenPipeError:  # "| head" has read enough
+    except BrokenPipeError:  # the reader has closed the pipe, e.g. "| head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)
     except (DataError, SettingError, OSError) as error:
-        _refuse(command, error)
+        _exit_with_message(command, error)
     except KeyboardInterrupt as error:
-        _end(command, error)
+        _exit_interrupted(command, error)
     except SystemExit as error:
-        if isinstance(error.__cause__, OSError | SettingError):  # of `RunFolder`
-            _refuse(command, error.__cause__)
+        if isinstance(error.__cause__, OSError | SettingError):  # raised by `RunFolder`
+            _exit_with_message(command, error.__cause__)
         # Lightning ends an interrupted run with 1.
         if error.code == 1 and isinstance(error.__context__, KeyboardInterrupt):
-            _end(command, error.__context__)
+            _exit_interrupted(command, error.__context__)
         raise
 
 
-def _refuse(command: str, error: Exception) -> NoReturn:
-    """Exit with one line for an error; raise those that the system did not report."""
+def _exit_with_message(command: str, error: Exception) -> NoReturn:
+    """Exit with one line for an error; re-raise an `OSError` without an error number."""
     if isinstance(error, OSError):
         if error.errno is None:
             raise error
@@ -195,29 +193,29 @@ def _refuse(command: str, error: Exception) -> NoReturn:
             path or "output",
             found=os.strerror(error.errno).lower(),
             expected="a file or folder that can be read and written",
-            remedy="Change its permissions, or choose another one (of a run: hydra.run.dir=…).",
+            remedy="Change its permissions, or choose another one (for a run: hydra.run.dir=…).",
         )
     sys.exit(f"tangent-{command}: {error}")
 
 
 @contextmanager
-def _errors_once() -> Iterator[None]:
-    """Print no error of a thread that keeps it, as TensorBoard's do: it is raised here too."""
+def _thread_errors_once() -> Iterator[None]:
+    """Do not print errors that a thread stores (e.g. TensorBoard's): they are raised here too."""
     before = threading.excepthook
 
-    def print_unless_kept(error: threading.ExceptHookArgs) -> None:
+    def print_unless_stored(error: threading.ExceptHookArgs) -> None:
         if getattr(error.thread, "exception", None) is not error.exc_value:
             before(error)
 
-    threading.excepthook = print_unless_kept
+    threading.excepthook = print_unless_stored
     try:
         yield
     finally:
         threading.excepthook = before
 
 
-def _end(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
-    """Exit with the status of a shell; the command has printed how to continue."""
+def _exit_interrupted(command: str, interrupt: KeyboardInterrupt) -> NoReturn:
+    """Exit with a shell's status for the signal; the command has printed how to continue."""
     from tangent_train.cli.processes import SigtermError
 
     received = signal.SIGTERM if isinstance(interrupt, SigtermError) else signal.SIGINT

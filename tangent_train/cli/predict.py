@@ -1,4 +1,4 @@
-"""``tangent-predict``: label maps of user panoramas and photos."""
+"""``tangent-predict``: predict the labels of panoramas and photos."""
 
 from __future__ import annotations
 
@@ -51,40 +51,40 @@ _DECISIVE = (
     "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
-"""Settings that results depend on: resumed predictions must have the same."""
+"""Settings that results depend on: resuming requires the same values."""
 
 _SAVED_EVERY_S = 10.0
-"""Seconds of work that may be lost when a process is killed."""
+"""Time between summaries: work that may be lost when a process is killed."""
 
 
 def predict(config: Mapping[str, Any]) -> None:
     """Predict the labels of images and write them.
 
     Args:
-        config: The composed ``predict.yaml``.
+        config: Composed ``predict.yaml``.
 
     Raises:
         SettingError: A setting is missing or invalid.
-        DataError: The checkpoint cannot be read, or there are no images.
+        DataError: The checkpoint cannot be read, or no images are found.
     """
     settings = parse_settings(PredictSettings, config)
     _check_projection(settings)
     decisive = {name: config[name] for name in _DECISIVE}
-    inputs, shard = _inputs(settings), Shard.of(settings.shard)
+    inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     original, trained = _networks(settings)
     folder = PredictionFolder(settings.output, trained.class_names, settings.write)
     names = inputs.names()
     shown = [names[number] for number in evenly_spread(settings.report, len(names))]
-    label = _Labeller(settings, original, trained, folder, shown)
+    label = _Labeler(settings, original, trained, folder, shown)
     if shard is None:
         done = _label(settings, decisive, inputs, label, folder)
         _finish(settings, inputs, label, folder, done)
     else:
-        together = {**decisive, "write": list(settings.write)}
-        part = PredictionShard(shard, settings.output / "shards", list(inputs.files), together)
+        shared = {**decisive, "write": list(settings.write)}
+        part = PredictionShard(shard, settings.output / "shards", list(inputs.files), shared)
         done = _label(settings, decisive, inputs.part(shard), label, folder, part)
         part.save(done, done=True)
-        count, entries = part.together()
+        count, entries = part.finished()
         print_text(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
@@ -97,11 +97,11 @@ def _label(
     settings: PredictSettings,
     decisive: Mapping[str, Any],
     inputs: Inputs,
-    label: _Labeller,
+    label: _Labeler,
     folder: PredictionFolder,
     part: PredictionShard | None = None,
 ) -> list[Entry]:
-    """Label images, those of a shard or all; returns their entries, with those done before."""
+    """Label all images, or those of a shard; return their entries and those of earlier runs."""
     summary = None if part is None else part.path
     known = folder.earlier(decisive, summary) if settings.resume else None
     if not (settings.overwrite or known is not None or (part and part.folder.exists())):
@@ -122,7 +122,7 @@ def _label(
     print_text(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
     steps = label, label.read, label.write
-    labelled = set()
+    labeled = set()
     saved = -math.inf
     save()
     try:
@@ -130,18 +130,18 @@ def _label(
             for job in done:
                 entry = {"error": job.error} if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
-                labelled.add(job.path)
+                labeled.add(job.path)
                 if time.monotonic() - saved > _SAVED_EVERY_S:
                     save()
                     saved = time.monotonic()
     except KeyboardInterrupt:
-        print_text(f"{len(entries)} of {count} images are done. resume=true continues.")
+        print_text(f"{len(entries)} of {count} images are done. Continue with resume=true.")
         raise
     finally:
         save()
         if part is None and not any("classes" in entry for entry in entries):
             folder.remove_summary()
-    if unmade := _make_videos(inputs, folder, entries, labelled):
+    if unmade := _make_videos(inputs, folder, entries, labeled):
         entries += unmade
         save()
     return entries
@@ -150,11 +150,11 @@ def _label(
 def _finish(
     settings: PredictSettings,
     inputs: Inputs,
-    label: _Labeller,
+    label: _Labeler,
     folder: PredictionFolder,
     entries: Sequence[Entry],
 ) -> None:
-    """Write the report, and print the shares of the classes."""
+    """Write the report and print the shares of the classes."""
     used = {entry["name"] for entry in entries if "classes" in entry}
     if not used:
         return
@@ -165,15 +165,15 @@ def _finish(
     print_text(f"Results are in {settings.output}.")
 
 
-class _Labeller:
-    """Reads images, predicts their labels and writes these.
+class _Labeler:
+    """Reads images, predicts their labels and writes them.
 
     Args:
         settings: Settings of the command.
-        original: The network before classes are mapped, which estimates up.
-        trained: The network.
+        original: Network with its original classes, which estimates the up direction.
+        trained: Network with mapped classes, which predicts the labels.
         folder: Output folder.
-        shown: Names of the images of the report.
+        shown: Names of the images in the report.
     """
 
     def __init__(
@@ -192,32 +192,33 @@ class _Labeller:
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
-        """Read one image; a panorama with its area."""
-        given, image = self._settings, job.path if job.value is None else job.value()
+        """Read one image; return it with the area of a panorama, or with None for a photo."""
+        settings, image = self._settings, job.path if job.value is None else job.value()
         stem = job.item.removesuffix(job.path.suffix)
         depth = None if self._depth is None else partial(self._depth.read, stem)
-        if given.projection == "perspective":
-            return read_photo(image, given.fov, depth), None
-        return read_panorama(image, given.crop, given.upright, depth)
+        if settings.projection == "perspective":
+            return read_photo(image, settings.fov, depth), None
+        return read_panorama(image, settings.crop, settings.upright, depth)
 
     def __call__(self, job: Job, progress: Callable[[float], object]) -> LabeledImage:
-        """Predict the labels of one image that was read."""
+        """Predict the labels of one image."""
         image, area = job.value
         if self._settings.upright == "auto" and area is not None:
             image = with_up(image, self._settings.max_tilt_deg, self._judge)
         probabilities = "probabilities" in self._settings.write
         scores = self._predictor.predict(image, progress, probabilities=probabilities)
-        self._folder.write_probabilities(job.item, scores, area)  # here: scores are large
+        # Not written in another thread: scores take much memory.
+        self._folder.write_probabilities(job.item, scores, area)
         labels = self._trained.labels(scores.labels())
         return LabeledImage(image, labels if area is None else area.cut(labels), area)
 
     def write(self, job: Job) -> Entry:
-        """Write the labels of one image, and return its entry of the summary."""
+        """Write the labels of one image; return its entry in the summary."""
         image, labels, area = labeled = job.value
-        counted = np.array(True)
+        is_counted = np.array(True)
         if area is not None:
-            counted = area.cut(self._masks.read(job.item, area)) > 0
-            labels = np.where(counted, labels, labels.dtype.type(0))
+            is_counted = area.cut(self._masks.read(job.item, area)) > 0
+            labels = np.where(is_counted, labels, labels.dtype.type(0))
             labeled = LabeledImage(image, labels, area)
         folder = self._folder.of_frames if is_video(job.path) else self._folder
         folder.write(job.item, labeled)
@@ -227,17 +228,17 @@ class _Labeller:
             entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        entry["classes"] = class_shares(labeled, self._folder.class_names, counted)
+        entry["classes"] = class_shares(labeled, self._folder.class_names, is_counted)
         if job.item in self._shown:
             self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
-        """Pictures for the report; images labelled earlier or elsewhere are read again.
+        """Return the pictures of the report; images labeled by other processes are read again.
 
         Args:
             inputs: All images and videos.
-            used: Names of the images and frames that have been labelled.
+            used: Names of the labeled images and frames.
         """
         count, names = self._settings.report, [name for name in inputs.names() if name in used]
         wanted = [names[number] for number in evenly_spread(count, len(names))]
@@ -249,20 +250,20 @@ class _Labeller:
                 labeled = LabeledImage(image, read_pixels(labels, indices=True), area)
                 self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
         others = [name for name in self._shown if name not in wanted]
-        made = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
-        shown = (self._shown[name] for name in names if name in made[:count])
+        available = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
+        shown = (self._shown[name] for name in names if name in available[:count])
         return [picture for picture in shown if picture is not None]
 
 
 def _make_videos(
-    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labelled: set[Path]
+    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labeled: set[Path]
 ) -> list[Entry]:
-    """Make pictures of the videos of which every frame was labelled; returns the errors."""
+    """Write the result videos of videos whose frames are all labeled; return errors as entries."""
     failed = {entry["file"] for entry in entries if "error" in entry}
     videos = [job for job in inputs.videos.values() if str(job.path) not in failed]
 
     def write(job: Job, _: Callable[[float], object]) -> None:
-        again = job.path in labelled
+        again = job.path in labeled
         folder.write_videos(job.item, job.path, job.value, inputs.every, again=again)
 
     done = run_jobs("Making videos", videos, len(videos), write)
@@ -270,7 +271,7 @@ def _make_videos(
 
 
 def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork]:
-    """The network with its original classes, and with those of the class map."""
+    """Return the network with its original classes, and with those of the class map."""
     if settings.class_map is None:
         return (load_trained(settings.checkpoint, settings.trust),) * 2
     class_map = load_class_map(settings.class_map)
@@ -281,7 +282,7 @@ def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork
 
 
 def _inputs(settings: PredictSettings) -> Inputs:
-    """The images and videos."""
+    """Find the images and videos."""
 
     def check_size(path: Path, size: tuple[int, int]) -> None:
         if settings.projection == "equirectangular":
@@ -293,28 +294,27 @@ def _inputs(settings: PredictSettings) -> Inputs:
         raise SettingError(
             "write",
             found=f"{' and '.join(sorted(pictures))} of a video without labels",
-            expected="labels too: pictures of a video are made of the labels of all its frames",
+            expected="labels too: videos of pictures are made from the labels of all frames",
         )
     return inputs
 
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
-    how = settings.levels, settings.base_level, settings.blend, settings.rotations
-    of_forward = settings.device, settings.images_per_forward
-    views = kind(trained, *how)
+    views = kind(trained, settings.levels, settings.base_level, settings.blend, settings.rotations)
     if isinstance(views, PanoramaViews):
         print_text(f"A panorama is labeled in {views}.")
-    return Predictor(trained, views, *of_forward, settings.min_confidence)
+    device, count = settings.device, settings.images_per_forward
+    return Predictor(trained, views, device, count, settings.min_confidence)
 
 
 def _check_projection(settings: PredictSettings) -> None:
     """Refuse settings of photos for panoramas, and of panoramas for photos."""
-    of_photos = settings.projection == "perspective"
-    others = ("crop", "upright", "mask") if of_photos else ("fov",)
+    is_photo = settings.projection == "perspective"
+    others = ("crop", "upright", "mask") if is_photo else ("fov",)
     for name in others:
         if (found := getattr(settings, name)) is not None:
-            expected = "null for photos" if of_photos else "null without projection=perspective"
+            expected = "null for photos" if is_photo else "null without projection=perspective"
             raise SettingError(name, found=found, expected=expected)
 
 

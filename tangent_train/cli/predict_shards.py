@@ -1,4 +1,4 @@
-"""Shards of predictions: the results of each in one file, and of all together."""
+"""Shards of predictions: store the results of each in a file, and combine them."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from tangent_train.results.predictions import Entry
 
 @dataclass(frozen=True)
 class PredictionShard:
-    """One of the shards of predictions, which see each other only through their files.
+    """One of the shards of predictions, which exchange results through their files.
 
     Attributes:
-        shard: Number of the shard, and of all shards.
-        folder: Folder of the files of all shards, ``3-of-16.json``.
+        shard: Number of the shard, and number of all shards.
+        folder: Folder of the files of all shards, e.g. ``3-of-16.json``.
         names: Names of the images and videos of all shards, in order.
         settings: Settings that all shards must share.
     """
@@ -41,30 +41,30 @@ class PredictionShard:
 
         Args:
             entries: Entries of images done before.
-            resume: True if it may have begun before.
-            overwrite: True if it may replace earlier files.
+            resume: True if the shard may have begun before.
+            overwrite: True if earlier files may be replaced.
 
         Raises:
-            SettingError: It has begun before, or others in the folder do not belong to it.
+            SettingError: The shard has begun before, or files in the folder are of other shards.
         """
         known = self.path.exists()
         if known and not (resume or overwrite):
             raise SettingError(
                 "shard",
                 found=f"{self.shard}, which has {self.path}",
-                expected="one that has not begun",
-                remedy="resume=true continues it, overwrite=true does it again.",
+                expected="a shard that has not begun",
+                remedy="Continue it with resume=true, or repeat it with overwrite=true.",
             )
-        # First: of two that begin at once and do not belong together, one sees the other.
+        # Saved before the check: if two that do not fit begin together, one of them finds it.
         self.save(entries)
         for path in self.folder.glob("[!.]*.json"):
             if not (content := _read(path)):
-                continue  # taken back meanwhile
-            unlike = [name for name, value in self._common.items() if content.get(name) != value]
-            if unlike and not overwrite:
+                continue  # removed by its process
+            differing = [name for name, value in self._common.items() if content.get(name) != value]
+            if differing and not overwrite:
                 if not known:
                     self.path.unlink()
-                name = unlike[0]
+                name = differing[0]
                 found, others = f"{name}={self._common[name]}", f" ({content.get(name)})"
                 if name == "names":
                     found, others = "images of other names", ""
@@ -72,33 +72,33 @@ class PredictionShard:
                     "shard",
                     found=f"{found} than those of {path}{others}",
                     expected="the same images and settings for all shards of a folder",
-                    remedy="Give another output, or overwrite=true.",
+                    remedy="Choose another output, or set overwrite=true.",
                 )
-            if "shards" in unlike:  # the others are replaced one by one
+            if "shards" in differing:  # files of the same number are replaced one by one
                 path.unlink(missing_ok=True)
 
     def save(self, entries: Sequence[Entry], *, done: bool = False) -> None:
-        """Write its file.
+        """Write the file of the shard.
 
         Args:
             entries: Entries of the images done so far.
-            done: True if no images are left.
+            done: True if all images are done.
         """
         content = {**self._common, "done": done, "images": list(entries)}
         write_text(self.path, json.dumps(content, indent=1) + "\n")
 
-    def together(self) -> tuple[int, list[Entry]]:
-        """Number of shards that are done, and their entries in the order of `names`."""
+    def finished(self) -> tuple[int, list[Entry]]:
+        """Return the number of finished shards, and their entries in the order of `names`."""
         read = [_read(self._path(number)) for number in range(1, self.shard.count + 1)]
         done = [c for c in read if c.get("done") and self._common.items() <= c.items()]
         entries = [entry for content in done for entry in content["images"]]
-        place = {name: number for number, name in enumerate(self.names)}
+        positions = {name: number for number, name in enumerate(self.names)}
 
-        def order(entry: Entry) -> int:
+        def position(entry: Entry) -> int:
             name: str = entry["name"]
-            return place[name if name in place else name.rpartition("/")[0]]
+            return positions[name if name in positions else name.rpartition("/")[0]]
 
-        return len(done), sorted(entries, key=order)
+        return len(done), sorted(entries, key=position)
 
     @property
     def _common(self) -> dict[str, Any]:
@@ -110,7 +110,7 @@ class PredictionShard:
 
 
 def _read(path: Path) -> dict[str, Any]:
-    """Content of the file of a shard; empty if it is missing or broken."""
+    """Return the content of a shard's file; empty if it is missing or broken."""
     try:
         content = parse_json(path.read_bytes())
     except (OSError, ValueError):

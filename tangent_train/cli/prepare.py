@@ -1,4 +1,4 @@
-"""``tangent-prepare``: generate or check a data set, and its prepared store if set."""
+"""``tangent-prepare``: generate or check a data set, and write its prepared store."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from tangent_train.registry import build_from_config
 
 
 def prepare(settings: Mapping[str, Any]) -> None:
-    """Generate or check the data set.
+    """Generate or check the data set of a run, and write its prepared store if it has one.
 
     Args:
-        settings: The composed ``prepare.yaml``.
+        settings: Composed ``prepare.yaml``.
     """
-    shard = Shard.of(settings["shard"])
+    shard = Shard.parse(settings["shard"])
     representation = build_from_config(settings["representation"], "representation")
     data = build_from_config(settings["data"], "data", representation=representation)
     if shard is not None:

@@ -1,4 +1,4 @@
-"""The network and the tensors that a training takes from another file, ``init_from``."""
+"""Take the network and its tensors from another file for a training, ``init_from``."""
 
 from __future__ import annotations
 
@@ -32,29 +32,28 @@ def with_pretrained_network(
 ) -> tuple[Mapping[str, Any], SettingsFile | None]:
     """Return the settings of a run with the network and the normalization of a file.
 
-    The network is that of the file, unless the user typed one (``network=…``,
-    ``network.widths=…``), or the composed one wraps a network of the file's class, as
-    `SphereContext` does. The data decide its classes and channels. The normalization is that of the
-    file, unless the config has one.
+    The network of the config stays if the user typed one (``network=…``, ``network.widths=…``), or
+    if it wraps a network of the file's class, e.g. in `SphereContext`. Classes and channels are
+    those of the data. The normalization of the config stays if it is not null.
 
     Args:
-        path: A file of any kind that `initialize` reads. A file that does not describe its network,
-            such as a state dict, changes nothing; nor do configs without the group ``network``,
-            such as the stages of a transfer, which are complete.
+        path: File of a kind that `initialize` reads. Nothing changes if it does not describe its
+            network, such as a state dict, or if the config has no group ``network``, such as the
+            complete config of a stage of a transfer.
         settings: Settings of the run.
 
     Returns:
-        Settings of the run, and the source of those that the file gave, if any.
+        Settings of the run, and the file that some come from, or None.
 
     Raises:
-        DataError: It is an ONNX file, or its network returns no scores that can be trained.
+        DataError: It is an ONNX file, or its network does not return scores that can be trained.
     """
     if path.suffix.lower() == ".onnx":
         raise DataError(
             path,
             found="an ONNX file, whose tensors cannot be trained",
             expected="a checkpoint, a state dict or a .safetensors file",
-            remedy="Give the checkpoint that it was exported from.",
+            remedy="Use the checkpoint that it was exported from.",
         )
     description, hydra = describe_network(path), HydraConfig.get()
     if description is None or "network" not in hydra.runtime.choices:
@@ -70,7 +69,7 @@ def with_pretrained_network(
                 path,
                 found=f"a network that returns {description.score_kind}",
                 expected="scores before a softmax or sigmoid, which the losses need",
-                remedy="Take the last step out of the network, and import it again.",
+                remedy="Remove the last step of the network, and import it again.",
             )
         changed["network"] = description.settings
         trust = parse_settings(Trust, settings).trust
@@ -91,19 +90,19 @@ def load_pretrained(path: Path | None, run: Run) -> None:
     """Load the tensors of a file into the network of a new run, and print their names.
 
     Args:
-        path: The file; None to train from scratch.
-        run: Its network is changed in place; its task learns which tensors are new.
+        path: File with tensors; None to train from scratch.
+        run: Run whose network is changed in place, and whose task gets the names of new tensors.
 
     Raises:
-        DataError: The file cannot be read, or nothing in it fits.
-        SettingError: Other learning rates are set for a backbone that is not loaded.
+        DataError: The file cannot be read, or none of its tensors fit.
+        SettingError: A learning rate is set for a backbone, but no file is given.
     """
     if path is None:
         if run.task.backbone_lr_factor != 1:
             raise SettingError(
                 "task.backbone_lr_factor",
                 found=run.task.backbone_lr_factor,
-                expected="1 without init_from=, which says what the backbone is",
+                expected="1 without init_from=: the backbone is the part that is loaded",
             )
         return
     description, network = describe_network(path), run.task.network
@@ -127,7 +126,7 @@ def _print(text: str) -> None:
 
 
 def _wraps(section: Mapping[str, Any], target: Any) -> bool:
-    """True if the settings of a network contain a network of this class."""
+    """Return True if the settings of a network contain those of a network of this class."""
     inner = [value for value in section.values() if isinstance(value, Mapping)]
     return any(value.get("_target_") == target or _wraps(value, target) for value in inner)
 
@@ -135,7 +134,7 @@ def _wraps(section: Mapping[str, Any], target: Any) -> bool:
 def _normalization(
     description: NetworkDescription, data: Mapping[str, Any]
 ) -> dict[str, list[float]] | None:
-    """The normalization of a file for the inputs of the data; None to keep that of the data."""
+    """Return a file's normalization for the inputs of the data; None to keep that of the data."""
     inputs = data.get("inputs")
     if description.inputs is None or inputs is None or data.get("normalization") is not None:
         return None
@@ -148,7 +147,7 @@ def _normalization(
 
 
 def _heads(run: Run) -> set[str]:
-    """Names of the tensors that grow with another class."""
+    """Return the names of the tensors whose shape depends on the number of classes."""
     section, data = run.settings["network"], run.data
     more = completed_settings(section, data.in_channels, data.num_classes + 1, restored=True)
     larger = build_from_config(more, "network", run.source).state_dict()

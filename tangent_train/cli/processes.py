@@ -1,4 +1,4 @@
-"""Runs as processes: their command lines, and waiting for them."""
+"""Start runs as processes and wait for them."""
 
 from __future__ import annotations
 
@@ -16,38 +16,40 @@ from typing import NoReturn
 from tangent_train.cli.compose import quoted
 
 _NOTICE_S = 3.0
-"""After an interrupt, in which a process ends that a terminal's Ctrl-C has reached too."""
+"""Time after Ctrl-C, which a terminal sends to all processes, for a process to end by itself."""
 
-_PATIENCE_S = 30.0  # for a last checkpoint
+_CHECKPOINT_S = 30.0
+"""Time after SIGTERM for a process to save a last checkpoint."""
+
 _WATCHED_EVERY_S = 1.0
 _FIRST = "TANGENT_TRAIN_FIRST_PROCESS"
 
 
 class SigtermError(KeyboardInterrupt):
-    """SIGTERM, by which everything ends as by Ctrl-C."""
+    """SIGTERM, which ends a command in the same way as Ctrl-C."""
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:
     """Return the command line of one run.
 
     Args:
-        command: train, evaluate, …
-        arguments: Options, then overrides.
-        folder: Folder of the run.
+        command: Name of the command, e.g. train.
+        arguments: Options and overrides.
+        folder: Run folder.
     """
     program = [sys.executable, "-m", "tangent_train.cli.main"]
     return [*program, command, *arguments, f"hydra.run.dir={quoted(str(folder))}"]
 
 
 def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = None) -> int:
-    """Run a command to the end; an interrupt or end of this process ends it too.
+    """Run a command and wait for it; Ctrl-C and SIGTERM of this process end it too.
 
     Args:
         line: Program and arguments.
-        changes: Environment variables to change, or to remove with None.
+        changes: Environment variables to set, or to remove (None).
 
     Returns:
-        The exit status.
+        Exit status of the command.
     """
     environment = {**os.environ, **(changes or {})}
     known = {name: value for name, value in environment.items() if value is not None}
@@ -60,7 +62,7 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
                     process.wait(_NOTICE_S if type(error) is KeyboardInterrupt else 0)
                 process.terminate()
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(_PATIENCE_S)
+                    process.wait(_CHECKPOINT_S)
             finally:
                 process.kill()
                 process.wait()
@@ -68,11 +70,10 @@ def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = 
 
 
 def end_with_first_process() -> None:
-    """End this process with the first one of its run, which has started it.
+    """End this process when the first process of its run, which has started it, has ended.
 
-    Lightning starts the other processes of a run on several devices, and ends the first one when
-    one of them fails. A first process that was killed cannot end them: they would wait for it as
-    long as for a slow one, up to an hour.
+    On several devices, Lightning's first process starts the others, and ends when one of them
+    fails. If the first process is killed, the others would wait for it for up to an hour.
     """
     first = os.environ.get(_FIRST)
     if first is None or int(os.environ.get("LOCAL_RANK", "0")) == 0:
@@ -84,14 +85,14 @@ def end_with_first_process() -> None:
             time.sleep(_WATCHED_EVERY_S)
         sys.stderr.write("tangent-train: ended, because the first process of the run has ended\n")
         sys.stderr.flush()
-        os._exit(1)  # at once, also while another thread waits in a library
+        os._exit(1)  # immediately, even if another thread waits in a library
 
     threading.Thread(target=watch, daemon=True).start()
 
 
 @contextmanager
 def ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM unwind this process like Ctrl-C instead of ending it at once."""
+    """Raise `SigtermError` on SIGTERM instead of ending the process immediately."""
 
     def leave(number: int, frame: object) -> NoReturn:
         raise SigtermError

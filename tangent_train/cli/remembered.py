@@ -1,7 +1,7 @@
-"""Settings of a run for this machine, so that they are typed once: its data, loggers and callbacks.
+"""Remember a run's settings for this machine (data, loggers, callbacks): they are typed only once.
 
-Kept in the user's state folder by the place of the run's folder: nothing in a run folder, which may
-be somebody else's, says what is read here.
+They are stored in the user's state folder, under a hash of the run folder's path. Files in a run
+folder, which may come from somebody else, have no influence on them.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from tangent_train.files import NoRoomError, parse_json, write_text
 
 
 def remembered_settings(folder: Path, sections: Collection[str]) -> dict[str, str]:
-    """Return the remembered settings of a run, such as ``data.root``; perhaps none.
+    """Return the remembered settings of a run, such as ``data.root``; empty without any.
 
     Args:
-        folder: The run's folder.
-        sections: Sections of the settings.
+        folder: Run folder.
+        sections: Sections whose settings are returned.
     """
     with suppress(OSError, ValueError):
         content = parse_json(_file(folder).read_bytes())
@@ -31,11 +31,11 @@ def remembered_settings(folder: Path, sections: Collection[str]) -> dict[str, st
 
 
 def remember_settings(folder: Path, settings: Mapping[str, str]) -> None:
-    """Keep settings of a run instead of earlier ones; not where nothing can be written.
+    """Store settings of a run in place of earlier ones; do nothing if they cannot be written.
 
     Args:
-        folder: The run's folder.
-        settings: Values as on a command line, by the name of the setting.
+        folder: Run folder.
+        settings: Values as typed on a command line, by the name of the setting.
     """
     with suppress(OSError, NoRoomError):
         if settings:
@@ -47,5 +47,5 @@ def remember_settings(folder: Path, settings: Mapping[str, str]) -> None:
 
 def _file(folder: Path) -> Path:
     state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    place = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=16).hexdigest()
-    return Path(state) / "tangent-train" / "runs" / f"{place}.json"
+    digest = hashlib.blake2b(os.fsencode(folder.resolve()), digest_size=16).hexdigest()
+    return Path(state) / "tangent-train" / "runs" / f"{digest}.json"

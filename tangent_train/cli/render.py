@@ -1,4 +1,4 @@
-"""``tangent-render``: tangent images as files for other programs, and back."""
+"""``tangent-render``: write tangent images for other programs, and render their results back."""
 
 from __future__ import annotations
 
@@ -53,10 +53,10 @@ def render(config: Mapping[str, Any]) -> None:
     """Render panoramas to tangent images, or results for tangent images to panoramas.
 
     Args:
-        config: The composed ``render.yaml``.
+        config: Composed ``render.yaml``.
 
     Raises:
-        DataError: There is nothing to render.
+        DataError: No files to render are found.
         SettingError: A setting is invalid, or a file would be overwritten.
     """
     settings = parse_settings(RenderSettings, config)
@@ -65,30 +65,33 @@ def render(config: Mapping[str, Any]) -> None:
         raise SettingError(
             "input, back and poses",
             found=" and ".join(modes) or "none of them",
-            expected="input=<panoramas>, back=<results for tangent images>, or poses=<COLMAP's>",
+            expected="input=<panoramas>, back=<results for tangent images>, or "
+            "poses=<a model of COLMAP>",
         )
     if settings.output is None and (modes != ["input"] or not settings.figure):
-        raise SettingError("output", found="none", expected="a folder, or with back= a file")
+        raise SettingError("output", found="null", expected="a folder, or with back= a file")
     colmap = settings.colmap and settings.input is not None
     for name in ("figure",) if colmap else ("mask", "mask_classes"):
         if getattr(settings, name) is not None:
-            expected = f"none with{'' if colmap else 'out'} colmap=true"
+            expected = f"null with{'' if colmap else 'out'} colmap=true"
             raise SettingError(name, found=getattr(settings, name), expected=expected)
     if settings.poses is not None:
-        _poses(settings, settings.poses)
+        _write_panorama_poses(settings, settings.poses)
     elif colmap:
-        _colmap(settings)
+        _render_project(settings)
     else:
-        jobs, count, work = _forward(settings) if settings.input is not None else _back(settings)
-        _end(_rendered(jobs, count, work), count)
+        jobs, count, work = (
+            _rendering_jobs(settings) if settings.input is not None else _results_jobs(settings)
+        )
+        _print_written(_rendered(jobs, count, work), count)
 
 
 def _rendered(jobs: Iterable[Job], count: int, work: _Work) -> list[Path]:
-    """Results of the panoramas that could be rendered."""
+    """Render panoramas; return the results of those that could be rendered."""
     return [job.value for job in run_jobs("Rendering", jobs, count, work) if not job.error]
 
 
-def _end(done: Sequence[Path], count: int) -> None:
+def _print_written(done: Sequence[Path], count: int) -> None:
     """Print the written files, and exit with status 1 if some panoramas were not rendered."""
     if done:
         first, *others = dict.fromkeys(done)
@@ -98,12 +101,12 @@ def _end(done: Sequence[Path], count: int) -> None:
         sys.exit(f"tangent-render: {failed} could not be rendered, see above")
 
 
-def _forward(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
-    """The panoramas, their number, and the function that renders one to its folder."""
+def _rendering_jobs(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
+    """Return the panoramas, their number, and the function that renders one to its folder."""
     inputs, suffix = _panoramas(settings), _suffix(settings)
     names, output = inputs.names(), settings.output
     if settings.figure is not None and len(names) > 1:
-        raise SettingError("figure", found=f"{len(names)} panoramas", expected="one")
+        raise SettingError("figure", found=f"{len(names)} panoramas", expected="one panorama")
     folders = [] if output is None else [output / name for name in names]
     check_new(settings, *folders, settings.figure)
 
@@ -127,7 +130,7 @@ def _forward(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
 
 
 def _panoramas(settings: RenderSettings) -> Inputs:
-    """The panoramas of `input`, without tangent images that are among them."""
+    """Find the panoramas of `input`; tangent images that this command wrote are ignored."""
 
     def is_result(path: Path) -> bool:
         in_project = any((folder / RIG_FILE).exists() for folder in path.absolute().parents[2:3])
@@ -142,13 +145,13 @@ def _panoramas(settings: RenderSettings) -> Inputs:
 def _suffix(settings: RenderSettings) -> str:
     suffix = f".{settings.format}"
     if settings.interpolation == "nearest" and suffix in LOSSY_SUFFIXES:
-        expected = "png, tif or npy with interpolation=nearest: others change pixels"
+        expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
         raise SettingError("format", found=settings.format, expected=expected)
     return suffix
 
 
 def _grid(settings: RenderSettings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
-    """The images of panoramas with so many rows, and the indices of those to write."""
+    """Return the grid for a number of rows, and the indices of the images to write."""
     level = nearest_level(rows) if settings.level is None else settings.level
     rotation = None
     if settings.rotation is not None:  # x forward, y to the right, z up
@@ -160,15 +163,15 @@ def _grid(settings: RenderSettings, rows: int) -> tuple[TangentGrid, tuple[int, 
     return grid, tuple(int(face) for face in grid.face_indices(settings.faces))
 
 
-def _colmap(settings: RenderSettings) -> None:
-    """Render panoramas to one project for COLMAP."""
+def _render_project(settings: RenderSettings) -> None:
+    """Render all panoramas to one project for COLMAP."""
     inputs, suffix, output = _panoramas(settings), _suffix(settings), settings.output or Path()
     if suffix == ".npy":
         raise SettingError("format", found="npy", expected="png, jpg, webp or tif for COLMAP")
     check_new(settings, output)
     masks = _masks(settings)
     names = flat_names(inputs.names())
-    # One camera has images of one size. Errors of unreadable panoramas are printed below.
+    # A camera has images of one size. Errors of unreadable panoramas are printed when rendering.
     grid, faces = _grid(settings, max(_rows(settings, inputs)) or 512)
     with replaced_folder(output) as folder:
         project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
@@ -182,9 +185,9 @@ def _colmap(settings: RenderSettings) -> None:
 
         done = _rendered(inputs.missing(()), len(names), work)
         if not done:
-            _end(done, len(names))
+            _print_written(done, len(names))
         project.write_rig()
-    _end(done, len(names))
+    _print_written(done, len(names))
 
 
 def _masks(settings: RenderSettings) -> Masks:
@@ -194,13 +197,13 @@ def _masks(settings: RenderSettings) -> Masks:
         raise SettingError(
             "mask_classes",
             found=", ".join(settings.mask_classes),
-            expected="mask=<a folder with labels/ and classes.json> too",
+            expected="mask=<a folder with labels/ and classes.json> in the same command",
         )
     return class_masks(settings.mask, settings.mask_classes)
 
 
 def _rows(settings: RenderSettings, inputs: Inputs) -> Iterator[int]:
-    """Rows of the whole panoramas; 0 of files that cannot be read."""
+    """Yield the rows of the whole panoramas; 0 for files that cannot be read."""
     for name, path in inputs.files.items():
         rows, video = 0, inputs.videos.get(name)
         with suppress(DataError, SettingError):
@@ -210,8 +213,8 @@ def _rows(settings: RenderSettings, inputs: Inputs) -> Iterator[int]:
         yield rows
 
 
-def _poses(settings: RenderSettings, model: Path) -> None:
-    """Write the poses of panoramas in a model of COLMAP."""
+def _write_panorama_poses(settings: RenderSettings, model: Path) -> None:
+    """Write the poses of the panoramas from a model of COLMAP."""
     output = settings.output or Path()
     check_new(settings, output)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
@@ -222,26 +225,26 @@ def _poses(settings: RenderSettings, model: Path) -> None:
     )
 
 
-def _back(settings: RenderSettings) -> tuple[list[Job], int, _Work]:
-    """The folders of the results of panoramas, their number, and the function that renders one."""
+def _results_jobs(settings: RenderSettings) -> tuple[list[Job], int, _Work]:
+    """Return the folders of results, their number, and the function that renders one of them."""
     back, output = settings.back or Path(), settings.output or Path()
     if not back.is_dir():
         raise DataError(back, found="no such folder", expected="a folder of results")
     root = settings.cameras or back
-    of_one = root if root.is_file() else root / CAMERAS_FILE
-    found = sorted(path.parent.relative_to(root) for path in root.rglob(CAMERAS_FILE))
+    single = root if root.is_file() else root / CAMERAS_FILE
+    names = sorted(path.parent.relative_to(root) for path in root.rglob(CAMERAS_FILE))
     jobs = [
         Job(output / name, back / name, root / name / CAMERAS_FILE)
-        for name in found
+        for name in names
         if (back / name).is_dir()
     ]
-    if of_one.is_file():
+    if single.is_file():
         if output.suffix.lower() not in PIXEL_SUFFIXES:
             raise SettingError(
                 "output", found=output, expected=f"a name ending in {', '.join(PIXEL_SUFFIXES)}"
             )
         check_new(settings, output)
-        jobs = [Job(output, back, of_one)]
+        jobs = [Job(output, back, single)]
     if not jobs:
         raise DataError(
             root,
@@ -253,7 +256,7 @@ def _back(settings: RenderSettings) -> tuple[list[Job], int, _Work]:
     def work(job: Job, _: Callable[[float], object]) -> Path:
         path, cameras = job.item, read_cameras(job.value)
         results = TangentResults.read(result_files(job.path, cameras), cameras.grid, settings.kind)
-        if not of_one.is_file():
+        if not single.is_file():
             path = path.with_name(path.name + results.suffix)
             check_new(settings, path)
         rows = settings.height

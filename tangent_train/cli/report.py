@@ -1,4 +1,4 @@
-"""``tangent-report``: mean and spread of finished runs, beside the paper's figures."""
+"""``tangent-report``: compare finished runs with each other and with the paper's figures."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from tangent_train.imports import elsewhere
 
 
 def report(arguments: Sequence[str]) -> None:
-    """Read runs, print the table, write ``report.md``, ``.csv`` and ``.png``.
+    """Read runs, print the table, and write ``report.md``, ``.csv`` and ``.png``.
 
     Args:
-        arguments: The command line after the program's name.
+        arguments: Command line after the program's name.
 
     Raises:
         DataError: Runs are missing or cannot be read.
@@ -24,17 +24,17 @@ def report(arguments: Sequence[str]) -> None:
     for folder in options.folders:
         if not folder.is_dir():
             raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
-    # Slow to import, and not needed to refuse a command line.
+    # Slow imports, not needed to refuse a command line.
     with elsewhere():
         from tangent_train.results.comparisons import runs_report
         from tangent_train.results.record import find_runs, load_record, unfinished_runs
 
     records = [load_record(folder) for folder in find_runs(options.folders)]
-    notes = [f"{run}: not finished, left out." for run in unfinished_runs(options.folders)]
-    found = runs_report(records, notes)
-    found.write(options.output, "report")
-    found.tables()[0].print()
-    for note in found.all_notes():
+    notes = [f"{run}: not finished, ignored." for run in unfinished_runs(options.folders)]
+    runs = runs_report(records, notes)
+    runs.write(options.output, "report")
+    runs.tables()[0].print()
+    for note in runs.all_notes():
         print_text(f"- {note}")
     print_text(f"Files: {options.output}/report.*")
 
@@ -42,8 +42,8 @@ def report(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "tangent-report",
-        description="Mean and spread over folds and seeds, per class, beside the paper's figures.",
-        epilog="Runs that differ only in fold and seed make one row. Example: tangent-report "
+        description="Mean and spread of scores over folds and seeds, with the paper's figures.",
+        epilog="Runs that differ only in fold and seed share a row. Example: tangent-report "
         "runs/paper/semseg_s7_b0_rgbd --output report_s7",
     )
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""A run: its folder, settings, data and task. Training and evaluation share this."""
+"""Build a run (folder, settings, data module, task) and test it, for training and evaluation."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from tangent_train.results.html import write_report
 from tangent_train.results.record import Record
 from tangent_train.tasks.schedules import Schedule
 
-# lightning 2.6 asks torch's tree library in a way torch ≥ 2.13 deprecates: nothing to do about it.
+# lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
 
 
@@ -54,12 +54,12 @@ class Run:
 
     Attributes:
         folder: Output folder.
-        settings: Settings kept in its checkpoints.
+        settings: Settings stored in its checkpoints.
         source: File that settings come from; None if all are the user's.
-        data: The data module.
-        task: The task.
-        trained: Its network, if that is not built from the settings.
-        notes: Notes on the classes of that network.
+        data: Data module.
+        task: Task.
+        trained: Network from a file; None if the network is built from the settings.
+        notes: Notes on the class map of that network.
     """
 
     folder: Path
@@ -84,7 +84,7 @@ class Run:
             settings: Settings of the run.
             source: File that settings come from.
             trained: Network to evaluate; None to build it from the settings.
-            trains: False if the task is only evaluated, see `build`.
+            trains: True if the task is trained, see `build`.
         """
         folder = Path(HydraConfig.get().runtime.output_dir)
         seed = at_least("seed", settings["seed"], 0)
@@ -94,14 +94,14 @@ class Run:
             data, task = build(settings, source, trains=trains)
         else:
             data, task, notes = build_trained(settings, trained, source)
-        kept = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
-        kept = {"choices": _choices(settings, source), **named_arguments(kept)}
-        write_settings(folder / "config.yaml", kept)
-        return Run(folder, kept, source, data, task, trained, notes)
+        stored = {n: value for n, value in settings.items() if n not in ("choices", "trust")}
+        stored = {"choices": _choices(settings, source), **named_arguments(stored)}
+        write_settings(folder / "config.yaml", stored)
+        return Run(folder, stored, source, data, task, trained, notes)
 
     def trainer(self, callbacks: Sequence[Callback]) -> lightning.Trainer:
-        """The trainer of the config, with callbacks besides those of every run."""
-        # Checkpoints are passed on; settings of a logger may hold the address of a server.
+        """Build the trainer of the config, with further callbacks."""
+        # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
         config = {name: value for name, value in self.settings.items() if name != "logger"}
         contents = {
             "predicts": self.task.predicts,
@@ -113,7 +113,7 @@ class Run:
         )
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
-        """Evaluate weights on the test fold and write the results.
+        """Evaluate a checkpoint's weights on the test fold and write the results.
 
         Raises:
             SettingError: The data or the network do not match the weights.
@@ -126,7 +126,7 @@ class Run:
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
-        tested = sum(trainer.num_test_batches) > 0  # else the result is that of a validation
+        tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
         record = self.task.record(self.task.result, noun) if tested else None
         images = record.images if record else 0
         if record and images == total:
@@ -135,12 +135,12 @@ class Run:
         if not getattr(trainer, "fast_dev_run", False) and str(trainer.limit_test_batches) == "1.0":
             raise RuntimeError(f"{images} of {total} test {noun} were counted")
         rank_zero_only(print_text)(
-            f"{images} of {total} test {noun} were evaluated, as trainer.limit_test_batches or "
-            "trainer.fast_dev_run says: no results are written."
+            f"{images} of {total} test {noun} were evaluated because of trainer.limit_test_batches "
+            "or trainer.fast_dev_run: no results are written."
         )
 
     def _as_trained(self) -> TrainedNetwork:
-        """The network of the run, with what it was trained on."""
+        """Return the network of the run with its inputs, classes and representation."""
         if self.trained is not None:
             return self.trained
         data = self.data
@@ -169,7 +169,8 @@ class Run:
 
     @rank_zero_only
     def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
-        is_inside = checkpoint.is_relative_to(self.folder)  # the same wherever the folder is
+        is_inside = checkpoint.is_relative_to(self.folder)
+        # A relative path stays right when the folder is moved.
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
@@ -194,13 +195,13 @@ def build(
     """Build the data module and the task of a run, and try them on empty inputs.
 
     Network settings that are null are taken from the data: ``in_channels``, and ``num_classes`` or
-    ``classes``, also of a network inside the network's settings. Where a checkpoint will bring the
-    tensors, no others are fetched first.
+    ``classes``, also of a network inside the network's settings. Pretrained weights are not fetched
+    if a checkpoint replaces them.
 
     Args:
         settings: Settings of the run.
         source: File that settings come from, see `registry.build_from_config`.
-        trains: False if the task is only evaluated: its optimizer and scheduler are not built.
+        trains: True if the task is trained; else its optimizer and scheduler are not built.
 
     Returns:
         Data module and task.
@@ -221,8 +222,7 @@ def build(
         raise SettingError(
             "data.upright",
             found=f"auto, with {type(task).__name__}",
-            expected=f"null or pose: a network that predicts {PIXEL_CLASSES} estimates which way "
-            "is up",
+            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES}",
         )
     try_network(task, data.in_channels)
     if trains:
@@ -231,11 +231,11 @@ def build(
 
 
 def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -> Any:
-    """Build the data module of a run, with the labels that its task needs; see `build`."""
+    """Build the data module of a run and check that it has the labels of the task; see `build`."""
     representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
-        expected = "labelled images or shapes; pairs are for tangent-keypoints"
+        expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()
@@ -256,22 +256,22 @@ def build_trained(
     """Build the data module and the task that evaluate a network from a file.
 
     Args:
-        settings: Settings of the evaluation, perhaps with ``class_map`` and ``unmapped``.
-        trained: The network.
+        settings: Settings of the evaluation; ``class_map`` and ``unmapped`` are optional.
+        trained: Network to evaluate.
         source: File that settings come from, see `registry.build_from_config`.
 
     Returns:
         Data module, task, and notes on the class map.
 
     Raises:
-        SettingError: The network does not fit the data, or the class map does not fit one of them.
+        SettingError: The network does not fit the data, or the class map fits neither of them.
     """
     data = build_data(settings, source)
     notes = []
     if settings.get("class_map") is not None:
-        given = parse_settings(ClassMapSettings, settings)
-        class_map = load_class_map(given.class_map)
-        mapped = map_classes(trained, class_map, given.unmapped, data.class_names[1:])
+        parsed = parse_settings(ClassMapSettings, settings)
+        class_map = load_class_map(parsed.class_map)
+        mapped = map_classes(trained, class_map, parsed.unmapped, data.class_names[1:])
         trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
     check_fits(data, inputs_and_classes(trained), settings["checkpoint"])
     check_size(trained, data.representation.image_size)
@@ -280,31 +280,31 @@ def build_trained(
 
 
 def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
-    """Refuse data with other inputs or classes than those of a network.
+    """Refuse data whose inputs or classes differ from those of a network.
 
     Args:
-        data: The data module.
-        network: Its `inputs_and_classes`, perhaps with further fields.
+        data: Data module.
+        network: `inputs_and_classes` of the network; further fields are ignored.
         name: Name of the network, for the message.
 
     Raises:
         SettingError: Inputs or classes differ.
     """
-    for what, value in inputs_and_classes(data).items():
-        if network[what] != value:
+    for field, value in inputs_and_classes(data).items():
+        if network[field] != value:
             raise SettingError(
                 f"data, for {name}",
-                found=f"{what.replace('_', ' ')} {value}",
-                expected=f"{network[what]}, which the network was trained with",
-                remedy="class_map= says which are the same." if what == "class_names" else "",
+                found=f"{field.replace('_', ' ')} {value}",
+                expected=f"{network[field]}, which the network was trained with",
+                remedy="Map classes with class_map=." if field == "class_names" else "",
             )
 
 
-def inputs_and_classes(of: Any) -> dict[str, Any]:
-    """Return inputs and classes of a data module or a trained network as plain values."""
-    mean, std = list(of.normalization.mean), list(of.normalization.std)
-    inputs = {"inputs": list(of.inputs)} if hasattr(of, "inputs") else {}
-    names = list(of.class_names)
+def inputs_and_classes(data: Any) -> dict[str, Any]:
+    """Return inputs and classes of a data module or a `TrainedNetwork` as plain values."""
+    mean, std = list(data.normalization.mean), list(data.normalization.std)
+    inputs = {"inputs": list(data.inputs)} if hasattr(data, "inputs") else {}
+    names = list(data.class_names)
     return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
 
 
@@ -321,9 +321,9 @@ def _build_task(
         parts["optimizer"] = build_from_config(settings["optimizer"], "optimizer", source)
     if trains and settings.get("scheduler") is not None:
         section = dict(settings["scheduler"])
-        stepped = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
+        timing = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
         scheduler = build_from_config(section, "scheduler", source)
-        parts["scheduler"] = Schedule(scheduler, **stepped)
+        parts["scheduler"] = Schedule(scheduler, **timing)
     return build_from_config(
         settings["task"],
         "task",
@@ -336,7 +336,7 @@ def _build_task(
 
 
 def _choices(settings: Mapping[str, Any], source: SettingsFile | None) -> dict[str, str]:
-    """The chosen options of config groups, without those in whose place a file gave a section."""
+    """Return the chosen options of config groups, except where a file replaced the section."""
     chosen, stored = HydraConfig.get().runtime.choices, settings.get("choices") or ()
     return {
         group: chosen[group]
@@ -348,15 +348,15 @@ def _choices(settings: Mapping[str, Any], source: SettingsFile | None) -> dict[s
 
 @contextmanager
 def machine_faults(folder: Path, data: Any) -> Iterator[None]:
-    """Explain a full disk, and workers that died.
+    """Explain a full disk, and data workers that died.
 
     Args:
-        folder: Folder of the run.
-        data: Its data module.
+        folder: Run folder.
+        data: Data module of the run.
 
     Raises:
-        NoRoomError: The disk is full for a file that is not written atomically, such as
-            TensorBoard's events.
+        NoRoomError: The disk is full while a file is written that is not written atomically, such
+            as TensorBoard's events.
         DataError: A worker died.
     """
     try:

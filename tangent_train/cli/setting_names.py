@@ -1,4 +1,4 @@
-"""Names of the settings of a command: its config declares them, all others are refused."""
+"""Check names of settings: the config of a command declares them, all others are refused."""
 
 from __future__ import annotations
 
@@ -16,18 +16,19 @@ from tangent_train.errors import SettingError
 from tangent_train.registry import nearest
 
 _COMPLETED = "fine_tuning.optimizer"
-"""A section without a class: its further settings are those of ``optimizer``."""
+"""A section that is completed with the settings of ``optimizer`` and may have any of these."""
 
 
 @cache
 def declared_settings(command: str) -> Mapping[str, Any]:
-    """Return the settings of a command by name, and the names inside sections of its own.
+    """Return the settings that the config of a command declares.
 
     Args:
-        command: The command, such as transfer.
+        command: Name of the command, e.g. transfer.
 
     Returns:
-        For a section without a class, such as ``fine_tuning``, a mapping; else anything.
+        Settings by name. The value of a section without a class, such as ``fine_tuning``, is a
+        mapping; other values have no meaning.
     """
     content = yaml.safe_load((config_folder() / f"{command}.yaml").read_text("utf-8"))
     bases = [name for name in content["defaults"] if isinstance(name, str) and name != "_self_"]
@@ -39,25 +40,27 @@ def declared_settings(command: str) -> Mapping[str, Any]:
 def check_names(command: str, settings: Mapping[str, Any], references: str) -> None:
     """Refuse settings that nothing reads.
 
-    Sections with a class are left to it: it refuses arguments that it does not have.
+    Settings inside a section with a class are not checked here: the class refuses unknown ones.
 
     Args:
-        command: The command.
-        settings: Its composed config, resolved or not.
-        references: Text with all ``${…}`` of the config and of Hydra. A setting at the top that is
-            named in one of them is read there.
+        command: Name of the command.
+        settings: Composed config of the command, resolved or not.
+        references: Text with every ``${…}`` of the config and of Hydra. A top-level setting that
+            one of them names counts as read.
 
     Raises:
-        SettingError: There is one; the message names the nearest setting.
+        SettingError: A setting is not read; the message names the most similar one.
     """
     declared = declared_settings(command)
     for name, value in _undeclared(settings, declared):
         if not re.search(rf"\$\{{\s*([\w.]+:\s*)?\.*{re.escape(name)}\b", references):
+            known = [*_names(declared), *_names(settings, name)]
+            known = [other for other in known if not name.startswith(f"{other}.")]
             raise SettingError(
                 name,
                 found=f"{value}, which tangent-{command} does not read",
                 expected=f"a setting that tangent-{command} --help lists",
-                remedy=f"{nearest(name, [*_names(declared), *_names(settings, name)])}Remove it.",
+                remedy=f"{nearest(name, known)}Remove it.",
             )
 
 
@@ -78,22 +81,23 @@ def probable_setting(command: str, name: str) -> str:
 def _undeclared(
     settings: Mapping[str, Any], declared: Mapping[str, Any], section: str = ""
 ) -> Iterator[tuple[str, Any]]:
-    """Names and values of undeclared settings."""
+    """Yield the names and values of undeclared settings."""
     for key, value in settings.items():
         name = f"{section}{key}"
         has_class = isinstance(value, Mapping) and "_target_" in value
-        of_class = section and key in declared_settings("train") and has_class
-        if key not in declared and not of_class:
+        is_known_section = section and key in declared_settings("train") and has_class
+        if key not in declared and not is_known_section:
             yield name, value
         inner = declared.get(key)
         if isinstance(value, Mapping) and isinstance(inner, Mapping) and not has_class:
             yield from _undeclared(value, inner, f"{name}.") if name != _COMPLETED else ()
 
 
-def _names(settings: Mapping[str, Any], left_out: str = "", section: str = "") -> Iterator[str]:
+def _names(settings: Mapping[str, Any], excluded: str = "", section: str = "") -> Iterator[str]:
+    """Yield the names of settings and of the settings inside them, except for one."""
     for key, value in settings.items():
         name = f"{section}{key}"
-        if name != left_out:
+        if name != excluded:
             yield name
             if isinstance(value, Mapping):
-                yield from _names(value, left_out, f"{name}.")
+                yield from _names(value, excluded, f"{name}.")

@@ -1,4 +1,4 @@
-"""Settings of a command as an object with typed fields."""
+"""Parse the settings of a command into an object with typed fields."""
 
 from __future__ import annotations
 
@@ -27,69 +27,71 @@ _DESCRIPTIONS = {
 
 @dataclass(frozen=True)
 class Trust:
-    """Names that settings in files may use besides registered ones."""
+    """Classes and functions that settings in files may name besides the registered ones."""
 
     trust: tuple[str, ...]
 
 
 def parse_settings(kind: type[_Settings], config: Mapping[str, Any]) -> _Settings:
-    """Build a dataclass of settings; values are checked where they are used.
+    """Build a dataclass of settings, checking types; ranges are checked where a value is used.
 
     Annotations may be ``bool``, ``int``, ``float``, ``str``, `Path`, ``None``, `Literal`, tuples,
-    sections (``dict``) and unions of these. A single value may stand for a tuple.
+    sections (``dict``) and unions of these. A single value is accepted for a tuple.
 
     Args:
-        kind: The class.
-        config: Values of all fields without a default, and perhaps further ones.
+        kind: Dataclass to build.
+        config: Values by name; names that are not fields are ignored.
 
     Raises:
-        SettingError: A value is missing or of another type.
+        SettingError: A value is missing or has another type.
     """
     defaults = {one.name for one in fields(kind) if one.default is not MISSING}  # type: ignore[arg-type]
     hints = get_type_hints(kind).items()
     named = [(name, hint) for name, hint in hints if name in config or name not in defaults]
-    return kind(**{name: _converted(name, config.get(name), hint) for name, hint in named})
+    return kind(**{name: _checked_value(name, config.get(name), hint) for name, hint in named})
 
 
 def names_of(arguments: Sequence[str]) -> set[str]:
-    """Names of the settings in overrides, without those of Hydra."""
+    """Return the names of the settings in overrides, without Hydra's."""
     names = {a.lstrip("+~").partition("=")[0] for a in arguments if not a.startswith("-")}
     return {name for name in names if not name.startswith("hydra")}
 
 
 def check_new(settings: Any, *outputs: Path | None) -> None:
-    """Refuse to replace files and folders without `settings.overwrite`; empty folders are new.
+    """Refuse to replace existing files and folders unless `settings.overwrite` is True.
+
+    Empty folders may be used.
 
     Raises:
-        SettingError: One exists.
+        SettingError: A file, or a folder with content, exists.
     """
     for path in () if settings.overwrite else filter(None, outputs):
         if any(path.iterdir()) if path.is_dir() else path.exists():
             raise SettingError(
                 "output",
                 found=f"{path}, which exists",
-                expected="nothing there yet",
+                expected="a path that does not exist yet",
                 remedy="Give another output, or overwrite=true.",
             )
 
 
-def _converted(name: str, value: Any, hint: Any) -> Any:
+def _checked_value(name: str, value: Any, hint: Any) -> Any:
     options = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
     for option in options:
         with suppress(TypeError, ValueError):
-            return _as(option, value)
-    found = "none" if value is None else value
+            return _convert(option, value)
+    found = "null" if value is None else value
     raise SettingError(name, found=found, expected=" or ".join(map(_description, options)))
 
 
-def _as(kind: Any, value: Any) -> Any:
+def _convert(kind: Any, value: Any) -> Any:
     arguments = get_args(kind)
     if get_origin(kind) is Literal and value in arguments:
         return value
     if get_origin(kind) is tuple:
         values = value if isinstance(value, list | tuple) else [value]
         kinds = arguments[:1] * len(values) if arguments[-1] is ... else arguments
-        return tuple(_as(each, one) for one, each in zip(values, kinds, strict=True))
+        return tuple(_convert(each, one) for one, each in zip(values, kinds, strict=True))
     if get_origin(kind) is dict and isinstance(value, Mapping):
         return dict(value)
     if kind is Path and isinstance(value, str):

@@ -1,8 +1,8 @@
-"""Settings inside a checkpoint, to resume a run or to evaluate it or any other network.
+"""Take settings from a checkpoint, to resume a run or to evaluate a network.
 
-Hydra composes the user's own config, with the options of the run where the user has options of
-these names. The settings of the file are plain data: they are laid over the composed ones, except
-for what is typed and what concerns this machine, and never reach Hydra.
+Hydra composes the user's config with the options that the run was started with, as far as they are
+options of this program. The settings in the file are plain data that never reach Hydra. They
+replace the composed ones, except for typed settings and those of this machine.
 """
 
 from __future__ import annotations
@@ -28,57 +28,58 @@ _SECTIONS = {
     for name, kind in _DECLARED.items()
     if dict in (get_origin(kind), *map(get_origin, get_args(kind))) and from_file(name)
 }
-"""Sections that a checkpoint keeps, with their kinds."""
+"""Sections that a checkpoint stores, with their kinds."""
 
 _NEVER_STORED = ("callbacks", "debug", "logger")
-"""Groups whose settings are never taken from a file: a resumed run composes its options again."""
+"""Groups whose settings are not taken from a file: a resumed run composes their options again."""
 
 GROUPS = ("experiment", "recipe", *_SECTIONS, *_NEVER_STORED)
-"""Config groups whose chosen options a checkpoint keeps, as ``choices``."""
+"""Config groups whose chosen options a checkpoint stores as ``choices``."""
 
 _RUN = {
     "choices": dict[str, Text] | None,
     "name": Text,
     **{name: kind for name, kind in _DECLARED.items() if name not in GROUPS},
 }
-"""Settings outside of the sections."""
+"""Settings outside the sections, with their kinds."""
+
+_ONLY_FOR_TRAINING = ("ema", "init_from", "optimizer", "resume", "scheduler")
+"""Settings that an evaluation does not read."""
 
 _EXPECTED = "the settings of a run"
 
 
 @dataclass(frozen=True)
 class StoredRun:
-    """The settings inside a checkpoint, and the command line.
+    """Settings of a run in a checkpoint, and the command line.
 
     Attributes:
-        path: The checkpoint.
-        config: Its settings, plain values.
-        user_overrides: Overrides of the user, without the checkpoint.
-        added: The options of the run among the user's own, its level and seed.
-        place: Overrides for the checkpoint and the run folder.
+        path: Checkpoint.
+        config: Settings in the checkpoint, plain values.
+        user_overrides: Arguments of the user, without the checkpoint.
+        added: Overrides for the options, level and seed of the run.
+        location_overrides: Overrides for the checkpoint and the run folder.
     """
 
     path: Path
     config: Mapping[str, Any]
     user_overrides: Sequence[str]
     added: Sequence[str]
-    place: Sequence[str]
+    location_overrides: Sequence[str]
 
     @property
     def arguments(self) -> list[str]:
-        """Command line for Hydra: options, then overrides, of which the last one counts."""
-        options = [a for a in self.user_overrides if "=" not in a or a[0] == "-"]
-        overrides = [a for a in self.user_overrides if a not in options]
-        return [*options, *self.added, *overrides, *self.place]
+        """Command line for Hydra; the last override of a setting wins."""
+        return [*self.added, *self.user_overrides, *self.location_overrides]
 
     def settings(self, composed: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile]:
-        """All settings of the continued run.
+        """Return all settings of the continued run.
 
         Args:
-            composed: The composed config, resolved.
+            composed: Composed config, resolved.
 
         Returns:
-            The settings, and where they come from.
+            Settings, and the file that they come from.
 
         Raises:
             DataError: The file lacks settings.
@@ -99,33 +100,39 @@ class StoredRun:
         for name in typed:
             _copy_setting(settings, composed, name.split("."))
         if "data" in typed:
-            settings["data"] |= self._of_the_network(settings["data"], typed)
+            settings["data"] |= self._network_settings(settings["data"], typed)
         trust = parse_settings(Trust, composed).trust
         return settings, SettingsFile(self.path, trust, typed | local)
 
     def _section(
-        self, name: str, here: Mapping[str, Any], typed: set[str]
+        self, name: str, composed: Mapping[str, Any], typed: set[str]
     ) -> tuple[dict[str, Any], set[str]]:
-        """A section of the file with machine-specific settings of the user, and their names."""
+        """Return a section of the file with the user's settings for this machine, and their names.
+
+        Args:
+            name: Name of the section.
+            composed: The composed section.
+            typed: Names of the settings that the user typed.
+        """
         stored = self.config[name]
-        names = {*stored, *here}
+        names = {*stored, *composed}
         local = {n for n in names if not from_file(f"{name}.{n}", stored.get(n))}
         section = {n: v for n, v in stored.items() if n not in local}
-        same = here.get("_target_") == stored.get("_target_")
-        of_user = {n: v for n, v in here.items() if n in local and same}
+        is_same_class = composed.get("_target_") == stored.get("_target_")
+        of_user = {n: v for n, v in composed.items() if n in local and is_same_class}
         section |= of_user
         for n in sorted(local & {"root", "mask"} if name == "data" else ()):
             if f"data.{n}" not in typed and section.get(n) != stored.get(n):
                 raise SettingError(
                     f"data.{n}",
-                    found="none, as checkpoints do not say where files are",
-                    expected="that of the run on this machine",
-                    remedy=f"The run had data.{n}={stored.get(n)!r}: add that if it is right here.",
+                    found="null: paths are not taken from a checkpoint",
+                    expected="the path of these files on this machine",
+                    remedy=f"The run had data.{n}={stored.get(n)!r}: type that if right here.",
                 )
         return section, {f"{name}.{n}" for n in of_user}
 
-    def _of_the_network(self, data: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
-        """Settings tied to the network, not to the data: its test fold and its inputs."""
+    def _network_settings(self, data: Mapping[str, Any], typed: set[str]) -> dict[str, Any]:
+        """Return settings that belong to the network even with other data: test fold, inputs."""
         kinds = {"fold": int | None, "inputs": INPUTS | None, "normalization": NORMALIZATION | None}
         before = check_fields(self.path, self.config["data"], kinds, _EXPECTED, "data")
         known = {name for name in (*data, "normalization") if f"data.{name}" not in typed}
@@ -134,12 +141,12 @@ class StoredRun:
 
 @dataclass(frozen=True)
 class StoredNetwork:
-    """A network to evaluate whose file knows no run (imported, exported), and the command line.
+    """A file with a network but no settings of a run (imported, exported), and the command line.
 
     Attributes:
-        path: The file.
-        user_overrides: Overrides of the user, without the file.
-        added: Empty, see `StoredRun`.
+        path: File of the network.
+        user_overrides: Arguments of the user, without the file.
+        added: Always empty, see `StoredRun`.
     """
 
     path: Path
@@ -148,17 +155,17 @@ class StoredNetwork:
 
     @property
     def arguments(self) -> list[str]:
-        """The command line for Hydra."""
+        """Command line for Hydra."""
         return [*self.user_overrides, f"checkpoint={self.path}"]
 
     def settings(self, composed: Mapping[str, Any]) -> tuple[dict[str, Any], SettingsFile, Any]:
-        """All settings of the evaluation.
+        """Return all settings of the evaluation.
 
         Args:
-            composed: The composed config, resolved.
+            composed: Composed config, resolved.
 
         Returns:
-            The settings, where they come from, and the `TrainedNetwork`.
+            Settings, the file that they come from, and the `TrainedNetwork`.
 
         Raises:
             DataError: The file cannot be used.
@@ -186,88 +193,88 @@ class StoredNetwork:
         in_file = {"_target_": "models.OnnxNetwork", "path": str(self.path)}
         settings["network"] = in_file if trained.settings is None else trained.settings
         mean, std = list(trained.normalization.mean), list(trained.normalization.std)
-        tied = {"inputs": list(trained.inputs), "normalization": {"mean": mean, "std": std}}
+        of_network = {"inputs": list(trained.inputs), "normalization": {"mean": mean, "std": std}}
         if "inputs" in composed["data"]:  # images, not shapes
-            known = {name: v for name, v in tied.items() if f"data.{name}" not in typed}
+            known = {name: v for name, v in of_network.items() if f"data.{name}" not in typed}
             settings["data"] = dict(composed["data"]) | known
         if "task.images_per_forward" not in typed:  # photo networks have many classes, large images
-            at_once = views_per_forward(trained.image_size)
-            settings["task"] = dict(composed["task"]) | {"images_per_forward": at_once}
+            count = views_per_forward(trained.image_size)
+            settings["task"] = dict(composed["task"]) | {"images_per_forward": count}
         of_user = (composed.keys() - {"network", "representation"}) | typed
         return settings, SettingsFile(self.path, trust, of_user), trained
 
 
 def stored_run(command: str, arguments: Sequence[str]) -> StoredRun | StoredNetwork | None:
-    """Start from a stored config if the command continues from one.
+    """Read the settings that a command continues from; None if it starts from the config alone.
 
-    ``tangent-train resume=<run folder>`` takes the settings inside the run's last checkpoint,
-    ``tangent-evaluate checkpoint=<file>`` those inside that; ``data=<option>`` (or another section)
-    takes the user's own option in place of the stored section; the run keeps its experiment. A
-    network without a run is evaluated with the user's settings.
+    ``tangent-train resume=<run>`` takes the settings in the run's last checkpoint,
+    ``tangent-evaluate checkpoint=<file>`` those in the file. In an evaluation ``data=<option>`` (or
+    another section) replaces the stored section; the run keeps its experiment. A network without
+    settings of a run is evaluated with the user's settings.
 
     Args:
-        command: Any command.
-        arguments: The command line after the program's name.
+        command: Name of the command.
+        arguments: Command line after the program's name.
 
     Raises:
-        DataError: There are no usable settings where the argument points.
-        SettingError: A resumed run would become another one.
+        DataError: The file, or its settings, cannot be used.
+        SettingError: A typed setting does not fit the run.
     """
     setting = {"train": "resume", "evaluate": "checkpoint"}.get(command, "")
-    given = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
-    if not setting or not given or given[-1] in ("", "null"):
+    values = [a.partition("=")[2] for a in arguments if a.startswith(f"{setting}=")]
+    if not setting or not values or values[-1] in ("", "null"):
         return None
-    files = values_of_sweep(given[-1], arguments)
+    files = values_of_sweep(values[-1], arguments)
     if len(files) > 1:
-        expected = "one in a sweep, which is over settings of its run"
+        expected = "a single one: a sweep can change other settings"
         raise SettingError(setting, found=", ".join(files), expected=expected)
-    path = Path(path_text(given[-1])).absolute()
-    place = [f"{setting}={path}"]
-    left = [a for a in arguments if not a.startswith(f"{setting}=")]
+    path = Path(path_text(values[-1])).absolute()
+    location = [f"{setting}={path}"]
+    others = [a for a in arguments if not a.startswith(f"{setting}=")]
     if command == "train":
-        place.append(f"hydra.run.dir={quoted(str(path))}")
+        location.append(f"hydra.run.dir={quoted(str(path))}")
         path = path / "checkpoints" / "last.ckpt"
         if not path.is_file():
             raise DataError(
                 path.parents[1],
                 found="no checkpoints/last.ckpt",
                 expected="the folder of a started run",
-                remedy="Give resume= the folder that tangent-train printed.",
+                remedy="Use resume=<run> with the folder that tangent-train printed.",
             )
     if command == "train":
         config = read_checkpoint(path, ("config",))["config"]
     else:
         config = run_settings(path)
-        _check_evaluation(path, names_of(left), of_run=config is not None)
+        _check_evaluation(path, names_of(others), is_run=config is not None)
         if config is None:
-            return StoredNetwork(path, left)
-    kept = (*_SECTIONS, "experiment", "recipe") if command == "train" else ("experiment", "recipe")
-    if chosen := [a for a in left if a.partition("=")[0] in kept]:
+            return StoredNetwork(path, others)
+    fixed = (*_SECTIONS, "experiment", "recipe") if command == "train" else ("experiment", "recipe")
+    if chosen := [a for a in others if a.partition("=")[0] in fixed]:
         raise SettingError(
-            place[0],
-            found=f"{chosen[0]} beside it",
+            location[0],
+            found=f"{chosen[0]} in the same command",
             expected="single settings (data.root=…): the run keeps its options",
         )
-    left = [*_remembered(command, path, names_of(left)), *left]
+    others = [*_remembered(command, path, names_of(others)), *others]
     kinds = {name: _RUN[name] for name in ("choices", "level", "seed")}
     known = check_fields(path, config, kinds, _EXPECTED)
     choices = {g: name for g, name in (known["choices"] or {}).items() if is_own_option(g, name)}
-    # A file does not choose who sees a run, nor what else an evaluation does.
+    # A file chooses neither who sees a run nor the callbacks of an evaluation.
     for group in ("logger",) if command == "train" else _NEVER_STORED:
         choices.pop(group, None)
-    typed = {a.partition("=")[0] for a in left}.intersection(GROUPS)
-    if typed & _SECTIONS.keys():  # an experiment's settings of a section are for another option
+    typed = {a.partition("=")[0] for a in others}.intersection(GROUPS)
+    if typed & _SECTIONS.keys():  # the experiment's settings are for the replaced option
         choices = {g: name for g, name in choices.items() if g not in ("experiment", "recipe")}
     added = [f"level={known['level']}", f"seed={known['seed']}"]
     added += [f"{group}={name}" for group, name in choices.items() if group not in typed]
-    return StoredRun(path, config, left, added, place)
+    return StoredRun(path, config, others, added, location)
 
 
 def run_settings(path: Path) -> dict[str, Any] | None:
-    """Return the settings of a run in a checkpoint; None without settings of a run.
+    """Return the settings of a run in a checkpoint; None if it contains none.
 
     Raises:
-        DataError: It cannot be read.
+        DataError: The checkpoint cannot be read.
     """
     if path.suffix.lower() in (".onnx", ".safetensors"):
         return None
@@ -276,10 +283,10 @@ def run_settings(path: Path) -> dict[str, Any] | None:
 
 
 def _remembered(command: str, path: Path, names: Collection[str]) -> list[str]:
-    """Overrides of a run for this machine that were typed before, but not now.
+    """Return overrides for this machine that were typed for the run before, but not now.
 
-    They count as typed. Which run it is follows from where the checkpoint is, not from what is in
-    it. An evaluation has loggers and callbacks of its own.
+    The checkpoint's location identifies the run, not its content. An evaluation takes only the
+    data from there, no loggers and callbacks.
     """
     sections = {"data", *(_NEVER_STORED if command == "train" else ())} - set(names)
     if path.parent.name != "checkpoints":
@@ -288,29 +295,39 @@ def _remembered(command: str, path: Path, names: Collection[str]) -> list[str]:
     return [f"{'++' * ('.' in name)}{name}={v}" for name, v in settings if name not in names]
 
 
-def _check_evaluation(path: Path, typed: set[str], *, of_run: bool) -> None:
-    """Refuse to evaluate a network without data, or with settings of another network."""
-    if not of_run and not typed & {"data", "experiment"}:
+def _check_evaluation(path: Path, typed: set[str], *, is_run: bool) -> None:
+    """Refuse an evaluation without data, or with settings of another network or of training."""
+    if not is_run and not typed & {"data", "experiment"}:
         raise SettingError(
             "data",
             found=f"none, and {path} has no settings of a run",
             expected="the data set to evaluate it on: data=stanford2d3ds data.root=…",
-            remedy="class_map= gives the network the classes of the data.",
+            remedy="Map the network's classes to those of the data with class_map=.",
         )
-    others = sorted(name for name in typed if name.partition(".")[0] == "network")
-    if others and (not of_run or "class_map" in typed):
-        raise SettingError(others[0], found="a value", expected=f"none: the network is in {path}")
+    for name in sorted(typed):
+        section = name.partition(".")[0]
+        if section == "network" and (not is_run or "class_map" in typed):
+            raise SettingError(name, found="a value", expected=f"none: the network is in {path}")
+        if section in _ONLY_FOR_TRAINING:
+            expected = "none: tangent-evaluate does not train"
+            raise SettingError(name, found="a value", expected=expected, remedy="Remove it.")
 
 
 def is_own_option(group: str, option: str) -> bool:
-    """Return True for an option in the configs of this program."""
+    """Return True if the configs of this program contain an option of a group."""
     folder = config_folder() / group
     return group in GROUPS and folder / f"{option}.yaml" in folder.rglob("*.yaml")
 
 
-def _copy_setting(settings: dict[str, Any], composed: Any, place: Sequence[str]) -> None:
-    """Copy one of the composed settings; remove it where there is none."""
-    *sections, name = place
+def _copy_setting(settings: dict[str, Any], composed: Any, path: Sequence[str]) -> None:
+    """Copy one of the composed settings, or remove it if the composed config lacks it.
+
+    Args:
+        settings: Settings to change.
+        composed: Composed config.
+        path: Names of the sections, and of the setting.
+    """
+    *sections, name = path
     for section in sections:
         composed = composed.get(section) if isinstance(composed, dict) else None
         inner = settings.get(section)

@@ -1,7 +1,8 @@
-"""Sweeps: every job is an ordinary run, in a process of its own.
+"""Run every job of a sweep as an ordinary run in a separate process.
 
-Lightning starts a process per device with the command line it finds, which has to be that of one
-run; but a launcher of Hydra runs jobs in its own process. So a job starts one and waits for it.
+Lightning starts one process per device with the command line of its own process, which has to be
+that of a single run. Hydra's launchers run jobs in their own process. So each job starts a process
+and waits for it.
 """
 
 from __future__ import annotations
@@ -20,14 +21,14 @@ from tangent_train.errors import SettingError
 from tangent_train.files import parse_json
 
 OBJECTIVE_FILE = "validation.json"
-"""In a run's folder: the figure of its best epoch on the validation split."""
+"""File in a run's folder with the validation score of its best epoch."""
 
-_OF_THE_SWEEP = ("hydra.sweep", "hydra.launcher.", "hydra.mode=", "hydra.run.", "hydra/")
+_SWEEP_OVERRIDES = ("hydra.sweep", "hydra.launcher.", "hydra.mode=", "hydra.run.", "hydra/")
 _GROUPS = ("launcher=", "sweep=")
 
 
 def in_sweep() -> bool:
-    """Return True in a job of a sweep, to be run by `run_job`."""
+    """Return True in a job of a sweep, which `run_job` runs."""
     return HydraConfig.get().mode == RunMode.MULTIRUN
 
 
@@ -37,25 +38,25 @@ def run_job(
     """Run one job of a sweep as a process and wait for it.
 
     Args:
-        command: Command of the sweep.
-        config: Config of the job.
-        added: Overrides that were not typed.
-        visible_gpus: ``CUDA_VISIBLE_DEVICES`` where the sweep was started.
+        command: Name of the command.
+        config: Composed config of the job.
+        added: Overrides that the user did not type.
+        visible_gpus: ``CUDA_VISIBLE_DEVICES`` of the process that started the sweep.
 
     Returns:
-        The run's best validation score; None without a validation split.
+        Best validation score of the run; None without a validation split.
 
     Raises:
-        CompactHydraException: The run failed. Hydra prints it without a traceback.
-        SettingError: The sweep compares scores that its runs do not have, or looks for the worse.
+        CompactHydraException: The run failed. Hydra prints this without a traceback.
+        SettingError: Runs have no validation score, or the sweep searches in the wrong direction.
     """
     hydra = HydraConfig.get()
     searches = not hydra.sweeper["_target_"].endswith("BasicSweeper")
     if searches and not config.get("data", {}).get("validation_fraction"):
         raise SettingError(
             "data.validation_fraction",
-            found="no validation split, in a sweep that looks for the best validation figure",
-            expected="> 0: runs are never compared on the test fold",
+            found="no validation split, in a sweep that searches the best validation score",
+            expected="more than 0: runs are not compared on the test fold",
         )
     folder = Path(hydra.runtime.output_dir)
     (folder / OBJECTIVE_FILE).unlink(missing_ok=True)
@@ -63,10 +64,10 @@ def run_job(
     options = [f"--config-dir={path}" for path in sources]
     options.append(f"--config-name={hydra.job.config_name}")
     overrides = [o for o in hydra.overrides.task if o not in added and not o.startswith(_GROUPS)]
-    overrides += [o for o in hydra.overrides.hydra if not o.startswith(_OF_THE_SWEEP)]
+    overrides += [o for o in hydra.overrides.hydra if not o.startswith(_SWEEP_OVERRIDES)]
     environment = {}
     if os.environ.get("SUBMITIT_EXECUTOR") == "local":
-        # submitit hides the GPUs of this machine, or shows every job the same ones.
+        # submitit hides the GPUs of this machine, or gives every job the same ones.
         environment["CUDA_VISIBLE_DEVICES"] = visible_gpus
     status = run_process(command_line(command, [*options, *overrides], folder), environment)
     if status:

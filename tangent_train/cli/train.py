@@ -38,14 +38,16 @@ from tangent_train.setting_rules import differing_settings, flat_settings, from_
 
 
 def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> float | None:
-    """Train, then evaluate the best epoch of the validation split (else the last) on the test fold.
+    """Train, then evaluate the best epoch on the test fold.
+
+    The best epoch is that with the best validation score, or the last epoch without validation.
 
     Args:
-        settings: Settings of the run: the composed ``train.yaml``, or those of a resumed run.
+        settings: Composed ``train.yaml``, or the settings of a resumed run.
         source: File that settings come from, see `registry.build_from_config`.
 
     Returns:
-        The best validation score, which sweeps compare; None without a validation split.
+        Best validation score, which sweeps compare; None without a validation split.
     """
     files, resumed = parse_settings(TrainSettings, settings), None
     if files.resume is not None:
@@ -57,24 +59,24 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
     if resumed is None:
         load_pretrained(files.init_from, run)
     checkpoints = run.folder / "checkpoints"
-    needed = _typed_local(_remember(run))
+    needed = _settings_to_type_again(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.monitor_mode)
     trainer = run.trainer([last, best])
-    if settings["ema"] is not None:  # first: the last step is in the average that is saved
+    if settings["ema"] is not None:  # the first callback: the saved average has the last step
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     with machine_faults(run.folder, run.data):
         with _training_faults(resumed, last):
             trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
-        # First: an error in the test must not cost a sweep its figure.
-        score = _best_on_validation(trainer, best, run.folder)
-        run.test(trainer, _tested(trainer, best, last.path))
+        # Written before the test, whose errors must not cost a sweep the score.
+        score = _best_validation_score(trainer, best, run.folder)
+        run.test(trainer, _tested_checkpoint(trainer, best, last.path))
     return score
 
 
-def _tested(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Path:
-    """``best.ckpt``, which without validation is a copy of ``last.ckpt``."""
+def _tested_checkpoint(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Path:
+    """Return ``best.ckpt``; without validation, make it a copy of ``last.ckpt``."""
     tested = last.with_name("best.ckpt")
     if trainer.is_global_zero and best.best_model_score is None:
         with atomic_path(tested) as path:
@@ -83,11 +85,11 @@ def _tested(trainer: lightning.Trainer, best: BestCheckpoint, last: Path) -> Pat
     return tested
 
 
-def _best_on_validation(
+def _best_validation_score(
     trainer: lightning.Trainer, best: BestCheckpoint, folder: Path
 ) -> float | None:
-    """The best validation score, kept for sweeps; None if there is none."""
-    if best.best_model_score is None or not best.best_model_score.isfinite():  # of no label
+    """Return the best validation score and write it for sweeps; None without a score."""
+    if best.best_model_score is None or not best.best_model_score.isfinite():  # NaN: no labels
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:
@@ -98,16 +100,16 @@ def _best_on_validation(
 
 @contextmanager
 def _training_faults(resumed: Path | None, last: LastCheckpoint) -> Iterator[None]:
-    """Explain errors of a training, without warnings that do not apply to its runs."""
+    """Explain errors of a training, and hide warnings that do not apply to it."""
     with warnings.catch_warnings():
-        # The checkpoints of a resumed run are meant to be there.
+        # A resumed run has checkpoints.
         warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-        # Lightning looks for this in the loader; here the data module knows where to go on.
+        # The data module, not its loader, stores where to continue.
         warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
-        # Without validation there is no loader for it; a small data set has few batches.
+        # A run may have no validation; a small data set has few batches.
         warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")
         warnings.filterwarnings("ignore", "The number of training batches")
-        # network.frozen_statistics=true
+        # This is what network.frozen_statistics=true does.
         warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
         try:
             yield
@@ -121,7 +123,7 @@ def _training_faults(resumed: Path | None, last: LastCheckpoint) -> Iterator[Non
                 raise
             raise DataError(
                 resumed,
-                found=f"what cannot be resumed ({type(error).__name__}: {error})",
+                found=f"a checkpoint that cannot be resumed ({type(error).__name__}: {error})",
                 expected="the last checkpoint of this run",
             ) from error
         except MisconfigurationException as error:
@@ -129,17 +131,17 @@ def _training_faults(resumed: Path | None, last: LastCheckpoint) -> Iterator[Non
 
 
 def _check_resumed(settings: Mapping[str, Any], checkpoint: Path) -> None:
-    """Refuse to resume a run as another one, or for fewer epochs than it has."""
+    """Refuse to resume a run with other settings, or for fewer epochs than it has begun."""
     content = read_checkpoint(checkpoint, ("config", "epoch", "state_dict"))
     for name, now, then in differing_settings(settings, content["config"], "resume"):
         raise SettingError(
             name,
             found=f"{now!r} for a run that began with {then!r}",
-            expected="the same as before",
-            remedy="Give the same, or start a new run.",
+            expected="the same value",
+            remedy="Leave the setting out, or start a new run.",
         )
     begun, epochs = (content["epoch"] or 0) + 1, settings["trainer"].get("max_epochs")
-    if isinstance(epochs, int) and -1 < epochs < begun:  # other types are refused when it is made
+    if isinstance(epochs, int) and -1 < epochs < begun:  # the trainer refuses other types
         raise SettingError(
             "trainer.max_epochs",
             found=f"{epochs} for a run that is in its epoch {begun}",
@@ -148,36 +150,36 @@ def _check_resumed(settings: Mapping[str, Any], checkpoint: Path) -> None:
 
 
 def _remember(run: Run) -> Collection[str]:
-    """Remember the user's settings for this machine; returns the names of those that are kept.
+    """Remember the user's settings for this machine; return the names of the remembered ones.
 
-    Settings that were remembered are among the overrides of a resumed run.
+    In a resumed run, settings that were remembered before are among the overrides.
     """
     overrides = HydraConfig.get().overrides.task
     names = names_of(overrides)
     choices = HydraConfig.get().runtime.choices
     options = [(group, choices.get(group)) for group in ("data", "experiment")]
-    # Else the same options give the same paths again.
+    # Paths from options of this program are composed again and need not be remembered.
     is_composed = "data" in choices and all(o is None or is_own_option(g, o) for g, o in options)
-    kept = {
-        name: quoted(os.path.abspath(value))  # noqa: PTH100 - links stay
+    local = {
+        name: quoted(os.path.abspath(value))  # noqa: PTH100 - resolves no links
         for name, value in flat_settings({"data": run.settings["data"]})
         if isinstance(value, str) and not from_file(name, value)
         if name in names or not is_composed
     }
     typed = (text.lstrip("+").partition("=") for text in overrides)
-    kept |= {n: v for n, _, v in typed if re.match(r"logger$|(logger|callbacks)\.", n)}
-    rank_zero_only(remember_settings)(run.folder, kept)
+    local |= {n: v for n, _, v in typed if re.match(r"logger$|(logger|callbacks)\.", n)}
+    rank_zero_only(remember_settings)(run.folder, local)
     return remembered_settings(run.folder, ("data", "logger", "callbacks"))
 
 
-def _typed_local(remembered: Collection[str]) -> list[str]:
-    """Typed machine-specific settings that a resumed run needs again: no file holds them."""
-    # Added settings are in the config of a resumed run, or not: ++ sets them in both cases.
+def _settings_to_type_again(remembered: Collection[str]) -> list[str]:
+    """Return typed machine-specific settings that no file stores: resuming needs them again."""
+    # A setting that was added with + may be in the config of a resumed run: ++ covers both cases.
     overrides = [re.sub(r"^\++", "++", text) for text in HydraConfig.get().overrides.task]
     named = [(text, *text.lstrip("+").partition("=")[::2]) for text in overrides]
     return [
         text
         for text, name, value in named
         if name == "trust" or not (name in remembered or from_file(name, value))
-        if not is_own_option(name, value)  # kept among the run's choices
+        if not is_own_option(name, value)  # stored among the run's choices
     ]

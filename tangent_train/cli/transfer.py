@@ -1,4 +1,4 @@
-"""``tangent-transfer``: train on photos, evaluate on panoramas, fine-tune on either, compare."""
+"""``tangent-transfer``: train on photos, evaluate on panoramas, fine-tune on both, compare."""
 
 from __future__ import annotations
 
@@ -23,29 +23,29 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.imports import elsewhere
 from tangent_train.registry import check_fields, without_interpolation
 
-_OF_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
+_ONLY_FOR_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 
 
 def transfer(config: DictConfig) -> None:
     """Run all stages that are not finished, then write and print the tables.
 
     Args:
-        config: The composed ``transfer.yaml``.
+        config: Composed ``transfer.yaml``.
 
     Raises:
-        SettingError: A setting is invalid, or a stage's folder holds something else.
-        DataError: The given checkpoint, or a file of a stage, cannot be used.
+        SettingError: A setting is invalid, or a stage's folder has other content.
+        DataError: The checkpoint of the settings, or a file of a stage, cannot be used.
     """
     folder = Path(HydraConfig.get().runtime.output_dir)
-    given = trained = None
+    stored = trained = None
     if config.checkpoint is not None:
         config.checkpoint = without_interpolation(str(Path(config.checkpoint).absolute()))
-        given = run_settings(Path(config.checkpoint))
-        if given is None:
-            config, trained = _of_network(config)
+        stored = run_settings(Path(config.checkpoint))
+        if stored is None:
+            config, trained = _with_network(config)
     stages = plan(config, folder, views_of(config, trained))
-    if given is not None:
-        _check_given(Path(config.checkpoint), given, stages)
+    if stored is not None:
+        _check_fold(Path(config.checkpoint), stored, stages)
     missing = [stage for stage in stages if stage_state(stage) != "finished"]
     first = stages[0].fold, stages[0].seed
     _check_data([stage for stage in missing if (stage.fold, stage.seed) == first], trained)
@@ -58,17 +58,17 @@ def transfer(config: DictConfig) -> None:
     _report(config, folder, stages, trained)
 
 
-def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
-    """Return the config and the network of a file without settings of a run: only evaluated."""
+def _with_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
+    """Load a network without settings of a run; return the config for its evaluation, and it."""
     overrides = list(HydraConfig.get().overrides.task)
     for text in overrides:
         name = text.lstrip("+~").partition("=")[0]
-        if re.split("[.@]", name)[0] in _OF_TRAINING:
+        if re.split("[.@]", name)[0] in _ONLY_FOR_TRAINING:
             raise SettingError(
                 text,
-                found=f"a setting of training beside checkpoint={config.checkpoint}",
+                found=f"a setting of training with checkpoint={config.checkpoint}",
                 expected="none: a network without settings of a run is only evaluated",
-                remedy="tangent-train init_from= fine-tunes it.",
+                remedy="Fine-tune it with tangent-train init_from=….",
             )
     plain: Any = OmegaConf.to_container(config)
     settings, _, trained = StoredNetwork(Path(config.checkpoint), overrides).settings(plain)
@@ -76,30 +76,30 @@ def _of_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
         raise DataError(
             Path(config.checkpoint),
             found=f"representation={trained.representation}",
-            expected="no ${…} in it: the settings of the stages are interpolated",
+            expected="no ${…}: settings of the stages are interpolated",
         )
     rows = config.representation.get("erp_height")
-    if rows is not None:  # the panoramas of all views
+    if rows is not None:  # of all views
         settings["representation"] |= {"erp_height": rows}
-    settings["network"] = None  # it stays in its file, uninterpreted
+    settings["network"] = None  # stages load it from its file
     settings["fine_tuning"] |= {"epochs": []}
     return OmegaConf.create(settings), trained
 
 
-def _check_given(path: Path, given: Mapping[str, Any], stages: Sequence[Stage]) -> None:
-    """Refuse a checkpoint that has seen the test rooms of another fold."""
-    data = check_fields(path, given, {"data": dict}, "the settings of a run")["data"]
+def _check_fold(path: Path, stored: Mapping[str, Any], stages: Sequence[Stage]) -> None:
+    """Refuse a checkpoint that was trained on test rooms of the stages."""
+    data = check_fields(path, stored, {"data": dict}, "the settings of a run")["data"]
     fold = data.get("fold")
     if fold is not None and any(stage.fold != fold for stage in stages):
         raise SettingError(
             f"checkpoint={path}",
-            found=f"a network for testing on fold {fold}, of the others it has seen the rooms",
+            found=f"a network that was trained on all folds but fold {fold}",
             expected=f"folds=[{fold}]",
         )
 
 
 def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
-    """Build the data and networks of all stages: errors come before hours of training."""
+    """Build the data and networks of all stages, to find errors before hours of training."""
     from tangent_train.cli.run import build, build_trained, check_fits, inputs_and_classes
 
     first: Any = None
@@ -112,37 +112,39 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
         if parts in tried:
             continue
         tried.append(parts)
-        with _named(stage):
-            # No weights are fetched for a network that a checkpoint restores.
+        with _naming_stage(stage):
+            # With a checkpoint, no pretrained weights are fetched.
             settings = {**stage.config, "checkpoint": str(stage.weights)}
             data = (build_trained(settings, trained) if trained else build(settings))[0]
             first = first or data
             check_fits(data, inputs_and_classes(first), f"the network of stage {stages[0].name}")
-            # Files are the same for all rotations, and for all views of as many rows.
+            # Rotations, and views of the same number of rows, have the same files.
             built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
-    for stage, data in built.values():  # after all settings: this makes files
-        with _named(stage):
+    for stage, data in built.values():  # after all settings are checked: this writes files
+        with _naming_stage(stage):
             data.make_files()
             data.setup()
 
 
 @contextmanager
-def _named(stage: Stage) -> Iterator[None]:
-    """Name the stage of an error: settings of the photos are under ``photos``."""
+def _naming_stage(stage: Stage) -> Iterator[None]:
+    """Name the stage in an error; settings of the photos are in the section ``photos``."""
     try:
         yield
     except (DataError, SettingError) as error:
-        where = ", in photos" if stage.name[0] == "P" else ""
-        raise SettingError(f"stage {stage.name}{where}: {error}") from error
+        is_photos = stage.name[0] == "P" and re.match(r"(data|representation)\b", str(error))
+        section = "photos." if is_photos and isinstance(error, SettingError) else ""
+        raise SettingError(f"stage {stage.name}: {section}{error}") from error
 
 
-def _run(stage: Stage, what: str) -> None:
+def _run(stage: Stage, heading: str) -> None:
+    """Run a stage that is not finished, printing its command after a heading."""
     state = stage_state(stage)
     if state == "finished":
-        print_text(f"{what}: finished before.")
+        print_text(f"{heading}: finished before.")
         return
     _, _, _, command, *arguments = stage_command(stage)
-    print_text(f"{what}: tangent-{command} {shlex.join(arguments)}")
+    print_text(f"{heading}: tangent-{command} {shlex.join(arguments)}")
     status = run_stage(stage, state)
     if status:
         name = f"stage {stage.name} in {stage.folder}"
@@ -154,22 +156,22 @@ def _report(
     config: DictConfig, folder: Path, stages: Sequence[Stage], trained: TrainedNetwork | None
 ) -> None:
     """Write and print the tables and the chart."""
-    with elsewhere():  # of matplotlib
+    with elsewhere():  # imports matplotlib
         from tangent_train.results.comparisons import levels_report, transfer_report
     from tangent_train.results.record import load_record
 
-    found: dict[Any, list[Any]] = defaultdict(list)
+    records: dict[Any, list[Any]] = defaultdict(list)
     study = bool(config.study_levels)
     for stage in stages:
         if not study or stage.view:
             key = stage.config["level"] if study else stage.name
-            found[key].append(load_record(stage.folder))
+            records[key].append(load_record(stage.folder))
     if study:
         level = config.level if trained is None else trained.level
-        name, report = "angular_resolution", levels_report(found, level)
+        name, report = "angular_resolution", levels_report(records, level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
-        name, report = "transfer", transfer_report(found, cells)
+        name, report = "transfer", transfer_report(records, cells)
     report.write(folder, name)
     report.tables()[0].print()
     for note in report.all_notes():

@@ -1,18 +1,18 @@
-"""The stages of a transfer (paper, section "Network transfer"), planned and run as ordinary runs.
+"""Plan the stages of a transfer (paper, section "Network transfer") and run them as ordinary runs.
 
 ===========  ===============================================================================
 P            trained on photos, tested on photos
 S            P, tested on panoramas
 S-<view>     P, tested on panoramas through another view
-S-…-<name>   the same in another condition, as tilted
+S-…-<name>   the same in another condition, e.g. tilted
 P-FT-n       P, fine-tuned for n epochs on photos, tested on photos
 S-FT-n       P, fine-tuned for n epochs on panoramas, tested on panoramas
 S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 ===========  ===============================================================================
 
-Besides the files of a run, a stage's folder holds ``stage.yaml``, its config for ``tangent-train``
-or ``tangent-evaluate``, and ``stage.digest``, that of the checkpoint it starts from and of its
-class map.
+Besides the files of a run, a stage's folder contains ``stage.yaml``, its config for
+``tangent-train`` or ``tangent-evaluate``, and ``stage.digest``, a digest of the checkpoint that it
+starts from and of its class map.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from tangent_train.registry import without_interpolation
 from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]
-"""Progress of a stage. One that only evaluates is either new or finished."""
+"""Progress of a stage. A stage that only evaluates is either new or finished."""
 
 _HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
-_SLOWER = 10  # fine-tuning: 1e-5 after 1e-4 (paper, supplement, "Transfer learning")
+_SLOWER = 10  # in fine-tuning: from 1e-4 to 1e-5 (paper, supplement, "Transfer learning")
 _REMEDY = "Give another name=, or delete the folder to run it again."
 
 
@@ -49,14 +49,14 @@ class Stage:
 
     Attributes:
         name: Name of the stage, see the table above.
-        fold: The tested fold; None for data without folds.
-        seed: Seed of all randomness.
-        folder: Folder of the run.
-        command: train or evaluate.
-        config: All its settings, resolved, but for where its weights come from.
-        weights: Checkpoint of its network; None to start from scratch.
-        view: Name of the view, if panoramas are evaluated; "" for that of the transfer.
-        condition: Condition of these panoramas.
+        fold: Test fold; None for data without folds.
+        seed: Seed of all random numbers.
+        folder: Run folder.
+        command: Command that runs the stage.
+        config: All settings of the stage, resolved, except for the file of its weights.
+        weights: Checkpoint of the network; None to start from scratch.
+        view: Name of the view that panoramas are evaluated in; "" for the view of the transfer.
+        condition: Condition that panoramas are evaluated in; "" in other stages.
     """
 
     name: str
@@ -71,13 +71,13 @@ class Stage:
 
 
 def plan(config: DictConfig, folder: Path, views: Mapping[str, Mapping[str, Any]]) -> list[Stage]:
-    """All stages, grouped by fold and seed.
+    """Plan all stages, grouped by fold and seed.
 
     Args:
-        config: The composed ``transfer.yaml``; ``checkpoint``, if any, an absolute path.
-        folder: The transfer's.
-        views: Changes of settings by the names of the views, see `transfer_views`; in a study all
-            of them, else those besides the transfer's own.
+        config: Composed ``transfer.yaml``; ``checkpoint`` is an absolute path or null.
+        folder: Folder of the transfer.
+        views: Changes of settings by the names of the views, see `transfer_views`. In a study,
+            these are all views; else they are compared with the view of the transfer.
 
     Raises:
         SettingError: A setting of the transfer is invalid.
@@ -88,10 +88,10 @@ def plan(config: DictConfig, folder: Path, views: Mapping[str, Mapping[str, Any]
             found=config.class_map,
             expected="null for a network that is trained here, on the classes of the data",
         )
-    own_fold = config.data.get("fold")
-    if config.folds is not None and own_fold is None:
+    fold = config.data.get("fold")
+    if config.folds is not None and fold is None:
         raise SettingError("folds", found=config.folds, expected="null: this data has no folds")
-    folds = [own_fold] if config.folds is None else numbers(config, "folds", 0)
+    folds = [fold] if config.folds is None else numbers(config, "folds", 0)
     seeds = [config.seed] if config.seeds is None else numbers(config, "seeds", 0)
     planners = [_Planner(config, folder, fold, seed) for fold in folds for seed in seeds]
     return [stage for planner in planners for stage in planner.all(views)]
@@ -103,12 +103,12 @@ class _Planner:
     def __init__(self, config: DictConfig, folder: Path, fold: int | None, seed: int) -> None:
         self._config, self._fold, self._seed = config, fold, seed
         self._folder = (folder if fold is None else folder / f"fold_{fold}") / f"seed_{seed}"
-        self._given = config.checkpoint
+        self._checkpoint = config.checkpoint
 
     def all(self, views: Mapping[str, Mapping[str, Any]]) -> Iterator[Stage]:
         settings, study = self._settings(), self._config.study_levels
-        if self._has_photos() and not (study and self._given):
-            yield self._stage("P", settings, "evaluate" if self._given else "train")
+        if self._has_photos() and not (study and self._checkpoint):
+            yield self._stage("P", settings, "evaluate" if self._checkpoint else "train")
         for view, changes in (views if study else {"": {}, **views}).items():
             for condition, of_data in conditions_of(self._config).items():
                 name = "-".join(filter(None, ("S", view, condition if of_data else "")))
@@ -120,27 +120,27 @@ class _Planner:
     def _has_photos(self) -> bool:
         if "_target_" in self._config.photos.data:
             return True
-        if self._given:
+        if self._checkpoint:
             return False
         raise SettingError(
             "data@photos.data",
             found="none",
             expected="the photos to train P on: data@photos.data=folder_photos photos.data.root=…",
-            remedy="Or give checkpoint=, a network that was trained on photos.",
+            remedy="Or start from a network that was trained on photos: checkpoint=….",
         )
 
     def _fine_tuned(self, settings: dict[str, Any]) -> Iterator[Stage]:
         for epochs in numbers(self._config, "fine_tuning.epochs", 1):
-            tuned = self._settings({"optimizer": self._slower(settings)})
+            tuned = self._settings({"optimizer": self._fine_tuning_optimizer(settings)})
             tuned["scheduler"] = tuned["fine_tuning"]["scheduler"]
             tuned["trainer"]["max_epochs"] = epochs
-            # Other crops than those of P's first epochs.
+            # Not the crops of P's first epochs again.
             tuned["photos"]["data"]["sampling_seed"] = 1
             for on in "PS":
                 yield self._stage(f"{on}-FT-{epochs}", tuned, "train")
 
     def _settings(self, changes: Mapping[str, Any] | None = None) -> dict[str, Any]:
-        """All settings, resolved after the changes."""
+        """Return all settings, resolved after changes."""
         config: Any = OmegaConf.create(OmegaConf.to_container(self._config))
         config.seed = self._seed
         for data in (config.data, config.photos.data):
@@ -151,18 +151,18 @@ class _Planner:
         resolved: Any = OmegaConf.to_container(config, resolve=True)
         return dict(resolved)
 
-    def _slower(self, settings: dict[str, Any]) -> dict[str, Any]:
-        """Return the optimizer of fine-tuning; other settings are those of P's training."""
+    def _fine_tuning_optimizer(self, settings: dict[str, Any]) -> dict[str, Any]:
+        """Return the optimizer of fine-tuning, completed with the settings of P's training."""
         tuned, before = settings["fine_tuning"]["optimizer"], settings["optimizer"]
         optimizer = tuned if "_target_" in tuned else before | tuned
         if optimizer.get("lr") is None:
             if before.get("lr") is None:
                 raise SettingError(
                     "fine_tuning.optimizer.lr",
-                    found="null, a tenth of optimizer.lr, which is null",
+                    found="null (a tenth of optimizer.lr), and optimizer.lr is null",
                     expected="a learning rate",
                 )
-            # 3e-4 of 3e-3, not 3.0000000000000003e-4
+            # Rounded: 3e-3 / 10 is 3.0000000000000003e-4.
             optimizer = optimizer | {"lr": float(f"{before['lr'] / _SLOWER:.12g}")}
         return dict(optimizer)
 
@@ -180,7 +180,7 @@ class _Planner:
         if name[0] == "P":
             config |= {key: settings["photos"][key] for key in ("data", "representation")}
         trained = self._folder / "P" / "checkpoints" / "best.ckpt"
-        scratch = name == "P" and not self._given
+        scratch = name == "P" and not self._checkpoint
         return Stage(
             name=name,
             fold=self._fold,
@@ -188,15 +188,15 @@ class _Planner:
             folder=self._folder / name,
             command=command,
             config=config,
-            weights=None if scratch else Path(self._given or trained),
+            weights=None if scratch else Path(self._checkpoint or trained),
         )
 
 
 def stage_state(stage: Stage) -> State:
-    """Progress of a stage, from the files in its folder.
+    """Determine the progress of a stage from the files in its folder.
 
     Raises:
-        SettingError: Its folder holds something else, or the same stage with other settings.
+        SettingError: The folder has other content, or the stage with other settings.
         DataError: A file of the stage cannot be read.
     """
     record = stage.folder / "stage.digest"
@@ -205,7 +205,7 @@ def stage_state(stage: Stage) -> State:
             raise SettingError(
                 stage.folder,
                 found="files that tangent-transfer did not write",
-                expected="a new folder, or that of this stage",
+                expected="a new folder, or the folder of this stage",
                 remedy=_REMEDY,
             )
         return "new"
@@ -221,16 +221,16 @@ def stage_state(stage: Stage) -> State:
         raise SettingError(
             stage.folder,
             found=f"stage {stage.name} with {', '.join(named)}",
-            expected="the settings of this command",
+            expected="the same settings as in this command",
             remedy=_REMEDY,
         )
     weights, known = stage.weights, record.read_bytes()
-    # A network that was trained again is another one; one that is gone is not missed.
+    # A retrained network has another digest; a removed one does not matter.
     if weights and weights.is_file() and known != _digest(weights, stage.config).encode():
         raise SettingError(
             stage.folder,
             found=f"stage {stage.name} of another network, or with another class map",
-            expected=f"the one in {weights}",
+            expected=f"the network in {weights} and this class map",
             remedy=_REMEDY,
         )
     return "finished" if finished else "begun"
@@ -240,15 +240,15 @@ def run_stage(stage: Stage, state: State) -> int:
     """Start or resume a stage and wait for it.
 
     Args:
-        stage: Not finished.
-        state: Its `stage_state`.
+        stage: Stage that is not finished.
+        state: Progress of the stage, see `stage_state`.
 
     Returns:
-        The exit status, as in a shell.
+        Exit status, as in a shell.
 
     Raises:
-        DataError: The checkpoint it starts from is missing.
-        SettingError: Another command is running it.
+        DataError: The checkpoint that the stage starts from is missing.
+        SettingError: Another command is running the stage.
     """
     config, digest = dict(stage.config), ""
     if state == "begun":
@@ -259,7 +259,7 @@ def run_stage(stage: Stage, state: State) -> int:
                 stage.weights,
                 found="no such file",
                 expected=f"the network that {stage.name} starts from",
-                remedy="Delete the stages of this seed to run it all again.",
+                remedy="Delete the stages of this seed to run them all again.",
             )
         config["init_from" if stage.command == "train" else "checkpoint"] = str(stage.weights)
         digest = _digest(stage.weights, config)
@@ -274,9 +274,9 @@ def run_stage(stage: Stage, state: State) -> int:
     except Timeout as error:
         raise SettingError(
             stage.folder,
-            found=f"another tangent-transfer that runs stage {stage.name}",
-            expected="none",
-            remedy="Wait for it; other seeds and folds can run beside it.",
+            found=f"another tangent-transfer that is running stage {stage.name}",
+            expected="a folder that is not in use",
+            remedy="Wait for it; other seeds and folds can run at the same time.",
         ) from error
     return status if status >= 0 else 128 - status
 
@@ -288,11 +288,11 @@ def stage_command(stage: Stage) -> list[str]:
 
 
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:
-    """A hash of the network's file and, if there is one, of its class map's."""
-    given = str(config.get("class_map") or "")
-    own_map = [Path(given)] if given.lower().endswith(".json") else []
-    hashed = hashlib.blake2b()
-    for path in (weights, *own_map):
+    """Hash the network's file and, if there is one, the file of the class map."""
+    class_map = str(config.get("class_map") or "")
+    map_files = [Path(class_map)] if class_map.lower().endswith(".json") else []
+    digest = hashlib.blake2b()
+    for path in (weights, *map_files):
         with path.open("rb") as file:
-            hashed.update(hashlib.file_digest(file, "blake2b").digest())
-    return hashed.hexdigest()[:32]
+            digest.update(hashlib.file_digest(file, "blake2b").digest())
+    return digest.hexdigest()[:32]

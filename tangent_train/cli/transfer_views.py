@@ -1,8 +1,7 @@
-"""Views of the panoramas, in several conditions, on which a transfer evaluates its network.
+"""Views and conditions of the panoramas that a transfer evaluates its network on.
 
-Both are lists of the user's own settings with names: ``compare`` of the representation,
-``conditions`` of the data. Every view is evaluated in every condition, always on the same
-panoramas, rotated alike.
+Both are lists of named settings: ``compare`` changes the representation, ``conditions`` the data.
+Every view is evaluated in every condition, on the same panoramas with the same rotations.
 """
 
 from __future__ import annotations
@@ -19,18 +18,19 @@ from tangent_train.errors import SettingError
 from tangent_train.inference.representations import panorama_settings
 
 _NAME = re.compile(r"\w[\w.+-]*")
-"""It becomes part of a folder's name."""
+"""Names that can be part of a folder's name."""
 
 
 def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, dict[str, Any]]:
-    """Return the views by name, each as changes of settings: those of ``compare``, or of the study.
+    """Return the views of ``compare`` or of the study by name, each as changes of settings.
 
-    A view is an option of ``representation`` (a name alone, or ``option``) or, without one, the
-    transfer's own, with the other settings changed. ``level`` is also that of the stage.
+    A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
+    without an option, it is the transfer's own representation with changed settings. ``level`` also
+    sets the level of the stage.
 
     Args:
-        config: The composed ``transfer.yaml``.
-        trained: The given network, if its file knows no run.
+        config: Composed ``transfer.yaml``.
+        trained: Network from a file without settings of a run; else None.
 
     Raises:
         SettingError: The list is invalid.
@@ -38,92 +38,101 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
     if config.study_levels:
         most = config.study_max_rows
         levels = {n: 2 ** (n + 1) for n in numbers(config, "study_levels", 0)}
-        rows = {n: own if most is None else min(own, most) for n, own in levels.items()}
-        return {f"level-{n}": _view(config, trained, level=n, erp_height=rows[n]) for n in levels}
-    own = HydraConfig.get().runtime.choices.get("representation")
-    views = {}
-    for name, given in _named(config, "compare").items():
-        if given or name != own:
-            settings = given or {"option": name}
-            views[name] = _view(config, trained, **settings)
-    return views
+        heights = {n: rows if most is None else min(rows, most) for n, rows in levels.items()}
+        return {
+            f"level-{n}": _view(config, trained, level=n, erp_height=rows)
+            for n, rows in heights.items()
+        }
+    chosen = HydraConfig.get().runtime.choices.get("representation")
+    return {
+        name: _view(config, trained, **(changes or {"option": name}))
+        for name, changes in _named_entries(config, "compare").items()
+        if changes or name != chosen
+    }
 
 
 def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:
     """Return the conditions of the test panoramas by name, each as changes of settings.
 
     Args:
-        config: The composed ``transfer.yaml``.
+        config: Composed ``transfer.yaml``.
 
     Raises:
         SettingError: The list is invalid.
     """
-    found = _named(config, "conditions")
-    if not found:
-        raise SettingError("conditions", found="[]", expected="one or more: [upright]")
-    return {name: {f"data.{n}": v for n, v in given.items()} for name, given in found.items()}
+    conditions = _named_entries(config, "conditions")
+    if not conditions:
+        raise SettingError("conditions", found="[]", expected="at least one: [upright]")
+    return {n: {f"data.{key}": v for key, v in c.items()} for n, c in conditions.items()}
 
 
 def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
-    """Return the different whole numbers of a list.
+    """Return a list of different whole numbers.
 
     Args:
-        config: The composed ``transfer.yaml``.
-        setting: The list, ``section.setting``.
-        least: The smallest that is allowed.
+        config: Composed ``transfer.yaml``.
+        setting: Name of the list, ``section.setting``.
+        least: Smallest allowed number.
 
     Raises:
-        SettingError: It holds something else.
+        SettingError: The list has other values, or equal ones.
     """
-    found = OmegaConf.select(config, setting)
-    numbers: list[Any] = list(found) if isinstance(found, list | ListConfig) else [None]
+    value = OmegaConf.select(config, setting)
+    numbers: list[Any] = list(value) if isinstance(value, list | ListConfig) else [None]
     if not all(type(n) is int and n >= least for n in numbers) or len(set(numbers)) < len(numbers):
-        raise SettingError(
-            setting, found=found, expected=f"a list of different whole numbers from {least}"
-        )
+        expected = f"a list of different whole numbers, {least} or more"
+        raise SettingError(setting, found=value, expected=expected)
     return numbers
 
 
 def _view(
-    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **given: Any
+    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **changes: Any
 ) -> dict[str, Any]:
-    level = given.get("level")
-    own: Any = OmegaConf.to_container(config.representation)
+    """Return a view as changes of settings: its representation, and its level if it has one.
+
+    Args:
+        config: Composed ``transfer.yaml``.
+        trained: Network from a file without settings of a run; else None.
+        option: Option of the group ``representation``; None for the representation of the transfer.
+        **changes: Changed settings of the representation.
+    """
+    level = changes.get("level")
+    composed: Any = OmegaConf.to_container(config.representation)
     section: Any
     if option is not None:
         search = [s for s in HydraConfig.get().overrides.hydra if s.startswith("hydra.searchpath")]
-        # The option alone: its references to other settings stay as they are.
+        # Composed alone, so that its references to other settings are not resolved.
         section = OmegaConf.to_container(compose(f"representation/{option}", search).representation)
-    elif trained is not None and {"level", "base_level"} & given.keys():
-        of_size = panorama_settings(trained, level, given.get("base_level"))
-        section = own if own["_target_"] == of_size["_target_"] else {}
-        section |= of_size
+    elif trained is not None and {"level", "base_level"} & changes.keys():
+        of_level = panorama_settings(trained, level, changes.get("base_level"))
+        section = composed if composed["_target_"] == of_level["_target_"] else {}
+        section |= of_level
     else:
-        section = own
+        section = composed
         dim = config.representation.get("dim")
         if level is not None and dim is not None:  # a side in pixels
             section["dim"] = max(1, round(dim * 2.0 ** (level - config.level)))
     rows = config.representation.get("erp_height")
     if rows is None and level is not None:
         rows = 2 ** (config.level + 1)
-    section |= ({} if rows is None else {"erp_height": rows}) | given
+    section |= ({} if rows is None else {"erp_height": rows}) | changes
     return {"representation": section} | ({} if level is None else {"level": level})
 
 
-def _named(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
-    """Return the settings in a list by name."""
-    found = config[setting]
-    entries: Any = OmegaConf.to_container(found) if isinstance(found, ListConfig) else [None]
+def _named_entries(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:
+    """Return the entries of a list, names or named settings, as settings by name."""
+    value = config[setting]
+    entries: Any = OmegaConf.to_container(value) if isinstance(value, ListConfig) else [None]
     named: dict[str, dict[str, Any]] = {}
     for entry in entries:
-        given = {"name": entry} if isinstance(entry, str) else entry
-        name = given.get("name") if isinstance(given, dict) else None
+        settings = {"name": entry} if isinstance(entry, str) else entry
+        name = settings.get("name") if isinstance(settings, dict) else None
         if not isinstance(name, str) or not _NAME.fullmatch(name) or name in named:
             raise SettingError(
                 setting,
-                found=entry if isinstance(found, ListConfig) else found,
+                found=entry if isinstance(value, ListConfig) else value,
                 expected="a list of different names, or of settings with such a name: "
                 "[one, {name: another, …}]",
             )
-        named[name] = {key: value for key, value in given.items() if key != "name"}
+        named[name] = {key: inner for key, inner in settings.items() if key != "name"}
     return named

@@ -76,7 +76,7 @@ class CubeGrid(PinholeGrid):
         return math.ceil(2 / self.pitch - 1e-9)
 
     @property
-    def overlapping(self) -> bool:
+    def is_overlapping(self) -> bool:
         """True if there is a margin. Without one, neighbors meet at their outer edges."""
         return self.dim * self.pitch > 2
 

@@ -151,7 +151,7 @@ class TangentGrid(PinholeGrid):
         return _face_table(self.base_level).neighbors
 
     @property
-    def overlapping(self) -> bool:
+    def is_overlapping(self) -> bool:
         """Always True: even the smallest images reach half a pixel beyond the owned cells."""
         return True
 

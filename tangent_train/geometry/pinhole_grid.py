@@ -51,7 +51,7 @@ class PinholeGrid(ABC):
 
     @property
     @abstractmethod
-    def overlapping(self) -> bool:
+    def is_overlapping(self) -> bool:
         """True if every direction is inside an image, not only on its outer edge."""
 
     @abstractmethod

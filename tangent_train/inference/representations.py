@@ -169,11 +169,11 @@ class PhotoViews:
 
 
 def wide_levels(side: int) -> list[int]:
-    """Levels of the wide views that photo networks are given by default.
+    """Return the levels of the wide views that photo networks get by default.
 
-    At level s and base level 0, 2^s pixels span 95.8°; the first level has the power of two
-    nearest to the side, the second one is the next lower level, at which the same number of pixels
-    spans twice as much of the tangent plane. See docs/explanation/choosing_views.md.
+    At level s and base level 0, 2^s pixels span 95.8°. The first level has the power of two nearest
+    to the side. The second is the next lower level, at which the same number of pixels spans twice
+    as much of the tangent plane. See docs/explanation/choosing_views.md.
 
     Args:
         side: Side of the network's images in pixels.
@@ -186,15 +186,16 @@ def wide_levels(side: int) -> list[int]:
 
 
 def images_of_side(side: int, level: int, base_level: int | None = None) -> dict[str, int]:
-    """Base level and side (``dim``) of the fewest tangent images with the side of a network's.
+    """Choose base level and side of tangent images: the fewest with a given side.
 
     Args:
         side: Side of the network's images in pixels.
-        level: The highest level s of the images.
-        base_level: Given base level b.
+        level: Highest level s of the images.
+        base_level: Base level b; None for the fewest images.
 
     Returns:
-        ``dim`` differs from `side` only where such images would leave gaps on the sphere.
+        ``base_level`` and ``dim``, which differs from `side` only if images of that side would
+        leave gaps on the sphere.
 
     >>> images_of_side(512, 9), images_of_side(512, 10)
     ({'base_level': 0, 'dim': 512}, {'base_level': 1, 'dim': 512})
@@ -238,13 +239,15 @@ def panorama_settings(
         raise SettingError(
             "levels",
             found=chosen,
-            expected="one, for a network that does not take tangent images",
+            expected="one level, for a network that does not take tangent images",
             remedy="Give base_level= to use tangent images.",
         )
     if is_tangent and (side := trained.photo_side) is not None:
         dim = settings.get("dim")
         of_side = images_of_side(side, level, base_level)
-        settings |= of_side if dim is None else {"dim": max(dim, side)}  # larger ones are divided
+        settings |= (
+            of_side if dim is None else {"dim": max(dim, side)}
+        )  # the network divides larger images
     return settings
 
 

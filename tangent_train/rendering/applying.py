@@ -68,7 +68,7 @@ def apply(
     >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
     np.float32(0.5)
     """
-    blend = blend_of(blend, overlapping=grid.overlapping)
+    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     check_panorama(panorama, "bilinear")
     if isinstance(panorama, Tensor) and panorama.ndim > 3:
         raise SettingError(

@@ -61,7 +61,7 @@ def tangent_to_equirect(
     Raises:
         SettingError: The images, the shape, the blend or the interpolation cannot be used.
     """
-    blend = blend_of(blend, overlapping=grid.overlapping)
+    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
     check_images("tangent images", images, grid, interpolation)
@@ -105,7 +105,7 @@ def tangent_to_labels(
         SettingError: The logits, the shape or the blend cannot be used.
     """
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
-    blend = blend_of(blend, overlapping=grid.overlapping)
+    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     shape = check_shape(shape)
     check_images("scores", scores, grid)
     small = torch.uint8 if scores.shape[-3] <= 256 else torch.uint16

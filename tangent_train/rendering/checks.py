@@ -35,7 +35,7 @@ def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
         )
 
 
-def blend_of(blend: Blend, *, overlapping: bool) -> Blend:
+def blend_of(blend: Blend, *, is_overlapping: bool) -> Blend:
     """Return the blend, or ``nearest`` for images that do not overlap.
 
     Images without overlap meet at their edges, where feather weights are 0: the faces of a cube map
@@ -43,13 +43,13 @@ def blend_of(blend: Blend, *, overlapping: bool) -> Blend:
 
     Args:
         blend: Requested blend.
-        overlapping: True if every pixel is inside an image, not only on its outer edge.
+        is_overlapping: True if every pixel is inside an image, not only on its outer edge.
 
     Raises:
         SettingError: There is no such blend.
     """
     check_choice("blend", blend, ("nearest", "feather"))
-    return blend if overlapping else "nearest"
+    return blend if is_overlapping else "nearest"
 
 
 def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:

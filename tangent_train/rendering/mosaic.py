@@ -127,7 +127,7 @@ class ScoreMosaic:
 
     def _owners(self, images: Views) -> Any:
         """Return the owner of each pixel, cached until images of another set are added."""
-        if blend_of(self.blend, overlapping=images.overlapping) == "feather":
+        if blend_of(self.blend, is_overlapping=images.is_overlapping) == "feather":
             return NO_OWNERS
         if self._owned[0] is not images.all_images:
             owner: Any = images.owners(self.shape)

@@ -1,4 +1,4 @@
-"""The chart of a report: bars of scores, and lines over the latitude."""
+"""Draw the chart of a report: bars of scores, and lines over the latitude."""
 
 from __future__ import annotations
 
@@ -14,24 +14,24 @@ from matplotlib.text import Text
 from tangent_train.results.rows import Row, Statistic
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
-"""Okabe and Ito's colours, which people with colour blindness can tell apart."""
+"""Colors of Okabe and Ito, which people with color blindness can distinguish."""
 
 _LONGEST_LABEL = 60
 _ERROR_BARS = "bars: standard deviation over folds, else over seeds, else 95 % interval over images"
 
 
 def report_png(title: str, rows: Sequence[Row]) -> bytes:
-    """Bars of the means over the classes and of every class, lines over the latitude.
+    """Draw bars of the means and of each class, and lines over the latitude.
 
     Error bars are the standard deviation over folds, else over seeds, else the 95 % interval over
-    the images of a single run; hatched bars are published.
+    the images of a single run. Bars of published scores are hatched.
 
     Args:
         title: Title of the chart.
-        rows: Rows of the same scores and classes.
+        rows: Rows with the same scores and classes.
 
     Returns:
-        A PNG file.
+        Content of a PNG file.
     """
     record = rows[0].records[0]
     panels: list[_Panel] = []
@@ -47,18 +47,18 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
 
 
 def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str, unit: str) -> bytes:
-    """Bars of one score of every view, in groups of one condition.
+    """Draw bars of one score of every view, grouped by condition.
 
     Args:
         title: Title of the chart.
-        grid: Rows by view, every one with all conditions.
+        grid: Rows by view and condition; every view has all conditions.
         score: Name of the score over all images.
         unit: Unit of the score.
 
     Returns:
-        A PNG file.
+        Content of a PNG file.
     """
-    scores = [[row.score(score) for row in found.values()] for found in grid.values()]
+    scores = [[row.score(score) for row in by_condition.values()] for by_condition in grid.values()]
     conditions = list(next(iter(grid.values())))
     panel = _Panel(title, conditions, scores, unit)
     return _png([Row(view, ()) for view in grid], panel)
@@ -74,7 +74,7 @@ class _Panel(NamedTuple):
 
 
 def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
-    """Panels of bars, and lines over the latitude of the rows that have bands."""
+    """Draw panels of bars, and lines over the latitude for rows with latitude bands."""
     banded = any(row.bands for row in rows)
     count = len(panels) + banded
     width = max(10.0, 0.12 * len(panels[-1].ticks) * len(rows))
@@ -92,7 +92,7 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     handles, labels = plots[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
-        text.set_parse_math(False)  # "$" in a name is no formula
+        text.set_parse_math(False)  # "$" in a name does not begin a formula
     file = io.BytesIO()
     figure.savefig(file, format="png")
     return file.getvalue()
@@ -100,15 +100,15 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
 
 def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
     width, ticks = 0.8 / len(rows), panel.ticks
-    for k, (row, number, found) in enumerate(zip(rows, _numbers(rows), panel.scores, strict=True)):
-        again = number >= len(_COLORS)  # a second row of a colour
+    for k, (row, number, scores) in enumerate(zip(rows, _numbers(rows), panel.scores, strict=True)):
+        is_repeated = number >= len(_COLORS)  # its color
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
-            _in_unit([score.mean for score in found], panel.unit),
+            _in_unit([score.mean for score in scores], panel.unit),
             0.92 * width,
-            yerr=np.transpose([_in_unit(_error_bar(score), panel.unit) for score in found]),
+            yerr=np.transpose([_in_unit(_error_bar(score), panel.unit) for score in scores]),
             color=_COLORS[number % len(_COLORS)],
-            hatch="//" if row.published else "xx" if again else "",
+            hatch="//" if row.published else "xx" if is_repeated else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
         )
@@ -129,23 +129,23 @@ def _band_lines(axes: Axes, rows: Sequence[Row], score: str, unit: str) -> None:
 
 
 def _numbers(rows: Sequence[Row]) -> list[int]:
-    """A number of every row for its colour, the same for a row of the paper as for one's own."""
+    """Return a number of each row for its color; a row and its row of the paper share a number."""
     names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
     return [names.index(row.label.removesuffix(" (paper)")) for row in rows]
 
 
 def _error_bar(score: Statistic) -> list[float | None]:
-    """Lengths below and above the mean."""
+    """Return the lengths of an error bar below and above the mean."""
     spread = score.over_seeds if score.over_folds is None else score.over_folds
     if spread is not None or score.mean is None or score.interval is None:
         return [spread, spread]
     low, high = score.interval
-    # The mean of few images may lie outside.
+    # The mean over few images may be outside the interval.
     return [max(score.mean - low, 0), max(high - score.mean, 0)]
 
 
 def _in_unit(values: Sequence[float | None], unit: str) -> list[float]:
-    """Numbers to draw; NaN, which draws nothing, for None."""
+    """Return the numbers to draw; NaN, which draws nothing, for None."""
     scale = 100 if unit == "%" else 1
     return [np.nan if value is None else scale * value for value in values]
 
@@ -161,6 +161,6 @@ def _score_axis(axes: Axes, unit: str) -> None:
 
 
 def _short(label: str) -> str:
-    """A label for the legend; its end, where settings differ, matters more than its middle."""
+    """Shorten a label for the legend in its middle: settings that differ are at its end."""
     half = _LONGEST_LABEL // 2
     return label if len(label) <= _LONGEST_LABEL else f"{label[:half]} … {label[-half:]}"

@@ -1,11 +1,11 @@
 """Reports over groups of runs, the stages of a transfer, and one network at several levels.
 
-``paper.csv`` has published figures, in percent: Eder, Shvets, Lim and Frahm, Tangent Images for
-Mitigating Spherical Distortion, CVPR 2020 (arXiv:1912.09390), and the work it compares with. They
-are the tables of semantic segmentation, shape classification and network transfer, and the
-per-class tables of the supplement. Rows without a stage are of networks trained on panoramas,
-"averaged over the 3 folds" on Stanford2D3DS. For the transfer the file has the single folds,
-because the rows for all folds repeat fold 3; its scores per class are over all folds.
+``paper.csv`` contains published scores in percent: Eder, Shvets, Lim and Frahm, Tangent Images for
+Mitigating Spherical Distortion, CVPR 2020 (arXiv:1912.09390), and the work that it compares with.
+They are the tables of semantic segmentation, shape classification and network transfer, and the
+per-class tables of the supplement. Rows without a stage are for networks trained on panoramas,
+"averaged over the 3 folds" on Stanford2D3DS. For the transfer, the file has the single folds,
+because the paper's rows for all folds repeat fold 3; its scores per class are over all folds.
 """
 
 from __future__ import annotations
@@ -29,27 +29,28 @@ _REPRESENTATIONS = {
     "Tangent": "tangent images",
 }
 _CHANGE_OF_STAGES = (
-    "Change: against photos after as much fine-tuning, over the folds and seeds that both have."
+    "Change: from photos after the same fine-tuning, over the folds and seeds that both have."
 )
 _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
-"""The field's names: none, about the vertical axis, any."""
+"""Usual names of no rotation, rotation about the vertical axis, and arbitrary rotation."""
 
 
 def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
-    """Report finished runs: mean and spread of each group, beside the paper's figures.
+    """Report the mean and spread of each group of finished runs, with the paper's figures.
 
     Args:
         records: Records of the runs.
         notes: Notes to add.
     """
     rows = [replace(row, facts=_facts(row.records)) for row in group_runs(records)]
-    together = sorted(
+    merged = sorted(
         [*published(records), *rows], key=lambda row: (row.facts["data"], row.facts["s"].zfill(2))
     )
-    return Report("Report", together, [*_repeated(rows), *notes])
+    return Report("Report", merged, [*_repeated(rows), *notes])
 
 
 def _repeated(rows: Sequence[Row]) -> Iterator[str]:
+    """Yield notes on runs with the same fold and seed."""
     for row in rows:
         seen: set[tuple[int | None, int | None]] = set()
         for record in row.records:
@@ -63,17 +64,16 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
 def transfer_report(
     stages: Mapping[str, Sequence[Record]], cells: Mapping[str, Cell] | None = None
 ) -> Report:
-    """Report a transfer from photos to panoramas, beside the paper's.
+    """Report a transfer from photos to panoramas, with the paper's figures.
 
     Args:
-        stages: Evaluations by the names of their stages: S, S-erp and S-FT-10, tested on panoramas,
-            are compared with P and P-FT-10, tested on photos, after as much fine-tuning.
-        cells: View and condition of stages that evaluate one network.
+        stages: Evaluations by the names of their stages. S, S-erp and S-FT-10, tested on panoramas,
+            are compared with P and P-FT-10, tested on photos, after the same fine-tuning.
+        cells: View and condition of stages that evaluate the same network.
     """
-    records = [record for found in stages.values() for record in found]
-    check_alike(records)
-    rows = [Row(name, tuple(found), _facts(found)) for name, found in stages.items()]
-    panoramas = [r for name, found in stages.items() if name[0] == "S" for r in found]
+    check_alike([record for records in stages.values() for record in records])
+    rows = [Row(name, tuple(records), _facts(records)) for name, records in stages.items()]
+    panoramas = [r for name, records in stages.items() if name[0] == "S" for r in records]
     rows += published(panoramas, transfer=True)
     by_name = {row.label: row for row in rows}
     rows = [replace(row, partner=by_name.get(_photos_of(row.label))) for row in rows]
@@ -82,7 +82,7 @@ def transfer_report(
 
 
 def _photos_of(stage: str) -> str:
-    """The stage on photos with as much fine-tuning.
+    """Return the stage on photos with the same fine-tuning; "" for a stage on photos.
 
     >>> _photos_of("S-FT-10 (paper)"), _photos_of("S-erp"), _photos_of("P")
     ('P-FT-10 (paper)', 'P', '')
@@ -97,15 +97,15 @@ def _photos_of(stage: str) -> str:
 def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) -> Report:
     """Report one network at several levels of the panoramas.
 
-    The paper's third transfer experiment: photos are normalized to the angular resolution of one
-    level; scores fall the further that of the panoramas is from it.
+    This is the paper's third transfer experiment: photos are normalized to the angular resolution
+    of one level; scores decrease with the difference from the resolution of the panoramas.
 
     Args:
         levels: Evaluations by level.
-        trained_level: The level whose angular resolution the photos had in training; between two
-            levels where it is that of neither.
+        trained_level: Level with the angular resolution of the photos in training; a fraction if it
+            is between two levels.
     """
-    check_alike([record for found in levels.values() for record in found])
+    check_alike([record for records in levels.values() for record in records])
     rows = {
         level: Row(f"level {level}", tuple(levels[level]), _facts(levels[level]))
         for level in sorted(levels)
@@ -116,7 +116,7 @@ def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) 
         for level, row in rows.items()
     ]
     note = f"Photos in training: the angular resolution of level {trained_level:g}."
-    change = f"Change: against level {nearest}, over the folds and seeds that both have."
+    change = f"Change: from level {nearest}, over the folds and seeds that both have."
     return Report("One network at several levels", compared, [note], change)
 
 
@@ -141,7 +141,7 @@ def _facts(records: Sequence[Record]) -> dict[str, str]:
 
 
 def _inputs(record: Record) -> str:
-    """RGB or RGB-D, as the paper writes it, and further inputs; a dash for shapes."""
+    """Return RGB or RGB-D, as in the paper, and further inputs; a dash for shapes."""
     names = record.settings.get("data.inputs")
     if names is None:
         return "–"
@@ -150,7 +150,7 @@ def _inputs(record: Record) -> str:
 
 
 def _base_level(record: Record) -> str:
-    """The base level b of tangent images, or the short name of a representation that has none."""
+    """Return the base level b of tangent images, or a short name of another representation."""
     base = record.settings.get("representation.base_level")
     if base is not None:
         return str(base)
@@ -160,31 +160,32 @@ def _base_level(record: Record) -> str:
 
 
 def published(records: Sequence[Record], *, transfer: bool = False) -> list[Row]:
-    """Return published scores for the data and resolutions of some evaluations.
+    """Return published scores for the data and levels of evaluations.
 
     Args:
-        records: Evaluations; those on other data, other classes or rotated data match nothing.
-        transfer: True for the figures of the network transfer.
+        records: Evaluations. For other data sets, classes and rotated data, nothing is published.
+        transfer: True for the scores of the network transfer.
 
     Returns:
         Rows in the order of the file.
     """
-    own = {(r.data, str(len(r.classes)), str(r.settings.get("level"))) for r in records}
+    wanted = {(r.data, str(len(r.classes)), str(r.settings.get("level"))) for r in records}
     lines: dict[tuple[str, ...], list[dict[str, str]]] = defaultdict(list)
     text = files("tangent_train.results").joinpath("paper.csv").read_text(encoding="utf-8")
     for line in csv.DictReader(text.splitlines()):
-        known = (line["data"], line["classes"], line["level"]) in own
-        known = known and line["score"] in records[0].headings
-        if known and bool(line["stage"]) is transfer:
+        is_wanted = (line["data"], line["classes"], line["level"]) in wanted
+        is_wanted = is_wanted and line["score"] in records[0].headings
+        if is_wanted and bool(line["stage"]) is transfer:
             lines[tuple(line[name] for name in _KEY)].append(line)
-    return [_row(records[0], dict(zip(_KEY, k, strict=True)), found) for k, found in lines.items()]
+    return [_row(records[0], dict(zip(_KEY, k, strict=True)), group) for k, group in lines.items()]
 
 
 def _row(like: Record, key: dict[str, str], lines: list[dict[str, str]]) -> Row:
-    of_fold: dict[str, list[dict[str, str]]] = defaultdict(list)
+    """Return a row of published scores with the headings and classes of an evaluation."""
+    folds: dict[str, list[dict[str, str]]] = defaultdict(list)
     for line in lines:
-        of_fold[line["fold"]].append(line)
-    records = tuple(_record(like, fold, found) for fold, found in of_fold.items())
+        folds[line["fold"]].append(line)
+    records = tuple(_record(like, fold, group) for fold, group in folds.items())
     tangent = key["method"] == "tangent images"
     name = key["stage"] if tangent and key["stage"] else key["method"]
     if key["stage"] and not tangent:

@@ -1,4 +1,4 @@
-"""Tables and files of one evaluation, and the parts of its record."""
+"""Write the tables and files of one evaluation, and build parts of its record."""
 
 from __future__ import annotations
 
@@ -27,12 +27,13 @@ _OTHER_COLUMNS = {
 def class_entries(
     scores: Mapping[str, NDArray[Any]], confusion: NDArray[np.int64], class_names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return name, scores and most frequent confusion of every class, see `Record.classes`.
+    """Return name, scores and most frequent confusion of each class, see `Record.classes`.
 
     Args:
-        scores: ``(K,)`` scores of the classes by name.
-        confusion: Counts, rows truth, columns prediction, perhaps with unknown as class 0.
-        class_names: As many names as the confusion matrix has rows.
+        scores: Scores of the classes ``(K,)`` by name.
+        confusion: Counts ``(K, K)``, or ``(K + 1, K + 1)`` with the unknown class first; rows are
+            true, columns predicted classes.
+        class_names: Name of each row of the confusion matrix.
     """
     first = len(class_names) - len(next(iter(scores.values())))
     return [
@@ -43,10 +44,10 @@ def class_entries(
     ]
 
 
-def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> dict[str, Any]:
-    """Most frequent confusion of a class, and its share; the first of equals."""
+def _taken_for(row: NDArray[np.int64], label: int, class_names: Sequence[str]) -> dict[str, Any]:
+    """Return the class that a class is most often taken for, and its share; the first of equals."""
     missed = row.copy()
-    missed[own] = 0
+    missed[label] = 0
     other = int(missed.argmax())
     if not missed[other]:
         return {"taken_for": None, "taken_for_share": None}
@@ -54,7 +55,7 @@ def _taken_for(row: NDArray[np.int64], own: int, class_names: Sequence[str]) -> 
 
 
 def plain_scores(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace NaN, which JSON does not have, by None."""
+    """Replace NaN, which JSON lacks, by None."""
     return {name: None if math.isnan(value) else value for name, value in scores.items()}
 
 
@@ -67,18 +68,18 @@ def headline(record: Record) -> str:
     ]
     absent = record.absent
     some = f", {len(record.classes) - len(absent)} of {len(record.classes)} classes"
-    explained = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
+    legend = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
     over = counted(record.images, record.noun) + (some if absent else "")
-    return f"{', '.join(means)} over {over}".strip() + explained
+    return f"{', '.join(means)} over {over}".strip() + legend
 
 
 def result_tables(record: Record) -> list[Table]:
-    """Return the scores per class, with their means, or over all images; and per latitude band.
+    """Return a table of scores per class, or over all images, and one per latitude band.
 
-    Classes that neither the labels nor the predictions have are left out, if their scores are.
+    A class is omitted if it occurs in neither labels nor predictions and its score is undefined.
 
     Args:
-        record: The evaluation.
+        record: Record of the evaluation.
     """
     headings = record.headings
     tables = [_per_class(record) if record.classes else _over_all(record)]
@@ -123,7 +124,7 @@ def _per_class(record: Record) -> Table:
     ]
     means = (_mean(record, mean_of[name]) if name in mean_of else "" for name in columns)
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
-    note = f"Means without classes that no label has: {', '.join(record.absent)}."
+    note = f"Means without classes that do not occur in the labels: {', '.join(record.absent)}."
     return Table(
         "Per class",
         ["class", *(headings[name] for name in columns)],
@@ -138,7 +139,7 @@ def _cell(value: Any, unit: str) -> str:
 
 
 def confusion_table(record: Record) -> Table:
-    """Return the confusion matrix as a heat map: percent of the true class."""
+    """Return the confusion matrix as a heat map, in percent of the true class."""
     first = len(record.confusion) - len(record.classes)  # without the unknown class
     counts = np.asarray(record.confusion, np.float64)[first:]
     shares = counts[:, first:] / np.maximum(counts.sum(axis=1, keepdims=True), 1)
@@ -154,9 +155,9 @@ def write_results(record: Record, folder: Path, notes: Sequence[str] = ()) -> No
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
-        record: The evaluation.
+        record: Record of the evaluation.
         folder: Output folder.
-        notes: Paragraphs of ``.md`` below the headline.
+        notes: Paragraphs in ``results.md`` below the headline.
     """
     write_text(folder / RESULTS_FILE, record.json())
     network = {"checkpoint": record.checkpoint, "class_map": record.class_map}

@@ -1,4 +1,4 @@
-"""Pictures of predictions: input, ground truth, prediction and error, with a legend."""
+"""Draw predictions: input, ground truth, prediction and error, with a legend."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ _MARGIN = 8
 _LEAST_ROWS = 256
 _PANORAMA_DIMENSIONS = 2
 _LEGEND_WIDTH = 1200
-"""Pixels of width per step of a legend's size."""
+"""Width of a picture, in pixels, per step of its legend's size."""
 
 
 def evenly_spread(count: int, total: int) -> NDArray[np.intp]:
-    """At most `count` of the numbers from 0 to ``total - 1``, the first and the last among them."""
+    """Return at most `count` numbers from 0 to ``total - 1``, including the first and the last."""
     return np.linspace(0, total - 1, min(count, total)).round().astype(np.intp)
 
 
 def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
-    """Class indices ``(H, W)`` as RGB ``(H, W, 3)``.
+    """Color labels ``(H, W)`` as RGB ``(H, W, 3)``.
 
     Args:
-        labels: Class indices.
-        num_classes: K + 1.
+        labels: Labels from 0 to K.
+        num_classes: Number of labels, K + 1.
     """
     return class_colors(num_classes)[labels]
 
@@ -41,17 +41,17 @@ def prediction_panel(
     prediction: NDArray[np.integer],
     class_names: Sequence[str],
 ) -> _Image:
-    """Input, ground truth, prediction and error in a 2×2 grid, above a legend of the classes.
+    """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend.
 
     Args:
-        rgb: ``(H, W, 3)`` the panorama, or the crops of a photo side by side.
-        truth: ``(H, W)`` class indices, 0 unknown.
-        prediction: ``(H, W)`` class indices.
-        class_names: K + 1 names.
+        rgb: Panorama ``(H, W, 3)``, or the crops of a photo side by side.
+        truth: True labels ``(H, W)``; 0 is unknown.
+        prediction: Predicted labels ``(H, W)``.
+        class_names: Names of the K + 1 labels.
 
     Returns:
-        RGB image, about 2W × 2H; panoramas of less than 256 rows are shown in whole multiples of
-        their size. Errors are red, unlabelled pixels are grey.
+        RGB image of about 2W × 2H; panoramas with less than 256 rows are enlarged by a whole
+        factor. Errors are red, unlabeled pixels are gray.
     """
     count = len(class_names)
     error = np.full((*truth.shape, 3), 255, np.uint8)
@@ -81,17 +81,17 @@ def shown_arrays(
     representation: Any,
     most_rows: int | None = None,
 ) -> tuple[_Image, NDArray[np.integer], NDArray[np.integer]]:
-    """A panorama with its labels, or the crops of a photo side by side.
+    """Return a panorama with its labels, or the crops of a photo side by side.
 
     Args:
-        image: A `Panorama` or `Photo`.
-        target: Tensor of its labels as they are evaluated: ``(H, W)``, or ``(n, h, w)`` of crops.
-        prediction: Tensor of predicted labels, as many.
-        representation: Defines the crops.
-        most_rows: Larger images are downsampled to fewer rows; None for all.
+        image: `Panorama` or `Photo`.
+        target: True labels: ``(H, W)``, or ``(n, h, w)`` for crops.
+        prediction: Predicted labels of the same shape.
+        representation: Representation that defines the crops.
+        most_rows: Largest number of rows, to which larger images are downsampled; None for all.
 
     Returns:
-        RGB ``(H, W, 3)``, truth and prediction ``(H, W)``; W is n·w of crops.
+        RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w.
     """
     truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
     rgb = image.rgb
@@ -110,15 +110,15 @@ def _titled(image: _Image, title: str) -> _Image:
 
 
 def overlay_picture(rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str]) -> _Image:
-    """A picture overlaid with its labels, above a legend of its classes.
+    """Overlay a picture with its labels, above a legend of its classes.
 
     Args:
-        rgb: ``(H, W, 3)``.
-        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
-        class_names: K + 1 names, the unknown class first.
+        rgb: RGB picture ``(H, W, 3)``.
+        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
+        class_names: Names of the K + 1 labels, the unknown class first.
 
     Returns:
-        RGB image of the same width, a little higher; the legend grows with the width.
+        RGB image of the same width, higher by the legend, whose text grows with the width.
     """
     mixed = mixed_picture(rgb, labels, len(class_names))
     scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
@@ -127,22 +127,22 @@ def overlay_picture(rgb: _Image, labels: NDArray[np.integer], class_names: Seque
 
 
 def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
-    """The lightness of a picture overlaid with its labels, of the same size.
+    """Overlay the lightness of a picture with its labels.
 
-    Without the picture's colours, which would change those of the classes; these are pure where a
-    class begins.
+    The colors of the picture would change those of the classes and are left out. Class colors are
+    not mixed along the borders between classes.
 
     Args:
-        rgb: ``(H, W, 3)``.
-        labels: ``(H, W)`` class indices; unknown pixels (0) show the picture.
-        num_classes: K + 1.
+        rgb: RGB picture ``(H, W, 3)``.
+        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
+        num_classes: Number of labels, K + 1.
     """
     light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
     colors = colorize(labels, num_classes)
     mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
     for axis in (0, 1):
-        begins = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
-        mixed[begins] = colors[begins]
+        is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
+        mixed[is_border] = colors[is_border]
     mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
     return mixed
 

@@ -1,4 +1,4 @@
-"""Output files of predictions: label maps, pictures, a summary and a report page."""
+"""Write the files of predictions: label maps, pictures, a summary and a report page."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _RESULTS = (
 )  # fmt: skip
 
 OutputKind = Literal["labels", "color", "overlay", "probabilities"]
-"""Outputs of an image, each in its own folder."""
+"""Kinds of output of an image, each in a separate folder."""
 
 _PICTURES: tuple[OutputKind, ...] = ("color", "overlay")
 
@@ -49,12 +49,12 @@ Entry = dict[str, Any]
 
 
 def frame_name(video: str, number: int) -> str:
-    """Name of a frame of a video, ``walk/000012``; numbers begin with 0."""
+    """Return the name of a video's frame, e.g. ``walk/000012``; numbers start at 0."""
     return f"{video}/{number:06d}"
 
 
 def is_result_in(output: Path) -> Callable[[Path], bool]:
-    """A function that is true for the files of predictions in an output folder."""
+    """Return a function that is True for files of predictions in an output folder."""
     results = [(output / name).resolve() for name in _RESULTS]
     return lambda path: any(path.resolve().is_relative_to(result) for result in results)
 
@@ -63,9 +63,9 @@ class LabeledImage(NamedTuple):
     """An image with its labels.
 
     Attributes:
-        image: The photo, or the whole sphere.
-        labels: ``(h, w)`` labels of the image, or of its area; 0 unknown.
-        area: Part of the sphere of the labels; None for photos.
+        image: Photo, or image of the whole sphere.
+        labels: Labels ``(h, w)`` of the image, or of its area; 0 is unknown.
+        area: Part of the sphere that the labels cover; None for photos.
     """
 
     image: InputImage
@@ -76,30 +76,30 @@ class LabeledImage(NamedTuple):
 def class_shares(
     labeled: LabeledImage, class_names: Sequence[str], counted: NDArray[np.bool_] | bool = True
 ) -> dict[str, float]:
-    """Share of the solid angle of every class, including the unknown class.
+    """Return the share of the solid angle of each class, including the unknown class.
 
     Args:
-        labeled: A panorama or photo.
-        class_names: K + 1 names, the unknown class first.
-        counted: ``(H, W)`` pixels that are not masked; all by default.
+        labeled: Panorama or photo.
+        class_names: Names of the K + 1 labels, the unknown class first.
+        counted: Mask ``(H, W)`` that is True for counted pixels; all by default.
 
     Returns:
         Shares by name; they add up to 1, or are all 0 if everything is masked.
     """
     labels, count = labeled.labels, len(class_names)
-    total, kept = np.zeros(count), np.broadcast_to(counted, labels.shape)
-    for line, weights, is_kept in zip(labels, _solid_angles(labeled), kept, strict=True):
-        total += np.bincount(line, weights * is_kept, minlength=count)
-    shares = dict.fromkeys(class_names, 0.0)  # a network's own class may be called unknown, too
+    total, is_counted = np.zeros(count), np.broadcast_to(counted, labels.shape)
+    for line, weights, mask in zip(labels, _solid_angles(labeled), is_counted, strict=True):
+        total += np.bincount(line, weights * mask, minlength=count)
+    shares = dict.fromkeys(class_names, 0.0)  # another class may be called unknown too
     for name, share in zip(class_names, total / (total.sum() or 1), strict=True):
         shares[name] += float(share)
     return shares
 
 
 def _solid_angles(labeled: LabeledImage) -> Iterator[NDArray[np.float64]]:
-    """Relative solid angles of the pixels, row by row: no array as large as the image.
+    """Yield the relative solid angles of the pixels row by row, which saves memory.
 
-    A photo's pixel at (x, y) on the plane at distance 1 is seen under (1 + x² + y²)^(−3/2).
+    A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
     """
     image, (height, width) = labeled.image, labeled.labels.shape
     if image.camera_matrix is None:
@@ -118,9 +118,9 @@ class PredictionFolder:
     """Output folder of predictions.
 
     Attributes:
-        path: The folder.
-        class_names: K + 1 names, the unknown class first.
-        kinds: Outputs of every image.
+        path: Folder.
+        class_names: Names of the K + 1 labels, the unknown class first.
+        kinds: Kinds of output to write.
     """
 
     path: Path
@@ -128,7 +128,7 @@ class PredictionFolder:
     kinds: Sequence[OutputKind]
 
     def files(self, name: str) -> dict[str, Path]:
-        """The files of one image, by kind."""
+        """Return the files of one image by kind."""
         suffixes = {kind: ".npy" if kind == "probabilities" else ".png" for kind in self.kinds}
         return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in suffixes.items()}
 
@@ -136,35 +136,35 @@ class PredictionFolder:
         """Refuse a folder with earlier results.
 
         Args:
-            resume: True if these should be continued, but have no summary.
+            resume: True if earlier results were to be continued, but have no summary.
 
         Raises:
-            SettingError: There are some.
+            SettingError: The folder has earlier results.
         """
-        there = [path for name in _RESULTS if (path := self.path / name).exists()]
-        if there:
+        existing = [path for name in _RESULTS if (path := self.path / name).exists()]
+        if existing:
             without, keep = "a folder without earlier results", " resume=true to keep them,"
             raise SettingError(
                 "output",
-                found=there[0],
-                expected=f"a readable {_SUMMARY} beside it" if resume else without,
+                found=existing[0],
+                expected=f"a readable {_SUMMARY} in the same folder" if resume else without,
                 remedy=f"Give another folder,{'' if resume else keep} or overwrite=true.",
             )
 
     def earlier(
         self, settings: Mapping[str, Any], summary: Path | None = None
     ) -> dict[str, Entry] | None:
-        """The entries of the images whose files are there, by name.
+        """Return the entries, by name, of images whose files exist.
 
         Args:
             settings: Settings that earlier predictions must share.
-            summary: Where they are; by default in ``summary.json``.
+            summary: File with the entries; ``summary.json`` by default.
 
         Returns:
-            Perhaps no entries; None without a summary.
+            Entries by name; None without a summary.
 
         Raises:
-            SettingError: They have other settings.
+            SettingError: Earlier predictions have other settings.
         """
         try:
             content = parse_json((summary or self.path / _SUMMARY).read_bytes())
@@ -175,8 +175,8 @@ class PredictionFolder:
         if changed:
             raise SettingError(
                 "resume",
-                found=f"{changed[0]}, another setting than for the results in {self.path}",
-                expected="the same",
+                found=f"{changed[0]}, which differs from that of the results in {self.path}",
+                expected="the same settings",
                 remedy="Give another folder, or overwrite=true.",
             )
         return {name: entry for name, entry in entries.items() if self._is_complete(name, entry)}
@@ -187,15 +187,15 @@ class PredictionFolder:
 
     @property
     def of_frames(self) -> PredictionFolder:
-        """The same for frames of a video, whose pictures are videos."""
+        """The same folder for frames of a video, without pictures, which become videos."""
         return replace(self, kinds=[kind for kind in self.kinds if kind not in _PICTURES])
 
     def write(self, name: str, labeled: LabeledImage) -> None:
-        """Write the wanted labels and pictures of one image.
+        """Write labels and pictures of one image, as far as `kinds` contains them.
 
         Args:
-            name: From `short_names`.
-            labeled: The image.
+            name: Name of the image, see `short_names`.
+            labeled: Image with its labels.
         """
         (image, labels, area), files = labeled, self.files(name)
         if "labels" in files:
@@ -209,7 +209,7 @@ class PredictionFolder:
     def write_videos(
         self, name: str, path: Path, size: tuple[int, int, int], every: int, *, again: bool
     ) -> None:
-        """Write the pictures that are wanted of a video, from the labels of its frames.
+        """Write videos of pictures, as far as `kinds` contains them, from the frames' labels.
 
         Args:
             name: Name of the video.
@@ -236,12 +236,12 @@ class PredictionFolder:
     def write_probabilities(
         self, name: str, scores: ScoreMosaic, area: PanoramaArea | None = None
     ) -> None:
-        """Write the probabilities of one image, if they are wanted.
+        """Write the probabilities of one image if `kinds` contains them.
 
         Args:
-            name: From `short_names`.
+            name: Name of the image, see `short_names`.
             scores: Scores of the photo, or of the whole sphere.
-            area: Part of the sphere to write.
+            area: Part of the sphere to write; None for all.
         """
         file = self.files(name).get("probabilities")
         if file is None:
@@ -258,8 +258,8 @@ class PredictionFolder:
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).
 
-        Labels whose class is called unknown are left out of ``classes.json``. ``summary.json`` is
-        the first file of a folder, so that a killed prediction can be continued.
+        ``classes.json`` lacks classes that are called unknown. ``summary.json`` is the first file
+        in a folder, so that a killed prediction can be continued.
 
         Args:
             settings: Settings of the prediction.
@@ -272,7 +272,7 @@ class PredictionFolder:
         for label, name in enumerate(map(composed, self.class_names)):
             if name != UNKNOWN_NAME:
                 labels.setdefault(name, []).append(label)
-        lines = (f" {json.dumps(name)}: {given}" for name, given in labels.items())
+        lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
         write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
         columns = ("file", "rows", "columns")
         rows = [
@@ -289,7 +289,7 @@ class PredictionFolder:
             self.path.rmdir()
 
     def mean_shares(self, entries: Sequence[Entry]) -> Table:
-        """Mean over the images of `class_shares`, the largest first, of classes that occur."""
+        """Return the mean of `class_shares` over the images for classes that occur, sorted."""
         shares = [entry["classes"] for entry in entries if "classes" in entry]
         count = max(1, len(shares))
         mean = {name: sum(of[name] for of in shares) / count for name in self.class_names}
@@ -298,7 +298,7 @@ class PredictionFolder:
         return Table("Mean over the images", ["class", "solid angle, %"], rows)
 
     def viewer_image(self, name: str, labeled: LabeledImage) -> EncodedImage:
-        """An image for `write_page`, of 0.1 to a few megabytes."""
+        """Compress an image for `write_page`, to 0.1 to a few megabytes."""
         (image, labels, area), count = labeled, len(self.class_names)
         placed = labels if area is None else area.place(labels)
         return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)
@@ -308,7 +308,7 @@ class PredictionFolder:
 
         Args:
             entries: Entries of all images.
-            shown: Some of them, for the report.
+            shown: Compressed images for the viewer.
         """
         tables = [self.mean_shares(entries)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]

@@ -1,6 +1,6 @@
-"""The record of an evaluation: its data and settings, scores and files.
+"""The record of an evaluation: its data, settings and scores.
 
-A finished run holds it as ``results.json`` beside its settings, ``config.yaml``.
+The folder of a finished run contains it as ``results.json``, and the settings as ``config.yaml``.
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ Band = tuple[float, ...]
 """South and north of a latitude band, in degrees."""
 
 SOLID_ANGLE = "_solid_angle"
-"""Ends the name of a score by solid angle; the same score by pixels has the name without it."""
+"""Suffix of the name of a score by solid angle; without it, it is the name of the same score by
+pixels."""
 
 
 class Heading(NamedTuple):
-    """How reports show a score.
+    """Name and unit of a score in reports.
 
     Attributes:
-        text: Name of the score.
-        unit: ``%`` for a share of 1, which is shown in percent; else a unit, or "".
-        of_class: Name of the score of one class that it is the mean of; "" if there is none.
+        text: Name of the score in reports.
+        unit: ``%`` for a share of 1, which is printed in percent; else a unit, or "".
+        of_class: Key of the score of one class that this score is the mean of, or "".
         class_text: Name of that score in reports.
     """
 
@@ -56,7 +57,7 @@ class Heading(NamedTuple):
 
 
 def by_solid_angle(scores: Mapping[str, _Value]) -> dict[str, _Value]:
-    """Name scores as those by solid angle."""
+    """Rename scores to those by solid angle."""
     return {name + SOLID_ANGLE: value for name, value in scores.items()}
 
 
@@ -84,7 +85,7 @@ _SHOWN = {
     "representation.base_level": int | None,
     "seed": int | None,
 }
-"""Types of the settings that reports show."""
+"""Settings that reports print, with their kinds."""
 
 _FIELDS = {
     "noun": Text,
@@ -103,21 +104,22 @@ _EXPECTED = "results written by tangent-train or tangent-evaluate"
 
 @dataclass(frozen=True)
 class Record:
-    """One evaluation. Scores are numbers, shares of 1 or of another unit; None where undefined.
+    """One evaluation. Scores are shares of 1, or in a unit; None if undefined.
 
     Attributes:
         noun: Plural name of the images: panoramas, photos, shapes.
         images: Number of images.
         headings: Headings of all scores, in the order of the tables.
-        means: Scores over all images, the main score first: charts and latitudes show it.
-        classes: For every class its name (``class``) and scores; empty without classes.
-        latitude_bands: For every band ``latitude_deg`` (south, north) and scores; empty for photos.
-        confusion: Integer counts, rows truth, columns prediction; empty without classes.
-        intervals: 95 % bootstrap intervals over the images, of those means that have one.
-        checkpoint: File of the network; that of a run itself is relative to its folder.
-        class_map: File or name of the map to the classes of the data; None for its own classes.
-        settings: The resolved config of the run, as ``section.setting``.
-        folder: Folder of the run.
+        means: Scores over all images. The first is the main score, used by charts and latitudes.
+        classes: Name (``class``) and scores of each class; empty without classes.
+        latitude_bands: Edges ``latitude_deg`` (south, north) and scores of each band; empty for
+            photos.
+        confusion: Counts; rows are true, columns predicted classes. Empty without classes.
+        intervals: 95 % bootstrap intervals over the images, for means that have one.
+        checkpoint: File of the network, relative to the run folder if it is inside.
+        class_map: File or name of the map to the classes of the data; None without a map.
+        settings: Resolved config of the run, with names ``section.setting``.
+        folder: Run folder.
     """
 
     noun: str
@@ -134,7 +136,7 @@ class Record:
     folder: Path = Path()
 
     def __post_init__(self) -> None:
-        """Refuse a score that would hide a field of the file."""
+        """Refuse a score with the name of a field of the file."""
         if clash := self.means.keys() & _FIELDS.keys():
             raise ValueError(f"a score cannot have the name {', '.join(sorted(clash))}")
 
@@ -155,22 +157,22 @@ class Record:
 
     @property
     def class_means(self) -> dict[str, str]:
-        """Names of the scores of one class, in the order of the tables, with those of the means."""
+        """Names of the means by the scores of one class, in the order of the tables."""
         return {h.of_class: name for name, h in self.headings.items() if h.of_class}
 
     @property
     def absent(self) -> tuple[str, ...]:
-        """Classes that do not occur in the labels, so that the means leave them out."""
+        """Classes that do not occur in the labels and are left out of the means."""
         return tuple(e["class"] for e in self.classes if e[self.main_of_class] is None)
 
     @property
     def bands(self) -> tuple[Band, ...]:
-        """The latitude bands."""
+        """Latitude bands."""
         return tuple(tuple(entry["latitude_deg"]) for entry in self.latitude_bands)
 
     @property
     def data(self) -> str:
-        """The data set, and how the test images were rotated, and turned upright."""
+        """Name of the data set, with rotation and gravity alignment of the test images."""
         name = str(self.settings.get("data._target_")).rpartition(".")[2]
         rotation = self.settings.get("data.test_rotation")
         if rotation is None or self.settings.get("data.inputs") is None:  # shapes
@@ -181,23 +183,23 @@ class Record:
 
     @property
     def fold(self) -> int | None:
-        """The fold that was tested; None for data without folds."""
+        """Test fold; None for data without folds."""
         return self.settings.get("data.fold")
 
     @property
     def seed(self) -> int | None:
-        """The seed of the run."""
+        """Seed of the run."""
         return self.settings.get("seed")
 
     def score(self, name: str, part: str | Band | None = None) -> float | None:
-        """A score over all classes, of a class, or of a latitude band.
+        """Return a score over all images, of a class, or of a latitude band.
 
         Args:
             name: Name of the score.
-            part: Name of a class, or a band.
+            part: Name of a class, or a band; None for all images.
 
         Returns:
-            None where it is undefined, or there is no such part.
+            Score; None if it is undefined, or the part does not exist.
         """
         parts: dict[Any, Mapping[str, Any]] = {None: self.means}
         parts |= zip(self.class_names, self.classes, strict=True)
@@ -205,7 +207,7 @@ class Record:
         return parts.get(part, {}).get(name)
 
     def json(self) -> str:
-        """The content of ``results.json``."""
+        """Return the content of ``results.json``."""
         content = {name: getattr(self, name) for name in _FIELDS}
         content["headings"] = {name: h._asdict() for name, h in self.headings.items()}
         return json.dumps({**self.means, **content}, indent=1) + "\n"
@@ -215,17 +217,17 @@ def load_record(folder: Path) -> Record:
     """Read the results and settings of a finished run.
 
     Args:
-        folder: Folder of the run.
+        folder: Run folder.
 
     Raises:
-        DataError: A file is missing, or is not what ``tangent-train`` writes.
+        DataError: A file is missing, or was not written by ``tangent-train``.
     """
     path = folder / RESULTS_FILE
     content = read_json(path, _EXPECTED)
-    found = check_fields(path, content, _FIELDS, _EXPECTED)
-    found["headings"] = headings = {
+    values = check_fields(path, content, _FIELDS, _EXPECTED)
+    values["headings"] = headings = {
         name: Heading(**check_fields(path, entry, _HEADING, _EXPECTED, f"headings.{name}"))
-        for name, entry in found["headings"].items()
+        for name, entry in values["headings"].items()
     }
     of_class = (heading.of_class for heading in headings.values())
     parts: dict[str, dict[str, Any]] = {
@@ -233,25 +235,26 @@ def load_record(folder: Path) -> Record:
         "latitude_bands": {**dict.fromkeys(headings, float | None), "latitude_deg": list[float]},
     }
     for part, kinds in parts.items():
-        for entry in found[part]:
+        for entry in values[part]:
             check_fields(path, entry, kinds, _EXPECTED, part)
-    kinds = {name: float | None for name in content if name in headings}  # the main one first
-    found["means"] = check_fields(path, content, kinds, _EXPECTED)
+    # In the order of the file: the main score is the first.
+    kinds = {name: float | None for name in content if name in headings}
+    values["means"] = check_fields(path, content, kinds, _EXPECTED)
     if not kinds:
         raise DataError(path, found="no score with a heading", expected=_EXPECTED)
     path = folder / "config.yaml"
     settings = dict(flat_settings(read_settings(path)))
     check_fields(path, settings, _SHOWN, "the settings of a run")
-    return Record(**found, settings=settings, folder=folder)
+    return Record(**values, settings=settings, folder=folder)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """The folders of finished runs in and below the given ones, each once, sorted within each.
+    """Find finished runs in and below folders; return each once, sorted within each folder.
 
     Raises:
-        DataError: A folder is missing or holds no results.
+        DataError: A folder is missing or contains no results.
     """
-    found: dict[Path, None] = {}
+    runs: dict[Path, None] = {}
     for folder in folders:
         if not folder.is_dir():
             raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
@@ -260,16 +263,16 @@ def find_runs(folders: Sequence[Path]) -> list[Path]:
             begun = (folder / "checkpoints").is_dir()
             raise DataError(
                 folder / RESULTS_FILE,
-                found="no such file, nor any below",
+                found="no such file, and none below",
                 expected="the results of a finished run",
                 remedy=f"Finish it: tangent-train resume={folder}" if begun else "",
             )
-        found.update(dict.fromkeys(path.resolve() for path in inside))
-    return list(found)
+        runs.update(dict.fromkeys(path.resolve() for path in inside))
+    return list(runs)
 
 
 def unfinished_runs(folders: Sequence[Path]) -> list[Path]:
-    """Folders of started runs without results, in and below the given ones."""
+    """Find runs that were started but have no results, in and below folders."""
     begun = [path for folder in folders for path in _below(folder, "checkpoints")]
     return sorted({path.resolve() for path in begun if not (path / RESULTS_FILE).exists()})
 

@@ -1,4 +1,4 @@
-"""Reports over several evaluations: rows of scores as tables, files and a chart."""
+"""Report several evaluations: rows of scores as tables, files and a chart."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tangent_train.results.rows import Row
 from tangent_train.results.tables import Table, score_text
 
 Cell = tuple[str, str]
-"""View and condition: row and column of the first table."""
+"""View and condition: row and column in the first table."""
 
 _LEGEND = (
     "Mean over folds of the mean over seeds; ± the sample standard deviation over folds, "
@@ -32,11 +32,11 @@ class Report:
 
     Attributes:
         title: Title of the report.
-        rows: Evaluations, and published figures.
+        rows: Evaluations, and published scores.
         notes: Sentences about the rows.
-        compared: Explains the column "change"; empty without one.
-        cells: Cells of rows, by label, of a first table and the chart; with a single condition
-            there is no such table.
+        compared: Explanation of the column "change"; empty without this column.
+        cells: Cell of a row in the first table and the chart, by the row's label. They are drawn
+            only if there are several conditions.
     """
 
     title: str
@@ -47,33 +47,31 @@ class Report:
 
     @property
     def grid(self) -> dict[str, dict[str, Row]]:
-        """Rows by view, every one with all conditions; empty with a single condition."""
+        """Rows by view and condition, all conditions in each view; empty with one condition."""
         grid: dict[str, dict[str, Row]] = defaultdict(dict)
         for row in self.rows:
             if row.label in self.cells:
                 view, condition = self.cells[row.label]
                 grid[view][condition] = row
-        conditions = dict.fromkeys(c for found in grid.values() for c in found)
+        conditions = dict.fromkeys(c for rows in grid.values() for c in rows)
         if len(conditions) < 2:
             return {}
-        nothing = Row("", ())
-        return {
-            view: {c: found.get(c, nothing) for c in conditions} for view, found in grid.items()
-        }
+        empty = Row("", ())
+        return {view: {c: rows.get(c, empty) for c in conditions} for view, rows in grid.items()}
 
     @property
     def first(self) -> Record:
-        """The first record; all have the same scores and classes."""
+        """First record; all records have the same scores and classes."""
         return self.rows[0].records[0]
 
     @property
     def cell_score(self) -> str:
-        """Name of the score in the cells: the main one, by solid angle if there is one."""
+        """Name of the score in the cells: the main score, by solid angle if that exists."""
         by_angle = self.first.main + SOLID_ANGLE
         return by_angle if by_angle in self.first.headings else self.first.main
 
     def tables(self) -> list[Table]:
-        """Views in conditions, all classes, every class, and latitude bands."""
+        """Return the tables of views in conditions, of means, of classes and of latitude bands."""
         banded = [row for row in self.rows if row.bands]
         tables = [*self._views(), self._overall(), *self._per_class()]
         if banded:
@@ -93,8 +91,8 @@ class Report:
             return
         conditions, name = next(iter(grid.values())), self.cell_score
         rows = [
-            (view, *(self._cell(row, name, 0) for row in found.values()))
-            for view, found in grid.items()
+            (view, *(self._cell(row, name, 0) for row in by_condition.values()))
+            for view, by_condition in grid.items()
         ]
         title = f"{self.title}: {self.first.headings[name].column}"
         yield Table(title, ("", *conditions), rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
@@ -119,8 +117,8 @@ class Report:
         header, cells_of = zip(*columns, strict=True)
         common = f"{'; '.join(alike)}." if alike else ""
         shown = any(row.score(name).interval for row in self.rows for name in scores)
-        explained = _LEGEND_OF_INTERVALS if shown else ""
-        note = " ".join(filter(None, (common, self._legend, explained, self.compared)))
+        intervals = _LEGEND_OF_INTERVALS if shown else ""
+        note = " ".join(filter(None, (common, self._legend, intervals, self.compared)))
         return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
 
     def _per_class(self) -> Iterator[Table]:
@@ -137,28 +135,27 @@ class Report:
                 yield Table(f"{title[:1].upper()}{title[1:]}", ("", *classes), rows)
 
     def _cell(self, row: Row, name: str, folds: int, part: str | None = None) -> str:
-        """A score with its spreads; "of 2" where it is over fewer folds than the row."""
-        found = row.score(name, part)
-        if found.mean is None:
+        """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""
+        score = row.score(name, part)
+        if score.mean is None:
             return "–"
         mean = name if part is None else self.first.class_means[name]
         text = partial(score_text, unit=self.first.headings[mean].unit)
-        over_folds = "" if found.over_folds is None else f" ± {text(found.over_folds)}"
-        over_seeds = "" if found.over_seeds is None else f" (± {text(found.over_seeds)})"
-        lacking = f" of {found.folds}" if found.folds < folds else ""
-        return text(found.mean, interval=found.interval) + over_folds + over_seeds + lacking
+        over_folds = "" if score.over_folds is None else f" ± {text(score.over_folds)}"
+        over_seeds = "" if score.over_seeds is None else f" (± {text(score.over_seeds)})"
+        count = f" of {score.folds}" if score.folds < folds else ""
+        return text(score.mean, interval=score.interval) + over_folds + over_seeds + count
 
     def all_notes(self) -> list[str]:
-        """Notes needed to read the scores correctly."""
-        lacking: dict[str, list[str]] = defaultdict(list)
-        own = [row for row in self.rows if not row.published]
-        for row in own:
+        """Return the notes, with those on missing folds."""
+        incomplete: dict[str, list[str]] = defaultdict(list)
+        for row in self.rows:
             missing = [str(fold) for fold in FOLDS if fold not in row.folds]
-            if missing and row.folds != (None,):
-                lacking[" and ".join(missing)].append(row.label)
+            if missing and row.folds != (None,) and not row.published:
+                incomplete[" and ".join(missing)].append(row.label)
         notes = [
             f"{', '.join(labels)}: fold {folds} missing; not a mean of {len(FOLDS)} folds."
-            for folds, labels in lacking.items()
+            for folds, labels in incomplete.items()
         ]
         return [*notes, *self.notes]
 
@@ -182,7 +179,10 @@ class Report:
         write_bytes(folder / f"{name}.png", png)
 
     def figures(self) -> Iterator[dict[str, Any]]:
-        """A line per row, fold ("mean" over all), class or band, and score; shares of 1."""
+        """Yield the lines of the CSV file.
+
+        There is a line for each row, fold ("mean" over all folds), class or band, and score.
+        """
         first = self.first
         for row in self.rows:
             scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
@@ -197,16 +197,16 @@ class Report:
                     for name in first.headings
                     if name in row.records[0].latitude_bands[0]
                 ]
-                for class_name, where, name in entries:
-                    south, north = where if isinstance(where, tuple) else (None, None)
+                for class_name, section, name in entries:
+                    south, north = section if isinstance(section, tuple) else (None, None)
                     yield {
                         **facts,
                         "class": class_name,
                         "south": south,
                         "north": north,
                         "score": name,
-                        **part.score(name, where)._asdict(),
-                        "kept": part.kept(name, where).mean,
+                        **part.score(name, section)._asdict(),
+                        "kept": part.kept(name, section).mean,
                     }
 
     def _markdown(self) -> str:
@@ -223,7 +223,7 @@ class Report:
 
 
 def _change(kept: float | None) -> str:
-    """The ratio to another score as a relative change.
+    """Return the ratio to another score as a relative change in percent.
 
     >>> _change(0.955), _change(1.026), _change(0.9999)
     ('−4.5 %', '+2.6 %', '+0.0 %')

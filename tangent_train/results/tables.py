@@ -1,4 +1,4 @@
-"""One description of a table, written as Markdown, for the terminal and as HTML."""
+"""Tables that are written as Markdown, on the terminal and as HTML."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from rich.markup import escape
 from tangent_train.errors import printable
 
 _WIDEST = 10_000
-"""Characters: no table is wider."""
+"""Largest width of a table that is not printed on a terminal, in characters."""
 
 _LONG = 32
-"""Characters: a longer cell may take several lines in HTML."""
+"""Number of characters above which a cell may take several lines in HTML."""
 
 
 @dataclass(frozen=True)
@@ -26,13 +26,13 @@ class Table:
 
     Attributes:
         title: Text above the table.
-        header: One name per column.
-        rows: As many cells each.
+        header: Name of each column.
+        rows: Cells of each row.
         note: Text below the table.
-        text_columns: Columns that are aligned to the left; the others hold numbers.
-        shades: For every row a number from 0 to 1 for each cell after the first: a heat map in
-            HTML.
-        lines: True if the terminal shows lines between the rows.
+        text_columns: Indices of columns with text, aligned to the left; others contain numbers.
+        shades: Numbers from 0 to 1 for the cells of each row after the first, for a heat map in
+            HTML; None for other tables.
+        lines: True to print lines between the rows on a terminal.
     """
 
     title: str
@@ -44,7 +44,7 @@ class Table:
     lines: bool = False
 
     def markdown(self) -> str:
-        """The table as Markdown, below a heading."""
+        """Return the table as Markdown, below a heading."""
         rule = ["---" if k in self.text_columns else "---:" for k in range(len(self.header))]
         lines = [f"## {self.title}", ""] if self.title else []
         lines += map(markdown_line, (self.header, rule, *self.rows))
@@ -52,7 +52,7 @@ class Table:
         return "\n".join(lines) + "\n"
 
     def print(self) -> None:
-        """Print the table: as wide as the terminal, elsewhere as wide as it is."""
+        """Print the table; on a terminal, it is folded to the terminal's width."""
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
@@ -60,14 +60,14 @@ class Table:
         table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
         for k, name in enumerate(self.header):
             justify: Any = "left" if k in self.text_columns else "right"
-            # Folded, never cut: a path is of use as a whole.
+            # Folded, not cut: a path is useful only as a whole.
             table.add_column(_shown(name), justify=justify, overflow="fold")
         for row in self.rows:
             table.add_row(*map(_shown, row))
         console.print(table)
 
     def html(self) -> str:
-        """The table as an HTML section."""
+        """Return the table as an HTML section."""
         title, note = html.escape(self.title), html.escape(self.note)
         kinds = ["" if k in self.text_columns else "number" for k in range(len(self.header))]
         header = "".join(
@@ -76,7 +76,7 @@ class Table:
         )
         shades = self.shades or [[]] * len(self.rows)
         rows = (_html_row(r, kinds, s) for r, s in zip(self.rows, shades, strict=True))
-        # The scrolling region takes the focus, so that keys can scroll it.
+        # The scrolling region can have the focus, so that keys scroll it.
         return (
             f'<section class="card">\n<h2>{title}</h2>\n<p class="note">{note}</p>\n'
             f'<div class="wide" tabindex="0" role="region" aria-label="{title}">\n'
@@ -86,16 +86,16 @@ class Table:
 
 
 def _shown(text: str) -> str:
-    """Text for the terminal: names of classes and files are untrusted."""
+    """Escape text for the terminal: names of classes and files are untrusted."""
     return escape(printable(text))
 
 
 def _html_row(cells: Sequence[str], kinds: Sequence[str], shades: Sequence[float]) -> str:
     first, *others = map(html.escape, cells)
-    of_text = ["long" if len(text) > _LONG else "" for text in cells]
-    parts = [f'<th{_class(of_text[0])} scope="row">{first}</th>']
+    lengths = ["long" if len(text) > _LONG else "" for text in cells]
+    parts = [f'<th{_class(lengths[0])} scope="row">{first}</th>']
     for k, text in enumerate(others):
-        kind, style = kinds[k + 1] or of_text[k + 1], ""
+        kind, style = kinds[k + 1] or lengths[k + 1], ""
         if shades:
             kind = "strong" if shades[k] > 0.5 else ""
             style = f' style="--share:{shades[k]:.3f}"'
@@ -108,7 +108,7 @@ def _class(name: str) -> str:
 
 
 def markdown_line(cells: Sequence[str]) -> str:
-    r"""One line of a Markdown table.
+    r"""Return one line of a Markdown table.
 
     >>> print(markdown_line(("a", "b|c")))
     | a | b\|c |
@@ -117,12 +117,12 @@ def markdown_line(cells: Sequence[str]) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share of 1 in percent, without the sign; a dash where it is undefined."""
+    """Return a share of 1 in percent, without the sign; a dash if it is undefined."""
     return score_text(share, "%")
 
 
 def score_text(value: float | None, unit: str, interval: tuple[float, float] | None = None) -> str:
-    """Return a score without its unit; a dash where it is undefined.
+    """Return a score without its unit; a dash if it is undefined.
 
     >>> score_text(0.4562, "%", (0.42, 0.5)), score_text(0.45623, "m"), score_text(None, "m")
     ('45.6 [42.0, 50.0]', '0.456', '–')

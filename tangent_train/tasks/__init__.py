@@ -1,4 +1,4 @@
-"""Tasks: loss, metrics and optimization. Networks are injected, never imported."""
+"""Tasks: loss, metrics and optimization of a network, which is an argument."""
 
 from tangent_train.tasks.classification import ClassificationTask
 from tangent_train.tasks.schedules import warmup_cosine

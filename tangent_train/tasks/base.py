@@ -1,4 +1,4 @@
-"""Base of all tasks: one gradient per batch, the optimizer, and the scores of a split."""
+"""Base class of tasks: gradient of a step, optimizer and schedule, scores of a split."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
 
 Part = tuple[tuple[Tensor, ...], Tensor]
-"""Inputs of the network and their labels."""
+"""Inputs of the network, and their labels."""
 
 RGB = NDArray[np.uint8]
 """A picture ``(H, W, 3)``."""
@@ -35,38 +35,40 @@ RGB = NDArray[np.uint8]
 class Task(lightning.LightningModule, ABC):
     """Trains a network on batches of spheres and scores it.
 
-    All images of a step, on all processes and in all accumulated batches, make one gradient: the
-    loss is a sum over the step divided by a norm of the step, in whatever chunks it is computed.
+    All images of a step, on all processes and in all accumulated batches, contribute to one
+    gradient: the loss is a sum over the step divided by a norm of the step, independent of the
+    chunks in which it is computed.
 
     Args:
-        network: The network to train.
-        representation: Representation of its images.
+        network: Network to train.
+        representation: Representation of the network's images.
         class_names: Names of the classes.
-        optimizer: Makes the optimizer from parameters; None for a task that is only evaluated.
-        scheduler: A `Schedule`, or builds a learning rate scheduler from the optimizer, which is
-            stepped every epoch; None for a constant rate.
+        optimizer: Function that builds the optimizer from parameters; None for a task that is only
+            evaluated.
+        scheduler: `Schedule`, or a function that builds a learning rate scheduler from the
+            optimizer, stepped every epoch; None for a constant rate.
         label_smoothing: Fraction of the target that is spread over all classes.
-        images_per_chunk: Most images per forward pass in training, which bounds memory; None for
-            the whole batch. Batch normalization sees one chunk at a time; chunks are even.
-        channels_last: Memory format of network and images, often faster.
+        images_per_chunk: Largest number of images per forward pass in training, which bounds
+            memory; None for the whole batch. Batch normalization uses one chunk at a time; chunks
+            are even.
+        channels_last: True to store network and images channels last, often faster.
         compile: Arguments of `torch.compile`, empty for its defaults; None to disable it.
         frozen: Names of modules and parameters of the network that are not trained; such modules
             stay in evaluation mode.
         backbone_lr_factor: Factor of the learning rate of parameters that are not `fresh`.
 
     Attributes:
-        labels: Labels that a data set must have, see `datamodules.core.labels`.
-        predicts: Predictions of the network, for commands that read its checkpoint: such as
-            `PIXEL_CLASSES`.
-        monitor: The score on the validation split that selects the best epoch.
-        monitor_mode: ``max`` or ``min``: the better value of that score.
+        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
+        predicts: Kind of predictions, e.g. `PIXEL_CLASSES`, for commands that read a checkpoint.
+        monitor: Score on the validation split that selects the best epoch.
+        monitor_mode: ``max`` if a larger score is better, ``min`` if a smaller one is.
         takes: Input and output of a network for this task, for messages.
         headings: Headings of the scores over a split, in the order of the tables.
-        metric: The metric of a split, see `build_metric`.
-        result: What `metric` computed in the last evaluation.
+        metric: Metric of a split, see `build_metric`.
+        result: Value of `metric` after the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
-        fresh: Names of the network's tensors that did not come from the file that the training
-            started from; None where it started from none. Kept in checkpoints.
+        fresh: Names of the network's tensors that were not loaded from the file of ``init_from``;
+            None without such a file. Stored in checkpoints.
 
     Raises:
         SettingError: A setting is invalid.
@@ -105,7 +107,7 @@ class Task(lightning.LightningModule, ABC):
                 "task.backbone_lr_factor",
                 found=backbone_lr_factor,
                 expected="a number greater than 0",
-                remedy="What is not to be trained at all: task.frozen=[…].",
+                remedy="To train parts not at all, use task.frozen=[…].",
             )
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         self.network: nn.Module = network.to(memory_format=self.memory_format)
@@ -120,12 +122,12 @@ class Task(lightning.LightningModule, ABC):
         self.images_per_chunk = images_per_chunk
         self.backbone_lr_factor = backbone_lr_factor
         self.fresh: Collection[str] | None = None
-        # A tuple: in a list of modules their tensors would have second names.
+        # A tuple: in a `ModuleList`, their tensors would have second names.
         self._frozen = tuple(freeze(self.network, frozen))
         self.metric: Any = self.build_metric()
         self._counted = SumMetric()
-        # The validation loss and its norm: without the check for NaN, at which the host waits for a
-        # GPU. (A `MeanMetric` without it ignores weights.)
+        # The validation loss and its norm, without the check for NaN, for which the host waits for
+        # a GPU. (A `MeanMetric` without this check ignores weights.)
         self._losses: Any = nn.ModuleList(SumMetric(nan_strategy="disable") for _ in range(2))
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
@@ -133,28 +135,30 @@ class Task(lightning.LightningModule, ABC):
 
     @staticmethod
     def num_outputs(num_classes: int) -> int:
-        """Outputs of a network whose ``num_classes`` is null; by default one for each class.
+        """Return the number of outputs of a network whose ``num_classes`` is null.
+
+        By default, there is one output for each class.
 
         Args:
-            num_classes: Classes of the data.
+            num_classes: Number of classes of the data.
         """
         return num_classes
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
-        """An empty input of the network, of the size of the run."""
+        """Return an empty input of the network, of the size of the run."""
 
     @abstractmethod
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Inputs of the network and their labels, with a common first dimension."""
+        """Return the inputs of the network and their labels, with a common first dimension."""
 
     @abstractmethod
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """The loss of some inputs, a sum."""
+        """Return the sum of the losses of inputs."""
 
     @abstractmethod
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """Normalizer of the sum of losses over all labels."""
+        """Return the number that the sum of the losses is divided by."""
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
@@ -162,31 +166,31 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def build_metric(self) -> Metric:
-        """The metric of a split. Its state is summed over all processes."""
+        """Build the metric of a split, whose state is summed over all processes."""
 
     @abstractmethod
     def logged_scores(self, result: Any) -> dict[str, float]:
-        """Scores over the whole split by name, the main one first.
+        """Return scores over the whole split by name, the main score first.
 
         A score ``miou`` is logged as ``val/miou`` and ``test/miou``.
 
         Args:
-            result: A result of `metric`.
+            result: Value of `metric`.
         """
 
     def class_scores(self, result: Any) -> dict[str, float]:
-        """Scores of single classes by name, such as ``iou/wall``; those of absent classes are NaN.
+        """Return scores of classes by name, e.g. ``iou/wall``; NaN for absent classes.
 
         Args:
-            result: A result of `metric`.
+            result: Value of `metric`.
         """
         return {}
 
     def record(self, result: Any, noun: str) -> Record:
-        """The record of the last evaluation, with the `logged_scores` under their `headings`.
+        """Return the record of the last evaluation: `logged_scores` under their `headings`.
 
         Args:
-            result: A result of `metric`.
+            result: Value of `metric`.
             noun: Plural name of the images: panoramas, photos, shapes.
         """
         scores = plain_scores(self.logged_scores(result))
@@ -194,20 +198,20 @@ class Task(lightning.LightningModule, ABC):
         return Record(noun, self.evaluated, self.headings, means)
 
     def targets(self, batch: Any) -> Tensor:
-        """The true labels of an evaluated batch, as many as there are predictions."""
+        """Return the true labels of an evaluated batch, one item per prediction."""
         targets: Tensor = batch.target
         return targets
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
     ) -> RGB | None:
-        """A picture of one prediction, for `panels` and loggers; None if the task has none.
+        """Draw one prediction, for `panels` and loggers; None if the task draws no pictures.
 
         Args:
-            image: A `Panorama` or `Photo`.
-            target: Its true labels, one of `targets`.
-            prediction: One of the predictions that `evaluate` returns.
-            most_rows: Rows of the image in the picture, for smaller files; None for all.
+            image: `Panorama` or `Photo`.
+            target: True labels of the image, one item of `targets`.
+            prediction: Prediction for the image, one item of the result of `evaluate`.
+            most_rows: Largest number of rows of the image in the picture; None for all.
 
         Returns:
             uint8 RGB ``(H, W, 3)``.
@@ -217,7 +221,7 @@ class Task(lightning.LightningModule, ABC):
     def report_image(
         self, name: str, image: Any, target: Tensor, prediction: Tensor
     ) -> EncodedImage | None:
-        """An image for the viewer of the report; by default the picture of the prediction.
+        """Return an image for the report's viewer, by default the picture of the prediction.
 
         Args:
             name: Name of the image.
@@ -229,27 +233,32 @@ class Task(lightning.LightningModule, ABC):
         return None if picture is None else encode_image(name, picture, 0, sphere=False)
 
     def empty_step(self, channels: int, samples: int) -> Tensor:
-        """Empty inputs of the network for a training step of some samples, without memory."""
+        """Return empty inputs of a training step on the device ``meta``, which takes no memory.
+
+        Args:
+            channels: Number of input channels.
+            samples: Number of samples in the step.
+        """
         example = self.example(channels).to("meta")
         return example.expand(samples * self.inputs_per_sample, *example.shape[1:])
 
     @property
     def inputs_per_sample(self) -> int:
-        """Inputs of the network for a sample of a training step."""
+        """Number of the network's inputs for a sample of a training step."""
         return 1
 
     def training_parts(self, batch: Any) -> list[Part]:
-        """A batch in parts, see `chunks`."""
+        """Divide a batch into parts, see `chunks`."""
         inputs, labels = self.training_pairs(batch)
-        parts = self.chunks(inputs)
-        of_parts = torch.tensor_split(labels, len(parts))
-        return [((part,), of_part) for part, of_part in zip(parts, of_parts, strict=True)]
+        chunks = self.chunks(inputs)
+        chunk_labels = torch.tensor_split(labels, len(chunks))
+        return [((chunk,), labels) for chunk, labels in zip(chunks, chunk_labels, strict=True)]
 
     def chunks(self, inputs: Tensor) -> tuple[Tensor, ...]:
-        """Even chunks of at most `images_per_chunk` images, but no less than one input.
+        """Divide inputs into even chunks of at most `images_per_chunk` images, at least one input.
 
-        Even, because batch normalization fails on a single value per channel: 20 images in chunks
-        of at most 19 are 10 and 10, not 19 and 1.
+        Batch normalization fails on a single value per channel: 20 images in chunks of at most 19
+        are divided into 10 and 10, not 19 and 1.
         """
         if self.images_per_chunk is None:
             return (inputs,)
@@ -262,33 +271,35 @@ class Task(lightning.LightningModule, ABC):
         Raises:
             SettingError: The length has changed.
         """
-        then, now, schedule = self._trained_length, self._length(), self.schedule
-        if then is None or schedule is None or then[schedule.interval] == now[schedule.interval]:
+        before, now, schedule = self._trained_length, self._length(), self.schedule
+        if before is None or schedule is None:
             return
         unit = schedule.interval
-        if schedule.has_length_of_training or schedule.ends_at(then[unit], self.make_optimizer):
+        if before[unit] == now[unit]:
+            return
+        if schedule.has_length_of_training or schedule.ends_at(before[unit], self.make_optimizer):
             others = ", trainer.devices and data.…_per_step" * (unit == "step")
             raise SettingError(
                 f"trainer.max_epochs, trainer.max_steps{others}",
                 found=f"{now[unit]} training {unit}s",
-                expected=f"{then[unit]}, which the schedule of the resumed run was made for",
-                remedy="Resume with the same. To train for longer, start a new run with a schedule "
-                "of its own from the weights: init_from=<run>/checkpoints/last.ckpt",
+                expected=f"{before[unit]}, which the schedule of the resumed run was made for",
+                remedy="Resume with the same values. To train for longer, start a new run, with a "
+                "new schedule, from the weights: init_from=<run>/checkpoints/last.ckpt",
             )
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Add to the gradient of a step over all chunks, accumulated batches and processes.
 
-        All parts but the last are back-propagated here, Lightning does the last one. On several
-        processes this is still inside `DistributedDataParallel.forward`, which exchanges gradients
-        only in a backward pass that follows it: once, after the last part.
+        All parts but the last are back-propagated here; Lightning back-propagates the last one. On
+        several processes, this method is called inside `DistributedDataParallel.forward`, which
+        exchanges gradients only in a backward pass after it: once, for the last part.
 
-        With `trainer.accumulate_grad_batches` the gradients are always those of the batches so far:
-        before another one they shrink by the growth of the norm.
+        With `trainer.accumulate_grad_batches`, the gradients are those of the batches so far:
+        before another batch is added, they are scaled by the ratio of the old norm to the new one.
         """
         *parts, last = self.training_parts(batch)
         strategy = self.trainer.strategy
-        # The mean over processes, as gradients are averaged.
+        # The mean over processes, because gradients are averaged too.
         norm: Any = sum(self.loss_norm(labels) for _, labels in (*parts, last))
         norm = strategy.reduce(norm, reduce_op="mean").clamp(min=torch.finfo(norm.dtype).tiny)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
@@ -305,25 +316,25 @@ class Task(lightning.LightningModule, ABC):
             strategy.backward(loss / self._step_norm, None)
             value += loss.detach()
         loss = self.loss_sum(*last)
-        whole: Any = strategy.reduce((value + loss.detach()) / norm, reduce_op="mean")
-        # Copied while a GPU is busy with the backward pass.
-        copied = torch.cuda.Event() if whole.is_cuda else None  # type: ignore[no-untyped-call]
-        self._pending = (whole.to("cpu", non_blocking=True), copied, batch)
+        total: Any = strategy.reduce((value + loss.detach()) / norm, reduce_op="mean")
+        # Copied to the host while a GPU is busy with the backward pass.
+        copied = torch.cuda.Event() if total.is_cuda else None  # type: ignore[no-untyped-call]
+        self._pending = (total.to("cpu", non_blocking=True), copied, batch)
         if copied is not None:
             copied.record()
         # Lightning divides by the number of accumulated batches.
         return loss / self._step_norm * self.trainer.accumulate_grad_batches
 
     def on_after_backward(self) -> None:
-        """Log the loss, and stop before a step with a non-finite one, on all processes.
+        """Log the loss, and stop all processes before a step with a loss that is not finite.
 
-        Gradients are not checked: with `trainer.precision=16-mixed` those that overflow are
-        skipped and the loss scale shrinks, as intended.
+        Gradients are not checked: with `trainer.precision=16-mixed`, steps whose gradients overflow
+        are skipped, and the loss scale shrinks.
 
         Raises:
             SettingError: The loss is NaN or infinite.
         """
-        if self._pending is None:  # a part that is not the last
+        if self._pending is None:  # not the last part
             return
         loss, copied, batch = self._pending
         self._pending = None
@@ -331,7 +342,7 @@ class Task(lightning.LightningModule, ABC):
             copied.synchronize()
         if not math.isfinite(loss):
             refuse_loss(self, float(loss), batch)
-        # On the CPU: the progress bar reads it every step, and would wait for a GPU.
+        # A value on the CPU: the progress bar reads it every step, and would wait for a GPU.
         self.log("train/loss", loss, prog_bar=True)
 
     def train(self, mode: bool = True) -> Self:
@@ -342,33 +353,33 @@ class Task(lightning.LightningModule, ABC):
         return self
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Add `fresh` and the length of the training; see also `check_weights`."""
+        """Check the weights, see `check_weights`; store `fresh` and the length of the training."""
         check_weights(self)
         checkpoint["length"] = self._length()
         if self.fresh is not None:
             checkpoint["fresh"] = sorted(self.fresh)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Take `fresh`, before the optimizer is made, and the length of the training."""
+        """Restore `fresh`, before the optimizer is built, and the length of the training."""
         length = checkpoint["length"]
         self._trained_length = {unit: int(length[unit]) for unit in ("step", "epoch")}
         fresh = checkpoint.get("fresh")
         self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
     def optimizer_zero_grad(self, *_: Any) -> None:
-        """Nothing: `training_step` clears the gradients before its first part."""
+        """Do nothing: `training_step` clears the gradients before its first part."""
 
     @property
     def is_tested(self) -> bool:
-        """True in a test, which has no loss."""
+        """True during a test, in which no loss is computed."""
         return self._trainer is not None and self._trainer.testing
 
     def add_validation_loss(self, loss: Tensor, labels: Tensor) -> None:
-        """Add to ``val/loss``, which is normalized as the training loss is.
+        """Add to ``val/loss``, which is normalized like the training loss.
 
         Args:
-            loss: Sum of the losses.
-            labels: Labels that the losses are computed from, see `loss_norm`.
+            loss: Sum of losses.
+            labels: Labels that the losses were computed from, see `loss_norm`.
         """
         for total, value in zip(self._losses, (loss, self.loss_norm(labels)), strict=True):
             total.update(value)
@@ -383,13 +394,13 @@ class Task(lightning.LightningModule, ABC):
         """Log the scores of the validation or test split.
 
         Raises:
-            SettingError: A score has no heading.
+            SettingError: A score has no heading, or a monitored value is not logged.
         """
         stage = "test" if self.is_tested else "val"
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
         self._counted.reset()
-        # A process without images takes part; a task without a loss has none to log.
+        # A process without images takes part too; a task without a loss logs none.
         if not self.is_tested and (self._losses[0].update_called or self.trainer.world_size > 1):
             loss, norm = (total.compute() for total in self._losses)
             self.log("val/loss", loss / norm, sync_dist=True)
@@ -397,21 +408,53 @@ class Task(lightning.LightningModule, ABC):
                 total.reset()
         scores = self.logged_scores(self.result)
         if scores.keys() - self.headings.keys():
-            place = f"headings of {type(self).__name__}"
-            raise SettingError(place, found=[*self.headings], expected=f"those of {[*scores]}")
-        # Every process has the same numbers: the mean over processes changes nothing.
+            name = f"headings of {type(self).__name__}"
+            raise SettingError(name, found=[*self.headings], expected=f"those of {[*scores]}")
+        # All processes have the same scores, which the mean over processes does not change.
         for name, score in scores.items():
             key = f"{stage}/{name}"
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
-        for name, score in self.class_scores(self.result).items():
+        of_classes = self.class_scores(self.result)
+        for name, score in of_classes.items():
             if not math.isnan(score):
                 self.log(f"{stage}_{name}", score, sync_dist=True)
+        if not self.is_tested:
+            self._check_monitors(
+                {*self.trainer.callback_metrics, *(f"val_{n}" for n in of_classes)}
+            )
+
+    def _check_monitors(self, logged: Collection[str]) -> None:
+        """Refuse monitored validation values that are not logged.
+
+        The first check comes before the training: Lightning validates a few images first.
+        """
+        monitors = [
+            (f"monitor of {type(callback).__name__}", getattr(callback, "monitor", None))
+            for callback in self.trainer.callbacks  # type: ignore[attr-defined]
+            if getattr(callback, "strict", True)
+        ]
+        monitors += [
+            ("scheduler.monitor", config.monitor)
+            for config in self.trainer.lr_scheduler_configs
+            if isinstance(config.scheduler, ReduceLROnPlateau)
+        ]
+        for name, monitor in monitors:
+            if str(monitor).startswith("val") and monitor not in logged:
+                raise SettingError(
+                    name,
+                    found=monitor,
+                    expected=f"one of {', '.join(sorted(logged))}",
+                    remedy="A callback that logs values only later needs "
+                    "trainer.num_sanity_val_steps=0.",
+                )
 
     test_step = validation_step
     on_test_epoch_end = on_validation_epoch_end
 
     def on_train_epoch_end(self) -> None:
-        """Step `ReduceLROnPlateau` before the checkpoint of the epoch, in which Lightning's is not.
+        """Step `ReduceLROnPlateau` before the checkpoint of the epoch is saved.
+
+        Lightning would step it afterwards, so that the checkpoint would not contain the step.
 
         Raises:
             SettingError: The monitored value is not logged.
@@ -426,21 +469,27 @@ class Task(lightning.LightningModule, ABC):
                     "scheduler.monitor",
                     found=f"{config.monitor} after epoch {self.current_epoch + 1}",
                     expected=f"one of {', '.join(logged)}",
-                    remedy="Of scores: scheduler.frequency=${trainer.check_val_every_n_epoch}",
+                    remedy="For a score: scheduler.frequency=${trainer.check_val_every_n_epoch}",
                 )
             config.scheduler.step(logged[str(config.monitor)])
 
     def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
-        """Step other schedulers as Lightning does."""
+        """Step schedulers as Lightning does, except for `ReduceLROnPlateau`."""
         if not isinstance(scheduler, ReduceLROnPlateau):
             super().lr_scheduler_step(scheduler, metric)
 
     def configure_optimizers(self) -> Any:
-        """Optimizer, and scheduler if there is one."""
+        """Build the optimizer, and the scheduler if there is one.
+
+        Raises:
+            SettingError: The schedule ends before the training.
+        """
+        if self.schedule is not None:
+            self.schedule.check_length(self._length())
         return self.optimization(self._length)
 
     def optimization(self, length: Callable[[], Mapping[str, int]]) -> Any:
-        """Optimizer and scheduler for any length of the training, see `Schedule.configure`."""
+        """Build optimizer and scheduler for a length of the training, see `Schedule.configure`."""
         factor = self.backbone_lr_factor
         trained = {n: p for n, p in self.network.named_parameters() if p.requires_grad}
         if factor == 1:
@@ -449,8 +498,8 @@ class Task(lightning.LightningModule, ABC):
             groups = groups_of(trained, self.fresh or ())
         optimizer = self.make_optimizer(groups)
         factors = [factor if group.get("name") == "backbone" else 1 for group in groups]
-        for group, of_group in zip(optimizer.param_groups, factors, strict=True):
-            group["lr"] *= of_group
+        for group, group_factor in zip(optimizer.param_groups, factors, strict=True):
+            group["lr"] *= group_factor
         if self.schedule is None:
             return optimizer
         monitor = self.monitor, self.monitor_mode
@@ -458,20 +507,20 @@ class Task(lightning.LightningModule, ABC):
         return {"optimizer": optimizer, "lr_scheduler": configured}
 
     def _length(self) -> dict[str, int]:
-        """Planned steps and epochs of the training; −1 without an end."""
+        """Return the planned steps and epochs of the training; −1 without an end."""
         trainer = self.trainer
         steps = trainer.estimated_stepping_batches
-        each = trainer.num_training_batches / trainer.accumulate_grad_batches
-        each = math.ceil(each) if math.isfinite(each) else each  # of data without an end
+        per_epoch = trainer.num_training_batches / trainer.accumulate_grad_batches
+        per_epoch = math.ceil(per_epoch) if math.isfinite(per_epoch) else per_epoch
         if not math.isfinite(steps):
             return {"step": -1, "epoch": -1}
-        return {"step": int(steps), "epoch": math.ceil(steps / max(each, 1))}
+        return {"step": int(steps), "epoch": math.ceil(steps / max(per_epoch, 1))}
 
     def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
-        """The network's scores.
+        """Return the network's scores if they have the expected shape.
 
         Raises:
-            SettingError: They are of another shape than expected.
+            SettingError: The scores have another shape.
         """
         found = tuple(scores.shape) if isinstance(scores, Tensor) else type(scores).__name__
         if found != expected:

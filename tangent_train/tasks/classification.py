@@ -1,4 +1,4 @@
-"""Classification of whole spheres: shapes seen through all of their images."""
+"""Classification of shapes from all images of their spheres."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from tangent_train.tasks.base import Task
 class ClassificationTask(Task):
     """Trains a network that classifies a shape by all views of its sphere (paper, section 4.1).
 
-    The loss is the mean cross-entropy over the shapes of the batch on all processes, with
-    `images_per_chunk` in chunks of whole shapes. Arguments are those of `Task`; the network is any
-    module ``(B, N, C, h, w) -> (B, K)``, N views each of B shapes.
+    The loss is the mean cross-entropy over the shapes of the batch on all processes; with
+    `images_per_chunk`, in chunks of whole shapes. The arguments are those of `Task`; the network is
+    a module ``(B, N, C, h, w) -> (B, K)`` that takes N views of each of B shapes.
 
     Attributes:
-        result: ``(K, K)`` counts of the last evaluation, rows truth, columns prediction.
+        result: Counts ``(K, K)`` of the last evaluation; rows are true, columns predicted classes.
     """
 
     labels: ClassVar[str] = IMAGE_CLASS
     predicts: ClassVar[str] = IMAGE_CLASS
     headings: ClassVar[Mapping[str, Heading]] = {
         "accuracy": Heading("accuracy"),
-        "class_accuracy": Heading("mean of the classes", "%", "accuracy", "accuracy"),
+        "class_accuracy": Heading("mean over classes", "%", "accuracy", "accuracy"),
     }
     monitor: ClassVar[str] = "val/accuracy"
     takes: ClassVar[str] = "views of shapes (B, N, C, h, w) to scores of classes (B, K)"
@@ -43,71 +43,71 @@ class ClassificationTask(Task):
     def forward(
         self, images: Float[Tensor, "shapes views channels height width"]
     ) -> Float[Tensor, "shapes classes"]:
-        """Scores of the classes.
+        """Return the scores of the classes.
 
         Raises:
-            SettingError: The network's scores do not fit the shapes or the classes.
+            SettingError: The shape of the scores does not fit the inputs or the classes.
         """
         return self.checked_scores(self.network(images), (len(images), len(self.class_names)))
 
     def example(self, channels: int) -> Tensor:
-        """All views of one empty shape ``(1, N, C, h, w)``."""
-        grid = getattr(self.representation, "grid", None)  # equirectangular images are one
+        """Return all views of one empty shape ``(1, N, C, h, w)``."""
+        grid = getattr(self.representation, "grid", None)  # an equirectangular image is one view
         views = 1 if grid is None else grid.num_images
         return torch.zeros(1, views, channels, *self.representation.image_size)
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Views ``(B, N, C, h, w)`` and classes ``(B,)`` of shapes."""
+        """Return the views ``(B, N, C, h, w)`` and classes ``(B,)`` of shapes."""
         return batch.images, batch.label
 
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """Cross-entropy, summed over the shapes."""
-        return self._loss_of(self(*inputs), labels)
+        """Return the cross-entropy, summed over the shapes."""
+        return self._cross_entropy(self(*inputs), labels)
 
-    def _loss_of(self, scores: Tensor, labels: Tensor) -> Tensor:
+    def _cross_entropy(self, scores: Tensor, labels: Tensor) -> Tensor:
         exact = torch.promote_types(scores.dtype, torch.float32)
         return functional.cross_entropy(
             scores.to(exact), labels, reduction="sum", label_smoothing=self.label_smoothing
         )
 
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """The number of shapes."""
+        """Return the number of shapes."""
         return torch.full((), float(len(labels)), device=labels.device)
 
     def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of shapes to `metric`; returns the predictions ``(B,)``."""
+        """Add a batch of shapes to `metric`; return the predictions ``(B,)``."""
         scores = self(batch.images)
         if not self.is_tested:
-            self.add_validation_loss(self._loss_of(scores, batch.label), batch.label)
+            self.add_validation_loss(self._cross_entropy(scores, batch.label), batch.label)
         prediction = scores.argmax(dim=1)
         self.metric.update(prediction, batch.label)
         return prediction
 
     def targets(self, batch: Any) -> Tensor:
-        """Classes ``(B,)``."""
+        """Return the true classes ``(B,)``."""
         labels: Tensor = batch.label
         return labels
 
     def build_metric(self) -> ClassificationMetric:
-        """The confusion matrix of whole shapes."""
+        """Build the confusion matrix of whole shapes."""
         return ClassificationMetric(len(self.class_names))
 
     def logged_scores(self, result: Any) -> dict[str, float]:
-        """Accuracy over shapes, and its mean over classes."""
+        """Return the accuracy over shapes, and its mean over classes."""
         scores = classification_scores(result)
         return {"accuracy": scores.accuracy, "class_accuracy": scores.class_accuracy}
 
     def class_scores(self, result: Any) -> dict[str, float]:
-        """Accuracy of each class."""
+        """Return the accuracy of each class."""
         scores = classification_scores(result).of_class.tolist()
         return {f"accuracy/{n}": s for n, s in zip(self.class_names, scores, strict=True)}
 
     def record(self, result: Any, noun: str) -> Record:
-        """The record, with the accuracy of every class and the confusion matrix."""
+        """Return the record with the accuracy of every class and the confusion matrix."""
         scores = classification_scores(result)
-        of_class = {"images": scores.counts, "accuracy": scores.of_class}
+        columns = {"images": scores.counts, "accuracy": scores.of_class}
         return replace(
             super().record(result, noun),
-            classes=class_entries(of_class, result, self.class_names),
+            classes=class_entries(columns, result, self.class_names),
             confusion=result.tolist(),
         )

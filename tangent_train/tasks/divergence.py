@@ -1,4 +1,4 @@
-"""A diverged training stops before its weights, or its last good checkpoint, are overwritten."""
+"""Stop a diverged training before its weights or its last good checkpoint are overwritten."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     """Stop training at a non-finite loss and name its cause.
 
     Args:
-        task: With the weights before the step.
-        loss: Of all processes.
-        batch: This process's batch that it was computed from.
+        task: Task with the weights before the step.
+        loss: Loss over all processes.
+        batch: Batch of this process.
 
     Raises:
         SettingError: Always.
@@ -28,7 +28,7 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     if not batch.images.isfinite().all():
         reason = "from images with NaN or infinite values"
     elif broken:
-        reason = f"from weights that were not finite already: {_some(broken)}"
+        reason = f"from weights that were not finite before: {_some(broken)}"
     trainer: Any = task.trainer
     names = [trainer.datamodule.source("train").name(k) for k in batch.index.tolist()]
     raise SettingError(
@@ -43,10 +43,10 @@ def check_weights(task: lightning.LightningModule) -> None:
     """Refuse to overwrite a good checkpoint with an unusable one.
 
     Args:
-        task: The trained task.
+        task: Task whose weights are to be saved.
 
     Raises:
-        SettingError: A weight or a running statistic is NaN or infinite.
+        SettingError: A weight or a running statistic is NaN, or a weight is infinite.
     """
     broken = _not_finite(task)
     if broken:
@@ -54,13 +54,13 @@ def check_weights(task: lightning.LightningModule) -> None:
         raise SettingError(
             f"weights after step {trainer.global_step} (epoch {trainer.current_epoch})",
             found=f"NaN or infinite values in {_some(broken)}",
-            expected="finite numbers: the last checkpoint is left as it was",
+            expected="finite numbers; the last checkpoint is kept",
             remedy=_remedy(trainer),
         )
 
 
 def _not_finite(task: lightning.LightningModule) -> list[str]:
-    """Names of tensors with NaN or infinite weights; masks may hold infinities."""
+    """Return the names of tensors with NaN or infinite weights; buffers may hold infinities."""
 
     def broken(tensor: Tensor) -> bool:
         return not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all()
@@ -70,11 +70,13 @@ def _not_finite(task: lightning.LightningModule) -> list[str]:
 
 
 def _some(names: list[str]) -> str:
+    """Return the first names of a list, and the number of the others."""
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def _remedy(trainer: lightning.Trainer) -> str:
+    """Return settings to try."""
     half = str(trainer.precision).startswith("16")
     precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
     return f"Try, in a new run, {precision}a smaller optimizer.lr or trainer.gradient_clip_val=1."

@@ -1,4 +1,4 @@
-"""Losses as a sum and its norm, so that any split of a batch adds up to one gradient."""
+"""Losses as a sum and its norm, so that the parts of a batch add up to one gradient."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ def cross_entropy_sum(
     class_weights: Float[Tensor, " classes"],
     label_smoothing: float = 0.0,
 ) -> Tensor:
-    """Weighted cross-entropy, summed; unknown pixels (label 0) are ignored.
+    """Sum the weighted cross-entropy of pixels; unknown pixels (label 0) are ignored.
 
-    Divided by the `cross_entropy_norm` of the same images it is torch's weighted mean. Divided by
-    the norm of *all* images, chunks and processes instead, it is their share of one mean.
+    Divided by the `cross_entropy_norm` of the same images, it is torch's weighted mean. Divided by
+    the norm of *all* images, chunks and processes, it is the share of these images in one mean.
 
     Args:
-        scores: Logits of the K classes.
-        labels: 1 … K; 0 is unknown.
-        class_weights: Weight of every class.
+        scores: Scores of the K classes, before a softmax.
+        labels: Labels from 1 to K; 0 is unknown.
+        class_weights: Weight of each class.
         label_smoothing: Fraction of the target that is spread evenly over the classes.
     """
     exact = _exact(scores)
@@ -39,10 +39,10 @@ def cross_entropy_sum(
 def cross_entropy_norm(
     labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
 ) -> Tensor:
-    """Sum of the class weights of the labelled pixels, known before the forward pass."""
-    # Not counts of the classes: torch.bincount makes the host wait for a GPU.
-    of_label = functional.pad(_exact(class_weights), (1, 0))
-    return of_label.index_select(0, labels.flatten().int()).sum()
+    """Sum the class weights of the labeled pixels, which needs no forward pass."""
+    # Not with torch.bincount, for which the host waits for a GPU.
+    label_weights = functional.pad(_exact(class_weights), (1, 0))
+    return label_weights.index_select(0, labels.flatten().int()).sum()
 
 
 def auxiliary_sum(
@@ -50,16 +50,17 @@ def auxiliary_sum(
     labels: UInt8[Tensor, "images height width"],
     class_weights: Float[Tensor, " classes"],
 ) -> Tensor:
-    """Weighted cross-entropy of the cells of a coarser network stage, summed over pixels.
+    """Sum the weighted cross-entropy of pixels, with scores of a coarser stage of a network.
 
-    Every cell is compared with the class histogram of the pixels whose centers lie in it. That is
-    the cross-entropy of the pixels, each with the scores of its cell, without upsampling them; its
-    norm is their `cross_entropy_norm`.
+    Each cell is compared with the class histogram of the pixels whose centers lie in it. This is
+    the cross-entropy of the pixels, each with the scores of its cell, without upsampling the
+    scores; its norm is the `cross_entropy_norm` of the pixels.
 
     Args:
-        scores: Logits of the cells, of any size.
-        labels: 1 … K of the pixels; 0 is unknown and ignored.
-        class_weights: Weight of every class.
+        scores: Scores of the cells, before a softmax; their size may differ from that of the
+            labels.
+        labels: Labels of the pixels from 1 to K; 0 is unknown and ignored.
+        class_weights: Weight of each class.
     """
     exact = _exact(scores)
     images, classes, *size = scores.shape
@@ -74,10 +75,10 @@ def auxiliary_sum(
     counts = exact.new_zeros(images * size[0] * size[1] * (classes + 1))
     counts.scatter_add_(0, bins.flatten(), counts.new_ones(()).expand(bins.numel()))
     histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
-    # Counts instead of probabilities: every pixel weighs the same, however many a cell has.
+    # Counts instead of probabilities: pixels weigh the same in cells with few and many of them.
     return functional.cross_entropy(exact, histograms, class_weights.to(exact), reduction="sum")
 
 
 def _exact(values: Tensor) -> Tensor:
-    """Sums of millions of pixels: never in half precision."""
+    """Convert to at least float32, for sums over millions of pixels."""
     return values.to(torch.promote_types(values.dtype, torch.float32))

@@ -1,4 +1,4 @@
-"""Learning rate schedules: their steps, and which of them are made for one length of training."""
+"""Learning rate schedules: when they are stepped, and the length of training that they need."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ class Schedule:
     """A learning rate scheduler and Lightning's settings for it.
 
     Attributes:
-        build: Builds the scheduler from the optimizer. Arguments that a `functools.partial` sets
-            to None are taken from the run: `total_steps` and, of `ReduceLROnPlateau`, `mode`.
-        interval: Unit after which it is stepped: ``epoch`` or ``step``.
-        frequency: Number of epochs or steps between its steps.
-        monitor: Logged value for `ReduceLROnPlateau`; None for the score of the best epoch.
+        build: Function that builds the scheduler from the optimizer. Arguments that a
+            `functools.partial` sets to None are taken from the run: `total_steps` and, for
+            `ReduceLROnPlateau`, `mode`.
+        interval: Unit after which the scheduler is stepped: ``epoch`` or ``step``.
+        frequency: Number of epochs or steps between steps of the scheduler.
+        monitor: Logged value for `ReduceLROnPlateau`; None for the score that selects the best
+            epoch.
 
     Raises:
         SettingError: A setting is invalid.
@@ -59,13 +61,13 @@ class Schedule:
         factors: Sequence[float],
         monitor: tuple[str, str],
     ) -> dict[str, Any]:
-        """Build the scheduler, in Lightning's form.
+        """Build the scheduler and Lightning's settings for it.
 
         Args:
-            optimizer: The optimizer.
-            length: Returns the number of epochs and steps of the training.
+            optimizer: Optimizer whose learning rates are scheduled.
+            length: Function that returns the number of epochs and steps of the training.
             factors: Factors of the learning rates of the optimizer's groups.
-            monitor: Score of the best epoch, and ``max`` or ``min``.
+            monitor: Score that selects the best epoch, and ``max`` or ``min``.
 
         Raises:
             SettingError: The training has no end, or `ReduceLROnPlateau` is stepped every step.
@@ -76,7 +78,7 @@ class Schedule:
         if self.has_length_of_training:
             filled["total_steps"] = length()[self.interval] // self.frequency
             if filled["total_steps"] < 1:
-                remedy = "Or give scheduler.total_steps."
+                remedy = "Or set scheduler.total_steps."
                 raise SettingError(
                     "trainer.max_epochs", found="no end", expected="a number", remedy=remedy
                 )
@@ -92,21 +94,41 @@ class Schedule:
             "interval": self.interval,
             "frequency": self.frequency,
             "monitor": monitored,
-            # The task steps it, see `Task.on_train_epoch_end`.
+            # `Task.on_train_epoch_end` steps it.
             "reduce_on_plateau": False,
         }
 
-    def ends_at(self, length: int, make_optimizer: Callable[..., Any]) -> bool:
-        """Return True if the schedule was made for a length, whatever its settings are called.
-
-        Its learning rate then changes in every epoch up to the last one or the one after it, and
-        from there on it stays, or turns back.
+    def check_length(self, length: Mapping[str, int]) -> None:
+        """Refuse a `total_steps` from the user that is less than the length of the training.
 
         Args:
-            length: Number of epochs (or steps); negative for a training without an end.
-            make_optimizer: Builds the optimizer from parameters.
+            length: Number of epochs and steps of the training.
+
+        Raises:
+            SettingError: The schedule ends before the training.
         """
-        if self._is_null("mode"):  # of `ReduceLROnPlateau`, which has no length
+        total = getattr(self.build, "keywords", {}).get("total_steps")
+        steps = length[self.interval] // self.frequency
+        if isinstance(total, int) and total < steps:
+            raise SettingError(
+                "scheduler.total_steps",
+                found=total,
+                expected=f"{steps} or more, the length of the training, or null",
+                remedy="A smaller number would end the schedule before the training.",
+            )
+
+    def ends_at(self, length: int, make_optimizer: Callable[..., Any]) -> bool:
+        """Return True if the schedule was made for a length of training.
+
+        The learning rate of such a schedule changes in the last epochs, and then stays constant or
+        reverses its direction, at the end of the training or one epoch before. This does not depend
+        on the names of the scheduler's settings.
+
+        Args:
+            length: Number of epochs or steps; negative for a training without an end.
+            make_optimizer: Function that builds the optimizer from parameters.
+        """
+        if self._is_null("mode"):  # `ReduceLROnPlateau`, which has no length
             return False
         optimizer = make_optimizer([{"params": [torch.zeros(1, requires_grad=True)]}])
         scheduler = self.build(optimizer)
@@ -141,17 +163,17 @@ def warmup_cosine(
     """Build a schedule that rises linearly and then falls along half a cosine.
 
     Args:
-        optimizer: The optimizer.
-        total_steps: Number of its steps.
+        optimizer: Optimizer whose learning rates are scheduled.
+        total_steps: Number of steps of the schedule.
         warmup_share: Share of these steps in which the rate rises.
         start_factor: Factor of the learning rate at the start.
         eta_min: Learning rate at the end.
 
     Raises:
-        SettingError: The share is not below 1.
+        SettingError: `warmup_share` is negative, or not less than 1.
     """
     if not 0 <= warmup_share < 1:
-        expected = "from 0, less than 1"
+        expected = "0 or more, less than 1"
         raise SettingError("scheduler.warmup_share", found=warmup_share, expected=expected)
     warmup = max(1, round(warmup_share * total_steps))
     parts = [

@@ -44,25 +44,25 @@ from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_
 class SegmentationTask(Task):
     """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
 
-    The views of all images of a batch, on all processes, make one gradient (paper, supplement,
-    "Semantic segmentation"): the loss is the sum over their labelled pixels divided by the sum of
-    those pixels' class weights. Validation and test cover the whole sphere, or the whole photo; the
-    scores are rendered back and compared with the original labels.
+    The views of all images of a batch, on all processes, contribute to one gradient (paper,
+    supplement, "Semantic segmentation"): the loss is the sum over their labeled pixels, divided by
+    the sum of the class weights of these pixels. Validation and test cover the whole sphere, or the
+    whole photo; the scores are rendered back and compared with the original labels.
 
     Args:
-        network: Any module ``(B, C, h, w) -> (B, K, h, w)`` or a dict with that under ``"out"``,
-            and optionally auxiliary scores under ``"aux"``; score k is that of label k + 1. One
-            whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing rays of
-            its images and bounds its memory itself (`models.SphereContext`).
+        network: Module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with these
+            scores under ``"out"`` and optional auxiliary scores under ``"aux"``. Score k is that of
+            label k + 1. A network whose `forward` also takes ``rays`` and ``images_per_chunk``
+            gets the viewing rays of its images and bounds its memory (`models.SphereContext`).
         representation: Representation of the images.
-        class_names: K + 1 names of the labels, the unknown class first.
+        class_names: Names of the K + 1 labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
-        class_weights: Weights of the loss: a name that the data module knows (``none``, ``log``,
-            ``sqrt``) or K numbers.
-        auxiliary_weight: Weight of the loss of the scores under ``"aux"``.
-        images_per_forward: Images per forward pass in evaluation, which bounds memory.
+        class_weights: Weights of the loss: a name (``none``, ``log``, ``sqrt``), for weights that
+            the data module computes, or K numbers.
+        auxiliary_weight: Weight of the loss of the auxiliary scores.
+        images_per_forward: Number of images per forward pass in evaluation, which bounds memory.
         absent_class: Treatment of classes absent from the ground truth in the means.
-        **settings: See `Task`.
+        **settings: Further arguments of `Task`.
     """
 
     predicts: ClassVar[str] = PIXEL_CLASSES
@@ -110,7 +110,8 @@ class SegmentationTask(Task):
                 "representation",
                 found="equirectangular images",
                 expected="tangent images or a cube map for a network with cross-image context",
-                remedy="One image sees all of itself: use the network without its context.",
+                remedy="An equirectangular image is the whole sphere: use the network without "
+                "context.",
             )
         self.weighting = class_weights
         self.auxiliary_weight = auxiliary_weight
@@ -119,7 +120,7 @@ class SegmentationTask(Task):
         self.register_buffer("class_weights", torch.ones(len(classes)))
 
     def setup(self, stage: str) -> None:
-        """Fix the class weights before training; a checkpoint brings its own."""
+        """Set the class weights before training; a checkpoint contains its weights."""
         if stage != "fit" or self.trainer.ckpt_path:
             return
         weights: Any = self.weighting
@@ -132,25 +133,25 @@ class SegmentationTask(Task):
         images: Float[Tensor, "images channels height width"],
         rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
     ) -> Float[Tensor, "images classes height width"]:
-        """Scores of every pixel.
+        """Return the scores of every pixel.
 
         Args:
             images: Images of one or several spheres.
             rays: Viewing rays, see `Views.rays`, for networks that take them.
 
         Raises:
-            SettingError: The network's scores do not fit the images or the classes.
+            SettingError: The shape of the scores does not fit the images or the classes.
         """
         return self.outputs(images, rays)["out"]
 
     def outputs(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
-        """All scores that the network returns, by name; see `forward`."""
+        """Return all scores of the network by name, see `forward`."""
         images = images.contiguous(memory_format=self.memory_format)
         if rays is None:
             returned = self.network(images)
         else:
-            at_once = self.images_per_chunk if self.training else self.images_per_forward
-            returned = self.network(images, rays, at_once)
+            count = self.images_per_chunk if self.training else self.images_per_forward
+            returned = self.network(images, rays, count)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
         expected = (len(images), self._num_scores, *images.shape[-2:])
         self.checked_scores(outputs["out"], expected)
@@ -158,34 +159,34 @@ class SegmentationTask(Task):
 
     @property
     def _num_scores(self) -> int:
-        """One more than there are classes where an imported network has unknown ones too."""
+        """Number of scores: that of classes, plus one for unknown classes of imported networks."""
         count: int = getattr(self.network, "num_scores", len(self.class_weights))
         return count
 
     def example(self, channels: int) -> Tensor:
-        """One empty image ``(1, C, h, w)``."""
+        """Return one empty image ``(1, C, h, w)``."""
         return torch.zeros(1, channels, *self.representation.image_size)
 
     @property
     def inputs_per_sample(self) -> int:
-        """Views of a panorama; 1 for a crop of a photo and an equirectangular image."""
+        """Number of views of a panorama; 1 for a photo's crop and for an equirectangular image."""
         if not isinstance(self.representation, Representation):
             return 1
         return len(self.representation.sample(np.random.default_rng(0)).rays()) or 1
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """All images of all panoramas or photos ``(n, C, h, w)`` and labels ``(n, h, w)``."""
+        """Return all images of a batch ``(n, C, h, w)`` and their labels ``(n, h, w)``."""
         return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
 
     def training_parts(self, batch: Any) -> list[Part]:
-        """See `Task`; a network that takes rays gets all images and divides them itself."""
+        """See `Task`; a network that takes rays gets all images, which it divides."""
         if self.sees_rays and batch.rays.numel():
             images, labels = self.training_pairs(batch)
             return [((images, batch.rays), labels)]
         return super().training_parts(batch)
 
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """Weighted cross-entropy, with that of an auxiliary head, summed over the pixels."""
+        """Return the weighted cross-entropy, summed over pixels, including auxiliary scores."""
         outputs, weights = self.outputs(*inputs), self.class_weights
         loss = cross_entropy_sum(outputs["out"], labels, weights, self.label_smoothing)
         if "aux" not in outputs:
@@ -193,7 +194,7 @@ class SegmentationTask(Task):
         return loss + self.auxiliary_weight * auxiliary_sum(outputs["aux"], labels, weights)
 
     def loss_norm(self, labels: Tensor) -> Tensor:
-        """Sum of the class weights of the labelled pixels."""
+        """Return the sum of the class weights of the labeled pixels."""
         return cross_entropy_norm(labels, self.class_weights)
 
     @torch.no_grad()
@@ -204,26 +205,27 @@ class SegmentationTask(Task):
         rotation: NDArray[np.float64] | None = None,
         target: Tensor | None = None,
     ) -> Integer[Tensor, ...]:
-        """Class index of every pixel of one panorama, or of the crops of a photo.
+        """Predict the label of every pixel of one panorama, or of the crops of a photo.
 
         Args:
-            images: All view sets of the representation, one after the other.
+            images: Images of all view sets of the representation, in this order.
             shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
                 crops.
-            rotation: Rotation of the representation.
-            target: The ground truth, to add the loss of the views to the validation loss.
+            rotation: Rotation of the representation ``(3, 3)``.
+            target: Ground truth, to add to the validation loss; None to compute no loss.
 
         Returns:
-            Class indices 1 … K of that shape; 0 where an imported network sees nothing.
+            Labels of that shape from 1 to K; 0 where an imported network predicts none of the
+            classes.
         """
-        if len(shape) > 2:  # each crop by itself
+        if len(shape) > 2:  # crops, each separately
             best = images.new_empty(shape, dtype=torch.int64)
             for part, scores in view_scores(
                 self, images.__getitem__, len(images), self.images_per_forward
             ):
                 best[part] = scores.argmax(dim=1)
                 if target is not None:
-                    self._add_loss_of(scores, target[part])
+                    self._add_loss(scores, target[part])
         else:
             mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target)
             best = mosaic.labels().long().to(images.device)
@@ -236,15 +238,15 @@ class SegmentationTask(Task):
         rotation: NDArray[np.float64] | None,
         target: Tensor | None,
     ) -> ScoreMosaic:
+        """Combine the scores of all views of a panorama, see `predict_labels`."""
         upright: Any = self.representation
-        seen = upright if rotation is None else upright.with_rotation(rotation)
-        sets = seen.view_sets()
-        counts = [len(views) for views in sets]
-        of_sets = (part.__getitem__ for part in torch.split(images, counts))
+        rotated = upright if rotation is None else upright.with_rotation(rotation)
+        sets = rotated.view_sets()
+        readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
         rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
         count, several = self._num_scores, len(sets) > 1
-        mosaic = ScoreMosaic(shape, count, seen.blend, averaged=several, device=images.device)
-        given = zip(sets, of_sets, rays, strict=True)
+        mosaic = ScoreMosaic(shape, count, rotated.blend, averaged=several, device=images.device)
+        inputs = zip(sets, readers, rays, strict=True)
 
         def add_loss(scores: Tensor, views: Any) -> None:
             if target is None:
@@ -253,17 +255,17 @@ class SegmentationTask(Task):
                 labels = torch.from_numpy(views.render(target.numpy(), "nearest"))
             else:
                 labels = views.render(target[None], "nearest")[:, 0]
-            self._add_loss_of(scores, labels)
+            self._add_loss(scores, labels)
 
-        return fill(mosaic, self, given, self.images_per_forward, scored=add_loss)
+        return fill(mosaic, self, inputs, self.images_per_forward, scored=add_loss)
 
-    def _add_loss_of(self, scores: Tensor, labels: Tensor) -> None:
-        """Add the cross-entropy of some views to the validation loss; not of auxiliary scores."""
+    def _add_loss(self, scores: Tensor, labels: Tensor) -> None:
+        """Add the cross-entropy of views, without auxiliary scores, to the validation loss."""
         loss = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
         self.add_validation_loss(loss, labels)
 
     def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of panoramas or photos to `metric`; returns the predictions."""
+        """Add a batch of panoramas or photos to `metric`; return the predicted labels."""
         predictions = []
         for images, target, rotation in zip(
             batch.images, batch.target, batch.rotation, strict=True
@@ -279,21 +281,21 @@ class SegmentationTask(Task):
         return torch.stack(predictions)
 
     def build_metric(self) -> SegmentationMetric:
-        """Confusion matrices of pixels, latitude bands and solid angles."""
+        """Build the confusion matrices of pixels, latitude bands and solid angles."""
         return SegmentationMetric(len(self.class_names))
 
     def logged_scores(self, result: SegmentationCounts) -> dict[str, float]:
-        """Means over classes, of panoramas also weighted by solid angle."""
+        """Return means over classes; for panoramas, also weighted by solid angle."""
         pixels, angles = self._scores(result)
         return pixels.means | (by_solid_angle(angles.means) if result.solid_angle.any() else {})
 
     def class_scores(self, result: SegmentationCounts) -> dict[str, float]:
-        """Intersection over union of each class."""
+        """Return the intersection over union of each class."""
         scores = self._scores(result)[0].iou.tolist()
         return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
 
     def record(self, result: SegmentationCounts, noun: str) -> Record:
-        """The record, with scores of classes and latitude bands, and intervals over the images."""
+        """Return the record with scores of classes and latitude bands, and confidence intervals."""
         pixels, angles = self._scores(result)
         bands = zip(itertools.pairwise(BAND_EDGES_DEG), result.bands, strict=True)
         intervals = [
@@ -302,12 +304,10 @@ class SegmentationTask(Task):
                 result.of_images.swapaxes(0, 1), self._absent_classes(result), strict=True
             )
         ]
-        of_class = pixels.of_classes | by_solid_angle(angles.of_classes)
+        columns = pixels.of_classes | by_solid_angle(angles.of_classes) | {"share": pixels.share}
         return replace(
             super().record(result, noun),
-            classes=class_entries(
-                of_class | {"share": pixels.share}, result.pixels, self.class_names
-            ),
+            classes=class_entries(columns, result.pixels, self.class_names),
             latitude_bands=[
                 {"latitude_deg": [south, north]}
                 | plain_scores(segmentation_scores(band, self.absent_class).means)
@@ -319,25 +319,25 @@ class SegmentationTask(Task):
         )
 
     def _absent_classes(self, result: SegmentationCounts) -> tuple[AbsentClass, AbsentClass]:
-        """Treatment of absent classes by pixels and by solid angle; photos have no solid angles."""
+        """Return the treatment of absent classes for scores by pixels and by solid angle."""
         return self.absent_class, self.absent_class if result.solid_angle.any() else "skip"
 
     def _scores(self, result: SegmentationCounts) -> Sequence[SegmentationScores]:
-        """Scores by pixels and by solid angle."""
+        """Return scores by pixels and by solid angle."""
         matrices = result.pixels, result.solid_angle
         return tuple(map(segmentation_scores, matrices, self._absent_classes(result)))
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
     ) -> RGB:
-        """Input, ground truth, prediction and error in a 2×2 grid above a legend."""
+        """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend."""
         shown = shown_arrays(image, target, prediction, self.representation, most_rows)
         return prediction_panel(*shown, self.class_names)
 
     def report_image(
         self, name: str, image: Any, target: Tensor, prediction: Tensor
     ) -> EncodedImage:
-        """The image with its true and predicted labels."""
+        """Return the image with its true and predicted labels."""
         rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
         classes = len(self.class_names)
         counts = count_image(prediction.cpu(), target.cpu(), classes).pixels

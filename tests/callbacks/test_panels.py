@@ -33,7 +33,7 @@ class _Source:
 
 
 def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
-    """After all ten, two a batch; the first labelled pixel is wrong."""
+    """After all ten, two a batch; the first labeled pixel is wrong."""
     panels = PredictionPanels(tmp_path, 4)
     trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
     representation: Any = None

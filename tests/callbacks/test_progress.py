@@ -1,4 +1,4 @@
-"""Progress where the output is no terminal."""
+"""Progress without a terminal."""
 
 from __future__ import annotations
 

@@ -18,13 +18,13 @@ class LabelMaps(nn.Module):
 
 
 @pytest.mark.parametrize(
-    ("num_classes", "groups", "told"),
+    ("num_classes", "groups", "message"),
     [(4, None, "found 4, for 5 scores"), (6, None, "6, for 5"), (1, [[5]], "1, for 5")],
 )
 def test_other_numbers_of_names_than_of_scores_are_refused(
-    num_classes: int, groups: list[list[int]] | None, told: str
+    num_classes: int, groups: list[list[int]] | None, message: str
 ) -> None:
-    with pytest.raises(SettingError, match=told):
+    with pytest.raises(SettingError, match=message):
         ClassScoreNetwork(nn.Conv2d(3, 5, 1), num_classes, groups)(torch.zeros(1, 3, 2, 2))
 
 

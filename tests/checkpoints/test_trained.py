@@ -97,7 +97,7 @@ def _network(**settings: Any) -> dict[str, Any]:
         ({"representation": None}, r"no representation in its config"),
     ],
 )
-def test_what_cannot_be_loaded_says_why(
+def test_files_that_cannot_be_loaded_are_explained(
     changed: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "best.ckpt"
@@ -113,12 +113,12 @@ def test_what_cannot_be_loaded_says_why(
     ("content", "message"),
     [
         (None, "no such file"),
-        (b"not a checkpoint", r"a damaged file, or none of torch\.save"),
+        (b"not a checkpoint", r"a damaged file, or not a file of torch\.save"),
         ({"state_dict": {}}, "no config inside"),
         ([1, 2], "list instead of a mapping inside"),
     ],
 )
-def test_what_is_no_checkpoint_is_refused(content: Any, message: str, tmp_path: Path) -> None:
+def test_other_files_are_refused(content: Any, message: str, tmp_path: Path) -> None:
     path = tmp_path / "x.ckpt"
     if isinstance(content, bytes):
         path.write_bytes(content)

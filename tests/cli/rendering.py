@@ -30,5 +30,5 @@ def render_with(**settings: Any) -> None:
 
 
 def smooth(height: int = 64) -> NDArray[np.uint8]:
-    """``(H, 2H, 3)`` RGB, smooth on the sphere; every direction has its own colour."""
+    """``(H, 2H, 3)`` RGB, smooth on the sphere; every direction has its own color."""
     return np.rint((equirect_directions((height, 2 * height)) + 1) * 127.5).astype(np.uint8)

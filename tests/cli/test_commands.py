@@ -97,7 +97,7 @@ def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
     assert results(tmp_path / "cut") == results(run_folder)
 
 
-def test_ctrl_c_ends_a_run_as_a_shell_says_it(
+def test_ctrl_c_ends_a_run_with_the_status_of_a_shell(
     rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def interrupted(*_: object) -> None:
@@ -182,7 +182,7 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
     for name, home in (("theirs", None), (str(run_folder), str(tmp_path / "other machine"))):
         if home is not None:
             monkeypatch.setenv("XDG_STATE_HOME", home)
-        with pytest.raises(SystemExit, match=r"data\.root: found none, as checkpoints do not say"):
+        with pytest.raises(SystemExit, match=r"data\.root: found null: paths are not taken"):
             run("evaluate", f"checkpoint={name}/checkpoints/best.ckpt")
     assert not [path for path in run_folder.rglob("*.json") if "data.root" in path.read_text()]
 
@@ -193,14 +193,16 @@ def test_where_data_are_is_remembered_by_the_place_of_the_run_and_never_in_it(
         ("train", "optimizer.lr=1", r"optimizer\.lr: found 1 for a run that began with 0\.003"),
         ("train", "seed=3", r"seed: found 3 for a run that began with 0"),
         ("train", "network.widths=[4,9]", r"network\.widths: found \[4, 9\]"),
-        ("train", "data=folder", r"found data=folder beside it"),
+        ("train", "data=folder", r"found data=folder in the same"),
         ("train", "trainer.max_epochs=1", r"max_epochs: found 1 for a run that is in its epoch 2"),
         ("train", "trainer.max_epochs=3", r"trainer\.max_epochs, .*: found 12 training steps"),
         ("evaluate", "data.inputs=[rgb]", "network: found .*|found inputs .* which the"),
         ("evaluate", "data=omnisynthia", r"found class names .*'sky'.*; expected .*'beam'"),
         ("evaluate", "network.widths=[4,9]", "network: found other tensors than in"),
-        ("evaluate", "experiment=rooms/demo", r"found experiment=rooms/demo beside it"),
-        ("evaluate", "recipe=small", r"found recipe=small beside it"),
+        ("evaluate", "experiment=rooms/demo", r"found experiment=rooms/demo in the same"),
+        ("evaluate", "recipe=small", r"found recipe=small in the same"),
+        ("evaluate", "optimizer.lr=3", r"optimizer\.lr: .*tangent-evaluate does not train"),
+        ("evaluate", "+scheduler.gamma=1", r"scheduler\.gamma: .*tangent-evaluate does not train"),
     ],
 )
 def test_a_run_is_neither_resumed_nor_evaluated_as_another(
@@ -238,7 +240,7 @@ def test_a_trial_of_a_network_finds_its_fault_whatever_the_memory_holds() -> Non
 def test_the_last_step_of_an_epoch_is_tried_before_training(
     faces: int, rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of 7 panoramas, 2 a step; DeepLab's pooled features have one value per image and channel."""
+    """7 panoramas, 2 per step; DeepLab's pooled features have one value per image and channel."""
 
     class BegunError(Exception):
         pass
@@ -307,7 +309,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         ),
         (["data=folder"], "data: found rooms for datamodules.FolderPanoramas; .*recipe=small"),
         (["data=synthshapes"], "data: found panoramas_per_step, rooms for .*SynthShapes"),
-        (["data=zind_pairs"], "data: found ZindPairs; expected labelled images"),
+        (["data=zind_pairs"], "data: found ZindPairs; expected labeled images"),
         (
             ["scheduler=step", f"{_SCHEDULER}.ExponentialLR"],
             "found step_size for .*~scheduler.step",
@@ -319,7 +321,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["~scheduler.max_lr", "~scheduler.pct_start", f"{_SCHEDULER}.StepLR"], "step_size"),
         (
             ["scheduler=cosine", "scheduler.T_max=abc"],
-            "scheduler: found .*; expected settings that .*CosineAnnealingLR takes",
+            "scheduler: found .*; expected settings that .*CosineAnnealingLR accepts",
         ),
         (
             ["network._target_=tests.cli.tiny_runs.results"],
@@ -337,7 +339,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
 
 
 @pytest.mark.parametrize(
-    ("command", "argument", "said"),
+    ("command", "argument", "message"),
     [
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Key 'levl' is not in struct"),
@@ -347,7 +349,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
     ],
 )
 def test_answers_before_anything_heavy_is_imported(
-    command: str, argument: str, said: str, tmp_path: Path
+    command: str, argument: str, message: str, tmp_path: Path
 ) -> None:
     code = (
         f"import sys; from tangent_train.cli.main import {command}\n"
@@ -357,7 +359,7 @@ def test_answers_before_anything_heavy_is_imported(
         "    print('heavy', len(heavy))"
     )
     done = run_python(tmp_path, "-c", code)
-    assert said in done.stdout + done.stderr
+    assert message in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
     assert "Traceback" not in done.stderr
 
@@ -438,7 +440,7 @@ def test_output_of_any_encoding(
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])
 @pytest.mark.parametrize("named", [True, False])
-def test_what_the_system_refuses_is_one_line(
+def test_errors_of_the_system_are_one_line(
     number: int, named: bool, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def render(_: object) -> None:
@@ -490,14 +492,14 @@ def test_a_pipe_that_is_closed_early_and_tab_completion(tmp_path: Path) -> None:
     train = f"{sys.executable} -m tangent_train.cli.main train"
     typed = "tangent-train data=folder_"
     completion = f"COMP_LINE='{typed}' COMP_POINT={len(typed)} {train} -sc query=bash"
-    for command, told in (
+    for command, beginning in (
         (f"{train} --help | head -n 1", "Train a network"),
         (completion, "data=folder_photos"),
     ):
         done = subprocess.run(
             command, shell=True, check=True, cwd=tmp_path, capture_output=True, text=True
         )
-        assert done.stdout.startswith(told)
+        assert done.stdout.startswith(beginning)
         assert not done.stderr
 
 
@@ -509,7 +511,8 @@ def test_an_incomplete_test_leaves_no_results(
     run("train", *SETTINGS, rooms, "trainer.max_epochs=1", typed, "hydra.run.dir=run")
     count = 0 if limit == "batches=0" else 1
     assert (
-        f"{count} of 2 test panoramas were evaluated, as trainer.limit" in capsys.readouterr().out
+        f"{count} of 2 test panoramas were evaluated because of trainer.limit"
+        in capsys.readouterr().out
     )
     assert not list((tmp_path / "run").glob("results.*"))
     checkpoint = tmp_path / "run" / "checkpoints" / "last.ckpt"

@@ -92,7 +92,7 @@ def test_paths_are_taken_literally(text: str) -> None:
 
 @settings(max_examples=300, deadline=None)
 @given(st.text() | st.text("ab'\"\\${}:,[](#= \n\t~%@é日\udc80\x1b"))
-def test_what_arrives_is_what_was_typed(text: str) -> None:
+def test_typed_paths_arrive_unchanged(text: str) -> None:
     def arrived(argument: str) -> Any:
         (literal,) = literal_paths("predict", [argument])
         override = OverridesParser.create().parse_override(literal)

@@ -39,7 +39,7 @@ def _confusion(folder: Path) -> Any:
     return np.asarray(results(folder)["confusion"])
 
 
-def test_what_a_map_leaves_is_missed_or_never_wins(
+def test_classes_that_a_map_lacks_are_missed_or_never_win(
     network: str,
     rooms: str,
     run_folder: Path,
@@ -52,8 +52,10 @@ def test_what_a_map_leaves_is_missed_or_never_wins(
         arguments = [network, *ROOMS, rooms, given, f"unmapped={unmapped}"]
         arguments += ["representation.blend=nearest"]  # averages may change other classes, too
         run("evaluate", *arguments, f"hydra.run.dir={unmapped}")
-    said = "ceiling ← bright; floor ← dark; not predicted: beam, board, bookcase, chair, clutter, "
-    assert said in capsys.readouterr().out
+    summary = (
+        "ceiling ← bright; floor ← dark; not predicted: beam, board, bookcase, chair, clutter, "
+    )
+    assert summary in capsys.readouterr().out
     matrices = {name: _confusion(tmp_path / name) for name in ("unknown", "never")}
     floor, ceiling = (1 + CLASSES.index(name) for name in ("floor", "ceiling"))
     for name, matrix in matrices.items():
@@ -127,7 +129,7 @@ def test_the_levels_of_an_imported_network(
     assert sum(map(len, made.view_sets())) == views
 
 
-def test_the_network_judges_which_way_is_up(
+def test_the_network_estimates_the_up_direction(
     network: str,
     rooms: str,
     run_folder: Path,
@@ -136,23 +138,23 @@ def test_the_network_judges_which_way_is_up(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Asked in this process, once for every test panorama, before workers read them."""
-    asked: list[Any] = []
+    max_tilts: list[Any] = []
 
     def estimate(rgb: NDArray[np.uint8], max_tilt_deg: float, judge: Any) -> NDArray[np.float64]:
         likely = judge(np.eye(3))
         assert likely.shape == (3,)
         assert np.isfinite(likely).all()
-        asked.append(max_tilt_deg)
+        max_tilts.append(max_tilt_deg)
         return np.array([0.0, 0, -1])
 
     monkeypatch.setattr("datamodules.core.transforms.estimate_up", estimate)
     given = ["data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]
     mapped = _written(tmp_path / "map.json", MAP)
     run("evaluate", network, *ROOMS, *given, mapped, "hydra.run.dir=imported")
-    assert asked == [180, 180]
+    assert max_tilts == [180, 180]
     best = f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}"
     run("evaluate", best, *given, "trainer.accelerator=cpu", "hydra.run.dir=own")
-    assert len(asked) == 4
+    assert len(max_tilts) == 4
     assert (_confusion(tmp_path / "own") != _confusion(run_folder)).any(), "seen upside down"
 
 
@@ -191,7 +193,7 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
     ],
 )
-def test_what_cannot_be_evaluated_is_refused(
+def test_impossible_evaluations_are_refused(
     changes: dict[str, Any], message: str, network: str, rooms: str, tmp_path: Path, run: Run
 ) -> None:
     given = {"checkpoint": network, "data": rooms, "class_map": MAP} | changes

@@ -20,18 +20,18 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["a, b.onnx", "new/folder/model.SAFETENSORS"])
-def test_the_suffix_says_the_format(
+def test_the_suffix_selects_the_format(
     name: str, checkpoint: Path, tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:
     run("export", f"checkpoint={checkpoint}", f"output={name}")
-    said, errors = capfd.readouterr()
+    printed, errors = capfd.readouterr()
     assert errors == ""
     path = tmp_path / name
     assert re.fullmatch(
         rf"{re.escape(name)}: {path.stat().st_size / 1e6:.1f} MB\n"
         r"images: 4 channels, any size, multiples of 2; scores: 13 classes\n"
-        r"largest difference to PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
-        said,
+        r"largest difference from PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
+        printed,
     )
     assert load_trained(path).in_channels == 4
     kept = [p for p in tmp_path.rglob("*") if p.is_file()]
@@ -41,14 +41,14 @@ def test_the_suffix_says_the_format(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "checkpoint: found none; expected a file"),
+        ([], "checkpoint: found null; expected a file"),
         (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
         (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
         (["checkpoint={}", "output=x.safetensors", "image_size=[9,9]"], "image_size and opset:"),
         (["checkpoint={}", "output=x.onnx", "image_size=[15,16]"], "output: .* multiples of 2"),
     ],
 )
-def test_errors(
+def test_export_errors_are_one_line(
     arguments: list[str], message: str, checkpoint: Path, tmp_path: Path, run: Run
 ) -> None:
     with pytest.raises(SystemExit, match=f"^tangent-export: {message}"):

@@ -50,12 +50,12 @@ OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalizati
 
 @pytest.mark.parametrize("wins", [True, False])
 def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys: Capture) -> None:
-    """Blocks of one colour: the labels are those of every pixel's own scores."""
+    """Blocks of one color: the labels are those of every pixel's own scores."""
     unknown = ("unknown_classes=[background]", f"unknown_wins={wins}".lower())
     run("import", *OF_ONNX, *unknown, "fov=90", "output=ours.onnx")
-    said = capsys.readouterr().out
-    assert "3 classes: dark, green, bright\n" in said
-    assert f"background: {'written as unknown' if wins else 'never win'}" in said
+    printed = capsys.readouterr().out
+    assert "3 classes: dark, green, bright\n" in printed
+    assert f"background: {'written as unknown' if wins else 'never win'}" in printed
     trained = load_trained(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
@@ -63,8 +63,10 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
     scores = Predictor(trained, PanoramaViews(trained, levels=(7,))).predict(InputImage(rgb))
     labels = trained.labels(scores.labels())
-    own = rgb / 255 @ WEIGHT.T + BIAS
-    expected = own.argmax(axis=-1) if wins else own[..., 1:].argmax(axis=-1) + 1
+    scores_by_hand = rgb / 255 @ WEIGHT.T + BIAS
+    expected = (
+        scores_by_hand.argmax(axis=-1) if wins else scores_by_hand[..., 1:].argmax(axis=-1) + 1
+    )
     middle = np.arange(128).reshape(8, 16)[:, 6:10].ravel()  # away from the edges of the blocks
     np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])
     assert set(np.unique(expected)) == ({0, 1, 2, 3} if wins else {1, 2, 3})
@@ -111,9 +113,9 @@ def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: P
     monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
     given = ("network=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
-    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as told:
+    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as message:
         run("import", *given)
-    file = Path(str(told.value).rpartition("save it as ")[2].removesuffix("."))
+    file = Path(str(message.value).rpartition("save it as ")[2].removesuffix("."))
     network = torchvision_models.get_model(name, weights=None, weights_backbone=None)
     file.parent.mkdir(parents=True, exist_ok=True)
     torch.save(network.state_dict(), file)
@@ -154,10 +156,10 @@ def test_a_network_of_ones_own_is_imported(here: Path, run: Run, capsys: Capture
     torch.save(network.state_dict(), here / "state.pt")
     given = ("weights=state.pt", "classes=classes.json", "normalization=unit", "output=net.ckpt")
     run("import", "--config-dir", "own", "network=mine", *given)
-    own = "tests.tasks.small_networks.with_statistics"
-    assert f"trust=[{own}]" in capsys.readouterr().out
-    assert load_trained(here / "net.ckpt", [own]).class_names == ("unknown", *NAMES)
-    with pytest.raises(DataError, match=f"trust={own}"):
+    scores_by_hand = "tests.tasks.small_networks.with_statistics"
+    assert f"trust=[{scores_by_hand}]" in capsys.readouterr().out
+    assert load_trained(here / "net.ckpt", [scores_by_hand]).class_names == ("unknown", *NAMES)
+    with pytest.raises(DataError, match=f"trust={scores_by_hand}"):
         load_trained(here / "net.ckpt")
 
 
@@ -329,7 +331,7 @@ def test_labels_without_settings_are_those_of_both_levels(
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         (("classes=three.json",), "^tangent-import: class names .*: found 3, for 4 scores; exp"),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
@@ -349,14 +351,14 @@ def test_labels_without_settings_are_those_of_both_levels(
         ),
     ],
 )
-def test_what_does_not_fit_is_one_clear_message(
-    changes: tuple[str, ...], told: str, here: Path, run: Run
+def test_unusable_files_are_one_clear_message(
+    changes: tuple[str, ...], message: str, here: Path, run: Run
 ) -> None:
     (here / "three.json").write_text(json.dumps(NAMES[1:]))
     (here / "holes.json").write_text(json.dumps({"0": "wall", "2": "floor"}))
     (here / "escapes.json").write_text(json.dumps([*NAMES[1:], "a\x1b[2J"]))
     before = set(here.iterdir())
-    with pytest.raises(SystemExit, match=told):
+    with pytest.raises(SystemExit, match=message):
         run("import", *OF_ONNX, "output=ours.onnx", *changes)
     assert set(here.iterdir()) == before
 

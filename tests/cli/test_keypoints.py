@@ -44,7 +44,9 @@ def pairs_in(folder: Path) -> list[str]:
     return list(dict.fromkeys(row["pair"] for row in results(folder)["rows"]))
 
 
-def test_two_panoramas(run: Run, panoramas: Path, tmp_path: Path, capsys: Capture) -> None:
+def test_two_panoramas_are_a_pair(
+    run: Run, panoramas: Path, tmp_path: Path, capsys: Capture
+) -> None:
     pair = (f"left={panoramas}/a.png", f"right={panoramas}/b.png")
     run(*pair, "base_level=[0]", "level=5", "output=out (1)")
     output = tmp_path / "out (1)"
@@ -98,9 +100,11 @@ def test_an_interrupted_run_goes_on(
     assert results(tmp_path / "out")["rows"][:2] == first
     run(*arguments, "max_pairs=1")  # takes nothing away
     assert len(pairs_in(tmp_path / "out")) == 3
-    with pytest.raises(SystemExit, match=r"ratio: found 0\.7; expected 0\.8, as for the results"):
+    with pytest.raises(
+        SystemExit, match=r"ratio: found 0\.7; expected 0\.8, with which the results"
+    ):
         run(*arguments, "ratio=0.7")
-    with pytest.raises(SystemExit, match=r"data: found .*; expected .*, as for the results"):
+    with pytest.raises(SystemExit, match=r"data: found .*; expected .*, with which the results"):
         run(*arguments, "pairing=consecutive")
 
 
@@ -121,7 +125,7 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
     run("input=in", *SMALL, "output=out")
     assert "1 of 2 pairs are done already" in capsys.readouterr().out
     assert pairs_in(tmp_path / "out") == ["a – b", "b – c/d"]
-    # Of nothing but broken pairs there are no results.
+    # Broken pairs have no results.
     assert cv2.imwrite(str(tmp_path / "square.png"), np.zeros((8, 8, 3), np.uint8))
     with pytest.raises(SystemExit, match="1 of 1 pairs could not be used"):
         run("left=in/a.png", "right=square.png", *SMALL, "output=none")
@@ -132,12 +136,12 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["input=in"], "output: found none"),
+        (["input=in"], "output: found null"),
         (["left={}/a.png", "output=o"], "input: found left="),
         (["input={}", "pairing=every", "output=o"], "pairing: found every"),
         (["left={}", "right={}/a.png", "output=o"], "found 4; expected two panoramas"),
         (["input={}/a.png", "output=o"], "a.png: found 1; expected two panoramas or more"),
-        (["data=synthrooms", "output=o"], "found datamodules.SynthRooms; expected pairs:"),
+        (["data=synthrooms", "output=o"], "SynthRooms; expected a data set of pairs:"),
         (["margin=-1", "output=o"], "margin: found -1"),
     ],
 )

@@ -74,7 +74,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict, capsys: Capture
     assert not list(output.rglob(".partial*"))
 
 
-def test_earlier_results_stay_and_are_not_labelled_again(tmp_path: Path, predict: Predict) -> None:
+def test_earlier_results_stay_and_are_not_labeled_again(tmp_path: Path, predict: Predict) -> None:
     write_pixels(tmp_path / "in" / "a.png", sphere(16))
     settings = {"output": tmp_path / "in", "report": 0}  # into the folder of the images
     assert predict(**settings).keys() == {"a"}
@@ -109,11 +109,11 @@ def test_an_interruption_keeps_what_is_done(
     first = tmp_path / "out" / "labels" / "a.png"
     assert list(first.parent.iterdir()) == [first]
     printed = capsys.readouterr()
-    assert "1 of 3 images are done. resume=true" in printed.out
+    assert "1 of 3 images are done. Continue with resume=true" in printed.out
     assert printed.err == "tangent-predict: ended by SIGTERM\n"
     monkeypatch.setattr(Predictor, "predict", whole)
     written = first.stat().st_mtime_ns
-    with pytest.raises(SystemExit, match="resume: found blend=nearest, another setting"):
+    with pytest.raises(SystemExit, match="resume: found blend=nearest, which differs"):
         predict(resume="true", blend="nearest")
     assert predict(resume="true").keys() == {"a", "b", "c"}
     assert first.stat().st_mtime_ns == written
@@ -167,7 +167,7 @@ def test_usable_images_take_the_places_of_broken_ones_in_the_report(
     assert page.count("<li><button") == 3
 
 
-def test_a_part_of_a_panorama_is_labelled_as_that_part(tmp_path: Path, predict: Predict) -> None:
+def test_a_part_of_a_panorama_is_labeled_as_that_part(tmp_path: Path, predict: Predict) -> None:
     """Away from its borders, across the seam, it gets what the whole panorama gets there."""
     rows, columns = np.arange(16, 48), np.r_[112:128, 0:16]
     whole, part = tmp_path / "whole.png", tmp_path / "part.png"
@@ -188,7 +188,7 @@ def test_a_part_of_a_panorama_is_labelled_as_that_part(tmp_path: Path, predict: 
     assert not (tmp_path / "p" / "color").exists(), "written only if wanted"
 
 
-def test_photos(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
+def test_photos_get_labels(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     checkpoint = write_checkpoint(tmp_path / "photos.ckpt", PERSPECTIVE)
     write_pixels(tmp_path / "in" / "a.png", sphere(64)[10:40, 20:70])
     settings = {"checkpoint": checkpoint, "projection": "perspective"}
@@ -200,18 +200,18 @@ def test_photos(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
     assert read_png(tmp_path / "out" / "labels" / "a.png").shape == (30, 50)
 
 
-def test_the_network_judges_which_way_is_up(
+def test_the_network_estimates_the_up_direction(
     tmp_path: Path, predict: Predict, monkeypatch: Patch
 ) -> None:
     even = np.full(6, 1 / 6)
     monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)
-    turn = rotation_about((1, 0, 0), math.radians(100))
-    room = draw_room((128, 256), turn)
+    tilt = rotation_about((1, 0, 0), math.radians(100))
+    room = draw_room((128, 256), tilt)
     write_pixels(tmp_path / "in" / "a.png", room)
 
     def judge(self: NetworkJudge, image: InputImage, ups: NDArray[np.float64]) -> Any:
         np.testing.assert_array_equal(image.rgb, room)
-        return 30 * ups @ turn[:, 2]
+        return 30 * ups @ tilt[:, 2]
 
     monkeypatch.setattr(NetworkJudge, "__call__", judge)
     found = predict(upright="auto", max_tilt_deg=180, write="[labels]", report=0)["a"]
@@ -219,12 +219,12 @@ def test_the_network_judges_which_way_is_up(
 
 
 def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predict) -> None:
-    """In metres or units, ``.npy`` or PNG, with ``_depth`` at the end or not."""
+    """In meters or units, ``.npy`` or PNG, with ``_depth`` at the end or not."""
     depth, checkpoint = tmp_path / "depth", write_checkpoint(tmp_path / "d.ckpt", channels=4)
-    for scene, metres in (("x", 0.5), ("y", 3.5), ("z", 3.5)):
+    for scene, meters in (("x", 0.5), ("y", 3.5), ("z", 3.5)):
         write_pixels(tmp_path / "in" / scene / "a.png", sphere(32))
         (depth / scene).mkdir(parents=True)
-        np.save(depth / scene / "a.npy", np.full((32, 64), metres, np.float32))
+        np.save(depth / scene / "a.npy", np.full((32, 64), meters, np.float32))
     (depth / "z" / "a.npy").unlink()
     cv2.imwrite(str(depth / "z" / "a_depth.png"), np.full((32, 64), 3500, np.uint16))
     predict(checkpoint=checkpoint, depth=depth)

@@ -26,18 +26,18 @@ TIMES = [0, 1, 2, 4, 5, 9, 10]
 """Of the frames, in sixteenths of a second: the rate varies."""
 
 
-def _write_video(path: Path, shape: tuple[int, int] = (32, 64), turns: int = 0) -> Path:
-    """A video, perhaps stored rotated clockwise by quarter turns."""
+def _write_video(path: Path, shape: tuple[int, int] = (32, 64), quarters: int = 0) -> Path:
+    """A video, perhaps stored rotated clockwise by quarter quarters."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with av.open(str(path), "w") as output:
         stream = output.add_stream("mpeg4", rate=16)
-        stream.height, stream.width = shape[::-1] if turns % 2 else shape
-        if turns:
-            stream.set_display_rotation(90 * turns)
+        stream.height, stream.width = shape[::-1] if quarters % 2 else shape
+        if quarters:
+            stream.set_display_rotation(90 * quarters)
         stream.codec_context.time_base = Fraction(1, 16)
         for number, time in enumerate(TIMES):
             rgb = np.roll(sphere(shape[0]), 5 * number, axis=1)[:, : shape[1]]
-            stored = np.ascontiguousarray(np.rot90(rgb, -turns))
+            stored = np.ascontiguousarray(np.rot90(rgb, -quarters))
             frame = av.VideoFrame.from_ndarray(stored, format="rgb24")
             frame.pts, frame.time_base = time, Fraction(1, 16)
             output.mux(stream.encode(frame))
@@ -57,14 +57,14 @@ def _labels(folder: Path) -> dict[str, NDArray[np.uint8]]:
     return {path.stem: read_png(path) for path in sorted(folder.rglob("*.png"))}
 
 
-@pytest.mark.parametrize("turns", [0, 1, 2])
+@pytest.mark.parametrize("quarters", [0, 1, 2])
 def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
-    tmp_path: Path, predict: Predict, turns: int
+    tmp_path: Path, predict: Predict, quarters: int
 ) -> None:
     """Upright, beside a folder of images that has the video's name."""
-    video = _write_video(tmp_path / "in" / "walk.mp4", turns=turns)
+    video = _write_video(tmp_path / "in" / "walk.mp4", quarters=quarters)
     stored, times = _decoded(video)
-    frames = np.rot90(stored, turns, axes=(1, 2))
+    frames = np.rot90(stored, quarters, axes=(1, 2))
     (tmp_path / "in" / "walk").mkdir()
     for number, rgb in enumerate(frames):
         cv2.imwrite(
@@ -86,7 +86,7 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
         assert (np.stack([frame() for frame in read_frames(path)]) == made).all(), "not rotated"
         assert made.shape == frames.shape
         assert made_times == pytest.approx(times)
-        assert np.abs(made - expected).mean() < 8  # compressed, with colours at half resolution
+        assert np.abs(made - expected).mean() < 8  # compressed, with colors at half resolution
     entries = predicted(tmp_path / "out")
     assert len(entries) == 2 * len(TIMES)
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
@@ -115,7 +115,7 @@ def test_every_third_frame(tmp_path: Path, predict: Predict, capsys: Capture) ->
         predict(every=3, resume="true")
         assert f"4 images, {3 if missing else 4} done already" in capsys.readouterr().out
         assert set(re.findall(r"walk/\d{6}", page.read_text())) == {f"walk/{n}" for n in third}
-    with pytest.raises(SystemExit, match="every=2, another setting"):
+    with pytest.raises(SystemExit, match="every=2, which differs"):
         predict(every=2, resume="true")
     with pytest.raises(SystemExit, match="every: found 0"):
         predict(every=0, output="none")
@@ -148,7 +148,7 @@ def test_an_interrupted_video_is_resumed(
     with pytest.raises(SystemExit) as stopped:
         predict(input=video)
     assert stopped.value.code == 130
-    assert "4 of 7 images are done. resume=true" in capsys.readouterr().out
+    assert "4 of 7 images are done. Continue with resume=true" in capsys.readouterr().out
     assert len(predicted(tmp_path / "out")) == 4
     assert not (tmp_path / "out" / "overlay").exists()
     monkeypatch.setattr("tangent_train.cli.input_files.read_frames", read_frames)
@@ -176,7 +176,7 @@ def _without_pictures(video: Path) -> bytes:
 def test_videos_that_cannot_be_used(
     tmp_path: Path, predict: Predict, capsys: Capture, monkeypatch: Patch
 ) -> None:
-    """Each is named once, and the others are labelled."""
+    """Each is named once, and the others are labeled."""
     folder = tmp_path / "in"
     good = _write_video(folder / "good.mp4")
     _write_video(folder / "narrow.mp4", (32, 48))
@@ -191,7 +191,7 @@ def test_videos_that_cannot_be_used(
         output.mux(stream.encode(None))
     with pytest.raises(SystemExit, match="5 of 12 images could not be used"):
         predict(write="[labels]")
-    said = " ".join(capsys.readouterr().out.split())
+    printed = " ".join(capsys.readouterr().out.split())
     for name, message in (
         ("broken", "cannot be decoded"),
         ("cut", "truncated or damaged"),
@@ -199,7 +199,7 @@ def test_videos_that_cannot_be_used(
         ("narrow", "expected a whole panorama"),
         ("sound", "no video stream"),
     ):
-        assert len(re.findall(rf"{name}\.\w+: found", said)) == 1
+        assert len(re.findall(rf"{name}\.\w+: found", printed)) == 1
         assert message in predicted(tmp_path / "out")[name]["error"]
     with pytest.raises(SystemExit, match="1 of 1 images could not be used"):
         predict(input=folder / "gray.mp4", output="other")

@@ -1,4 +1,4 @@
-"""What a run takes from the file that it starts from, and what is its own."""
+"""Networks and tensors that a run takes from another file."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def imported(tmp_path: Path) -> Path:
 
 
 def _begun(monkeypatch: Patch, path: Path, *overrides: str) -> tuple[Any, Any]:
-    """What such a command line begins with: settings, and where they come from."""
+    """Return the settings of a command line with ``init_from``, and the file they come from."""
     config = composed("train", "level=5", *overrides, return_hydra_config=True)
     monkeypatch.setattr(HydraConfig, "get", lambda: config.hydra)
     everything: Any = OmegaConf.to_container(config, resolve=False)
@@ -92,8 +92,8 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
         assert settings["network"]["widths"] == widths
         assert settings["data"]["normalization"] == IMAGENET
         taken = widths == UNET["widths"]
-        said = f"Network of {path}: models.UNet" if taken else "Network of the config: models.UNet"
-        assert said in capsys.readouterr().out
+        note = f"Network of {path}: models.UNet" if taken else "Network of the config: models.UNet"
+        assert note in capsys.readouterr().out
         assert (source is None) != taken
         if source is None:
             continue

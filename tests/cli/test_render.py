@@ -46,7 +46,7 @@ def rendered(room: Path, tmp_path: Path) -> Path:
     ("base_level", "blend", "dtype", "suffix"),
     [(0, "nearest", np.uint8, ".png"), (1, "feather", np.uint16, ".tif")],
 )
-def test_colours_come_back(
+def test_colors_come_back(
     tmp_path: Path, base_level: int, blend: Any, dtype: Any, suffix: str
 ) -> None:
     image = smooth().astype(dtype) * dtype(257 if dtype is np.uint16 else 1)
@@ -108,16 +108,16 @@ def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> Non
     for name in names:
         again = _read(tmp_path / "back" / f"{name}.png")
         assert np.abs(again.astype(int) - smooth(32)).max() <= 12
-    said = refused(back=tmp_path / "in", output=tmp_path / "back")
-    assert "a.png, which exists" in said
-    assert "3 of 3 panoramas could not be rendered" in said
+    message = refused(back=tmp_path / "in", output=tmp_path / "back")
+    assert "a.png, which exists" in message
+    assert "3 of 3 panoramas could not be rendered" in message
 
 
 def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
     write_pixels(tmp_path / "a.png", smooth(90))
     render_with(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
     assert read_cameras(tmp_path / "tan" / "a" / "cameras.json").grid.level == 5
-    # A checkerboard of single pixels: averaged it is grey, sampled it would be black and white.
+    # A checkerboard of single pixels: averaged it is gray, sampled it would be black and white.
     board = np.where(np.indices((128, 256)).sum(axis=0) % 2, 255, 0)
     write_pixels(tmp_path / "board.png", board[..., None].repeat(3, axis=2).astype(np.uint8))
     render_with(input=tmp_path / "board.png", output=tmp_path / "tan", base_level=0, level=5)
@@ -201,31 +201,33 @@ def test_yaw_pitch_roll(
     room: Path, tmp_path: Path, rotation: list[float], forward: Any, right: Any
 ) -> None:
     render_with(input=room, output=tmp_path / "tan", base_level=0, faces=[3], rotation=rotation)
-    turn = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid.rotation
-    assert turn is not None
-    np.testing.assert_allclose(turn @ (1, 0, 0), forward, atol=1e-12)
-    np.testing.assert_allclose(turn @ (0, 1, 0), right, atol=1e-12)
+    found = read_cameras(tmp_path / "tan" / "room" / "cameras.json").grid.rotation
+    assert found is not None
+    np.testing.assert_allclose(found @ (1, 0, 0), forward, atol=1e-12)
+    np.testing.assert_allclose(found @ (0, 1, 0), right, atol=1e-12)
 
 
 def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused: Refused) -> None:
     figure = tmp_path / "figure.png"
     render_with(input=room, figure=figure, base_level=0)
     assert _read(figure).shape[1] == 1600
-    said = refused(input=room, figure=figure, output=tmp_path / "tan")
-    assert "figure.png, which exists" in said
+    message = refused(input=room, figure=figure, output=tmp_path / "tan")
+    assert "figure.png, which exists" in message
     write_pixels(room.with_name("second.png"), smooth(32))
     assert "figure: found 2 panoramas" in refused(input=room.parent, figure=tmp_path / "b.png")
 
 
-# What exists, and what is interrupted.
+# Existing files and interruptions.
 
 
-def test_earlier_images_are_kept_unless_told(room: Path, tmp_path: Path, refused: Refused) -> None:
+def test_earlier_images_are_kept_without_overwrite(
+    room: Path, tmp_path: Path, refused: Refused
+) -> None:
     folder = tmp_path / "tan" / "room"
-    folder.mkdir(parents=True)  # an empty folder is no earlier result
+    folder.mkdir(parents=True)  # an empty folder may be used
     render_with(input=room, output=tmp_path / "tan", base_level=1)
-    said = refused(input=room, output=tmp_path / "tan")
-    assert re.search(r"tan/room, which exists.*overwrite=true", said)
+    message = refused(input=room, output=tmp_path / "tan")
+    assert re.search(r"tan/room, which exists.*overwrite=true", message)
     again = {"input": room, "output": tmp_path / "tan", "overwrite": True, "format": "jpg"}
     (folder / "notes.txt").write_text("mine")
     before = contents(folder)
@@ -244,14 +246,16 @@ def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Ref
         write_pixels(tmp_path / "in" / name, smooth(32))
     (tmp_path / "in" / "b.png").write_bytes(b"broken")
     write_pixels(tmp_path / "in" / "photo.jpg", np.zeros((30, 40, 3), np.uint8))
-    said = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
-    assert "2 of 4 panoramas could not be rendered" in said
-    assert "in/b.png" in said
-    assert "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice" in said
+    message = refused(input=tmp_path / "in", output=tmp_path / "tan", base_level=0)
+    assert "2 of 4 panoramas could not be rendered" in message
+    assert "in/b.png" in message
+    assert (
+        "in/photo.jpg: found 40 × 30 (width × height); expected a whole panorama, twice" in message
+    )
     assert sorted(path.name for path in (tmp_path / "tan").iterdir()) == ["a", "c"]
     (tmp_path / "tan" / "a" / "face_019.png").unlink()
-    said = refused(back=tmp_path / "tan", output=tmp_path / "back")
-    assert re.search(r"face_019.*1 of 2 panoramas could not", said, re.DOTALL)
+    message = refused(back=tmp_path / "tan", output=tmp_path / "back")
+    assert re.search(r"face_019.*1 of 2 panoramas could not", message, re.DOTALL)
     assert [path.name for path in (tmp_path / "back").iterdir()] == ["c.png"]
 
 
@@ -303,9 +307,9 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
     write_pixels(tmp_path / "whole.png", whole)
     write_pixels(tmp_path / "strip.png", whole[8:24])
     settings = {"base_level": 0, "faces": [9], "colmap": colmap}
-    said = refused(input=tmp_path / "strip.png", output=tmp_path / "none", **settings)
-    assert "crop=[west,east,south,north]" in said
-    assert "tangent-predict with projection=perspective" in said
+    message = refused(input=tmp_path / "strip.png", output=tmp_path / "none", **settings)
+    assert "crop=[west,east,south,north]" in message
+    assert "tangent-predict with projection=perspective" in message
     crop = [-180, 180, -45, 45]
     render_with(input=tmp_path / "strip.png", output=tmp_path / "strip", crop=crop, **settings)
     render_with(input=tmp_path / "whole.png", output=tmp_path / "whole", **settings)
@@ -313,13 +317,13 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
     again = _read(tmp_path / "strip" / images)
     expected = _read(tmp_path / "whole" / images.replace("strip", "whole"))
     np.testing.assert_array_equal(again, expected)
-    said = refused(input=tmp_path / "whole.png", output=tmp_path / "no", crop=crop, **settings)
-    assert "crop: found" in said
+    message = refused(input=tmp_path / "whole.png", output=tmp_path / "no", crop=crop, **settings)
+    assert "crop: found" in message
     if colmap:
         assert not _read(tmp_path / "strip" / "masks" / "face_009" / "strip.png.png").all()
 
 
-# What is refused.
+# Refused settings.
 
 _IN = {"input": "in", "output": "tan"}
 
@@ -328,15 +332,15 @@ _IN = {"input": "in", "output": "tan"}
     ("settings", "message"),
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
-        ({"input": "in"}, "output: found none"),
+        ({"input": "in"}, "output: found null"),
         ({**_IN, "faces": [80]}, "80"),
         ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},
-            "found jpg; .* others change pix",
+            "found jpg; .* other formats change pix",
         ),
         ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
-        ({**_IN, "mask": "in/room.png"}, "none without colmap=true"),
+        ({**_IN, "mask": "in/room.png"}, "null without colmap=true"),
         ({"back": "nowhere", "output": "a.png"}, "no such folder"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],
@@ -354,7 +358,7 @@ def test_settings_that_cannot_work(
     ("changes", "settings", "message"),
     [
         ({"face_003.png": None}, {}, r"found no face_003; expected one file for each"),
-        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*folder of their"),
+        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*cameras="),
         (
             {"face_003.png": (16, 16, 3)},
             {},

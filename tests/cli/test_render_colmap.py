@@ -93,7 +93,7 @@ def test_directions_are_where_colmap_projects_them(project: Path) -> None:
                 colors = shown[rows[inside], columns[inside]] / 127.5 - 1
                 away = angle_deg(colors, directions[seen][inside])
                 assert len(away) > 20
-                assert away.max() < 5  # a pixel's diagonal and the rounding of colours
+                assert away.max() < 5  # a pixel's diagonal and the rounding of colors
                 assert away.mean() < 2
         assert frames == {name: list(range(20)) for name in FRAMES}
 
@@ -102,9 +102,9 @@ def test_sizes_differ_and_one_is_broken(panoramas: Path, tmp_path: Path, refused
     write_pixels(panoramas / "large.png", smooth(128))
     (panoramas / "broken.png").write_bytes(b"broken")
     settings = {"input": panoramas, "colmap": True, "base_level": 0, "faces": [7, 2]}
-    said = refused(output=tmp_path / "tan", **settings)
-    assert "in/broken.png: found no image" in said
-    assert "1 of 4 panoramas could not be rendered" in said
+    message = refused(output=tmp_path / "tan", **settings)
+    assert "in/broken.png: found no image" in message
+    assert "1 of 4 panoramas could not be rendered" in message
     files = {(path.parent.name, path.name): path for path in tmp_path.glob("tan/images/*/*")}
     assert files.keys() == set(product(("face_002", "face_007"), (*FRAMES, "large.png")))
     for file in files.values():
@@ -121,28 +121,28 @@ def test_masks_by_name_and_classes_to_ignore(
 ) -> None:
     labels = np.zeros((32, 64), np.uint8)
     labels[:, :20], labels[:, 20:50] = 1, 3
-    (tmp_path / "labelled").mkdir()
-    (tmp_path / "labelled" / "classes.json").write_text('{"wall": 1, "sky": 2, "person": 3}')
+    (tmp_path / "labeled").mkdir()
+    (tmp_path / "labeled" / "classes.json").write_text('{"wall": 1, "sky": 2, "person": 3}')
     for name, stored in zip(NAMES, (labels, labels[:, ::-1]), strict=True):
-        write_pixels(tmp_path / "labelled" / "labels" / name, stored)
+        write_pixels(tmp_path / "labeled" / "labels" / name, stored)
         write_pixels(tmp_path / "masks" / name, (stored != 3).astype(np.uint8))
     settings = {"input": panoramas, "base_level": 0, "colmap": True}
     render_with(output=tmp_path / "by_name", mask=tmp_path / "masks", **settings)
-    settings["mask"] = tmp_path / "labelled"
+    settings["mask"] = tmp_path / "labeled"
     render_with(output=tmp_path / "by_class", mask_classes=["person", "sky"], **settings)
     by_name, by_class = (contents(tmp_path / name) for name in ("by_name", "by_class"))
     assert by_name == by_class
     first, second = (by_name[f"masks/face_004/{name}.png"] for name in FRAMES)
     assert first != second
-    said = refused(output=tmp_path / "no", mask_classes=["tripod"], **settings)
-    assert "mask_classes: found tripod; expected of wall, sky, person" in said
-    (tmp_path / "labelled" / "labels" / NAMES[1]).unlink()
-    said = refused(output=tmp_path / "some", mask_classes=["person"], **settings)
-    assert "labels/kitchen/room.png: found no such file; expected a mask" in said
+    message = refused(output=tmp_path / "no", mask_classes=["tripod"], **settings)
+    assert "mask_classes: found tripod; expected of wall, sky, person" in message
+    (tmp_path / "labeled" / "labels" / NAMES[1]).unlink()
+    message = refused(output=tmp_path / "some", mask_classes=["person"], **settings)
+    assert "labels/kitchen/room.png: found no such file; expected a mask" in message
     assert list(read_rig(tmp_path / "some" / "rig_config.json").panoramas.values()) == [NAMES[0]]
 
 
-def test_what_a_partial_panorama_does_not_show_is_ignored(tmp_path: Path) -> None:
+def test_the_missing_part_of_a_panorama_is_ignored(tmp_path: Path) -> None:
     tags = {"FullPanoWidth": 128, "FullPanoHeight": 64, "CroppedAreaLeft": 0, "CroppedAreaTop": 16}
     tags |= {"CroppedAreaImageWidth": 128, "CroppedAreaImageHeight": 32}
     xmp = gpano_xmp({f"{name}Pixels": value for name, value in tags.items()})
@@ -208,10 +208,10 @@ def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refuse
     assert not (tmp_path / "poses.json").exists()
 
 
-# What exists, and what is refused.
+# Existing files and refused settings.
 
 
-def test_earlier_projects_are_kept_unless_told(
+def test_earlier_projects_are_kept_without_overwrite(
     project: Path, panoramas: Path, refused: Refused
 ) -> None:
     settings = {"input": panoramas, "output": project, "colmap": True, "base_level": 0}
@@ -225,7 +225,7 @@ def test_earlier_projects_are_kept_unless_told(
     assert contents(project) == before
     render_with(overwrite=True, faces=[3], **settings)
     assert [path.name for path in (project / "images").iterdir()] == ["face_003"]
-    # Its images are no panoramas.
+    # Images of the project are not taken for panoramas.
     tan = project.parent / "tan"
     render_with(input=project.parent, output=tan, base_level=0)
     assert {*tan.rglob("cameras.json")} == {
@@ -236,11 +236,11 @@ def test_earlier_projects_are_kept_unless_told(
 def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
     settings = {"input": panoramas, "output": tmp_path / "out", "colmap": True}
     assert "format: found npy" in refused(format="npy", **settings)
-    assert "figure: found a.png; expected none with colmap" in refused(figure="a.png", **settings)
+    assert "figure: found a.png; expected null with colmap" in refused(figure="a.png", **settings)
     assert "mask_classes: found sky; expected mask=" in refused(mask_classes=["sky"], **settings)
     write_pixels(tmp_path / "mask.jpg", smooth(16))
-    said = refused(mask=tmp_path / "mask.jpg", **settings)
-    assert "mask.jpg: found JPEG or WebP, which blur masks" in said
+    message = refused(mask=tmp_path / "mask.jpg", **settings)
+    assert "mask.jpg: found JPEG or WebP, which blur masks" in message
     write_pixels(panoramas / "hall__room.png", smooth(16))
     assert "hall/room, which is called hall__room too" in refused(**settings)
     assert not (tmp_path / "out").exists()

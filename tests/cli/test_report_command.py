@@ -40,9 +40,9 @@ def test_the_files_hold_the_runs(
     assert "| mine | 70.0 ± 14.1 | 50.0 ± 0.0 | 100.0 of 1 |" in text
     assert "| mine | 60.0 | 20.0 |" in text, "bands of latitude"
     assert f"| mine | 2 | 0 | {runs / '2'} |" in text
-    said = capsys.readouterr().out
+    printed = capsys.readouterr().out
     for words in ("mine: fold 3 missing", f"{runs / 'cut'}: not finished"):
-        assert words in said
+        assert words in printed
         assert words in text
     (tmp_path / "report" / "report.md").unlink()
     run("report", str(runs / "1"))  # a report may be written over

@@ -126,7 +126,7 @@ def test_folders_that_hydra_would_rename_are_refused(
     assert begun == []
 
 
-def test_what_was_there_before_a_refused_run_stays(tmp_path: Path, run: Run) -> None:
+def test_existing_files_stay_when_a_run_is_refused(tmp_path: Path, run: Run) -> None:
     (tmp_path / "mine").mkdir()
     with pytest.raises(SystemExit, match="level: found high"):
         run("train", "level=high", "hydra.run.dir=mine")

@@ -1,4 +1,4 @@
-"""Shards of predictions: each image once, and one result as if there were none."""
+"""Shards of predictions: each image once, and the same result as without shards."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import contents
 from tests.inference.trained import sphere
 
-Told = Callable[..., str]
+RunShard = Callable[..., str]
 NAMES = ("a", "b/a", "b/b", "c", "d", "e", "f")
 
 
 @pytest.fixture
-def told(tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]) -> Told:
-    """Runs the command on seven panoramas, the fifth of which is broken; returns what it says."""
+def run_shard(tmp_path: Path, predict: Predict, capsys: pytest.CaptureFixture[str]) -> RunShard:
+    """Run the command on seven panoramas, of which the fifth is broken; return its output."""
     for number, name in enumerate(NAMES):
         write_pixels(tmp_path / "in" / f"{name}.png", np.roll(sphere(16), number, 1))
     (tmp_path / "in" / "d.png").write_bytes(b"broken")
@@ -48,11 +48,13 @@ def results(folder: str) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("count", [3, 9])
-def test_shards_give_what_one_command_gives(count: int, told: Told) -> None:
-    assert "1 of 7 images could not be used" in told("whole", report=3)
-    broken = ["could not be used" in told("out", n, count, report=3) for n in range(2, count + 1)]
+def test_shards_give_what_one_command_gives(count: int, run_shard: RunShard) -> None:
+    assert "1 of 7 images could not be used" in run_shard("whole", report=3)
+    broken = [
+        "could not be used" in run_shard("out", n, count, report=3) for n in range(2, count + 1)
+    ]
     assert not (Path("out") / "summary.json").exists()
-    assert f"{-(-7 // count)} image" in told("out", 1, count, report=3)
+    assert f"{-(-7 // count)} image" in run_shard("out", 1, count, report=3)
     assert broken.count(True) == (count > 1)
     assert results("out") == results("whole")
     of_shards = [json.loads(text) for text in contents(Path("out/shards")).values()]
@@ -63,8 +65,8 @@ def test_shards_give_what_one_command_gives(count: int, told: Told) -> None:
     assert max(lengths) - min(lengths) <= 1
 
 
-def test_an_interrupted_shard_resumes(told: Told, monkeypatch: pytest.MonkeyPatch) -> None:
-    told("whole")
+def test_an_interrupted_shard_resumes(run_shard: RunShard, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_shard("whole")
 
     def interrupted(path: Path, *args: Any) -> Any:
         if path.name == "e.png":
@@ -72,27 +74,27 @@ def test_an_interrupted_shard_resumes(told: Told, monkeypatch: pytest.MonkeyPatc
         return read_panorama(path, *args)
 
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", interrupted)
-    assert "resume=true continues" in told("out", 2, 2)
+    assert "Continue with resume=true" in run_shard("out", 2, 2)
     monkeypatch.setattr("tangent_train.cli.predict.read_panorama", read_panorama)
     before = {path: path.stat().st_mtime_ns for path in Path("out").rglob("*.png")}
     assert {path.stem for path in before} == {"a", "c"}
-    assert "1 of 2 in all" in told("out", 1, 2, resume="true")
-    assert "shard: found 2/2, which has out/shards/2-of-2.json" in told("out", 2, 2)
-    assert "3 images, 2 done already" in told("out", 2, 2, resume="true")
+    assert "1 of 2 in all" in run_shard("out", 1, 2, resume="true")
+    assert "shard: found 2/2, which has out/shards/2-of-2.json" in run_shard("out", 2, 2)
+    assert "3 images, 2 done already" in run_shard("out", 2, 2, resume="true")
     assert {path: path.stat().st_mtime_ns for path in before} == before
     assert results("out") == results("whole")
-    told("out", 2, 2, resume="true")  # as a scheduler may start it again
+    run_shard("out", 2, 2, resume="true")  # as a scheduler may start it again
     assert results("out") == results("whole")
 
 
 @pytest.mark.parametrize("shard", ["17/16", "0/16", "1/2/3"])
-def test_there_is_no_such_shard(shard: str, told: Told) -> None:
-    assert f"shard: found {shard}; expected 1/16 to 16/16" in told("out", shard=shard)
+def test_there_is_no_such_shard(shard: str, run_shard: RunShard) -> None:
+    assert f"shard: found {shard}; expected number/count, such" in run_shard("out", shard=shard)
     assert not Path("out").exists()
 
 
-def test_shards_that_do_not_belong_together_are_refused(told: Told) -> None:
-    told("out", 1, 3)
+def test_shards_that_do_not_belong_together_are_refused(run_shard: RunShard) -> None:
+    run_shard("out", 1, 3)
     kept = contents(Path("out"))
     changes: dict[str, dict[str, Any]] = {
         "found shards=4 than those of out/shards/1-of-3.json (3)": {"shard": "2/4"},
@@ -100,24 +102,24 @@ def test_shards_that_do_not_belong_together_are_refused(told: Told) -> None:
         "found write=['color'] than": {"write": "[color]"},
         "found images of other names than those of": {"input": "in/b"},
     }
-    for said, settings in changes.items():
-        assert said in told("out", **({"shard": "2/3"} | settings))
-        assert "expected a folder without earlier results" in told("out")
+    for message, settings in changes.items():
+        assert message in run_shard("out", **({"shard": "2/3"} | settings))
+        assert "expected a folder without earlier results" in run_shard("out")
         assert contents(Path("out")) == kept
-    assert "resume: found rotations=2" in told("out", 1, 3, rotations=2, resume="true")
+    assert "resume: found rotations=2" in run_shard("out", 1, 3, rotations=2, resume="true")
     assert contents(Path("out")) == kept
-    told("whole")
-    assert "expected a folder without earlier results" in told("whole", 1, 2)
+    run_shard("whole")
+    assert "expected a folder without earlier results" in run_shard("whole", 1, 2)
 
 
-def test_masked_pixels_are_unknown_and_have_no_share(told: Told) -> None:
+def test_masked_pixels_are_unknown_and_have_no_share(run_shard: RunShard) -> None:
     """The labels are read by another program."""
-    told("plain")
+    run_shard("plain")
     counts = np.ones((16, 32), bool)
     counts[11:], counts[:, 29:], counts[:, :2] = False, False, False
     for name in NAMES:
         write_pixels(Path(f"masks/{name}.png"), counts.repeat(2, 0).repeat(2, 1).astype(np.uint8))
-    told("masked", mask="masks")
+    run_shard("masked", mask="masks")
     for entry in json.loads(Path("masked/summary.json").read_text())["images"]:
         if "error" in entry:
             continue

@@ -125,8 +125,8 @@ def test_loggers_and_plugins_of_the_user_are_used(
     assert isinstance(trainer.strategy.checkpoint_io, AtomicCheckpointIO), "that of every run too"
     assert [logger.save_dir for logger in trainer.loggers] == ["here"]
     assert any(isinstance(one, RichModelSummary) for one in trainer.callbacks)
-    (mine,) = (one for one in trainer.callbacks if isinstance(one, Named))
-    assert mine.given == (None, None), "a callback's own nulls stay"
+    (callback,) = (one for one in trainer.callbacks if isinstance(one, Named))
+    assert callback.given == (None, None), "a callback's own nulls stay"
 
 
 @pytest.mark.parametrize(
@@ -158,5 +158,5 @@ def test_runs_are_named_by_their_folders_and_grouped_by_sweep_and_transfer() -> 
         ("runs/transfer/mine/fold_1/seed_0/P", "transfer/mine/fold_1/seed_0/P", "transfer/mine"),
         ("/somewhere/out/b", "out/b", "out"),
     ):
-        names = trainer_module._names(Path(folder))
+        names = trainer_module._logger_names(Path(folder))
         assert names == {"name": name, "run_name": name, "group": group}

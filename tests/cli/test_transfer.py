@@ -108,7 +108,7 @@ def test_a_folder_of_other_settings_or_files_is_refused(runs: PretendedRuns) -> 
     (OF_SEED_0 / "S-FT-1" / "thesis.tex").touch()
     with pytest.raises(REFUSED, match="S-FT-1: found files that tangent-transfer did not write"):
         run_transfer()
-    assert len(runs.started) == before, "said before anything is run"
+    assert len(runs.started) == before, "refused before anything is run"
 
 
 def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedRuns) -> None:
@@ -123,7 +123,7 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
         run_transfer("compare=[erp]", "fine_tuning.epochs=[]")
 
 
-def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
+def test_a_network_without_a_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
     network = write_checkpoint(tmp_path / "photo.ckpt")
     class_map = tmp_path / "map.json"
     class_map.write_text('{"classes": {"floor": ["dark"]}}')
@@ -158,7 +158,7 @@ def test_a_network_that_knows_no_run_is_only_evaluated(runs: PretendedRuns, tmp_
     with pytest.raises(REFUSED, match=r"seed_0/P: found stage P of another .* class map; expected"):
         run_transfer(*arguments)
     for typed in ("optimizer.lr=1", "network.widths=[4]", "fine_tuning.epochs=[1]"):
-        with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training beside"):
+        with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training with"):
             run_transfer(*arguments, typed)
 
 
@@ -166,7 +166,7 @@ def test_the_study_of_the_angular_resolution(runs: PretendedRuns) -> None:
     run_transfer("study_levels=[4,6]")
     files = {path.name for path in HERE.glob("angular_resolution.*")}
     assert files == {f"angular_resolution.{suffix}" for suffix in ("md", "csv", "png")}
-    assert "against level 4" in (HERE / "angular_resolution.md").read_text()
+    assert "from level 4" in (HERE / "angular_resolution.md").read_text()
 
 
 def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> None:
@@ -176,5 +176,5 @@ def test_a_given_network_is_not_trained(runs: PretendedRuns, tmp_path: Path) -> 
     run_transfer(*arguments)
     assert runs.started[:2] == [("evaluate", "P"), ("evaluate", "S")]
     assert runs.configs[0].checkpoint == runs.configs[2].init_from == str(given)
-    with pytest.raises(REFUSED, match=r"testing on fold 1.*; expected folds=\[1\]"):
+    with pytest.raises(REFUSED, match=r"trained on all folds but fold 1.*; expected folds=\[1\]"):
         run_transfer(*arguments, "folds=[1,2]")

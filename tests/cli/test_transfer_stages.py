@@ -33,7 +33,7 @@ def rooms() -> DictConfig:
 
 @pytest.fixture(autouse=True, scope="module")
 def _hydra() -> Any:
-    """What a command finds of Hydra, with the default options."""
+    """Set Hydra's config to that of a command with the default options."""
     HydraConfig.instance().set_config(composed("transfer", return_hydra_config=True))
 
 
@@ -80,7 +80,7 @@ def test_fine_tuning_takes_a_tenth_of_the_rate(rooms: DictConfig) -> None:
     assert tuned["trainer"]["max_epochs"] == 10
     assert (first["optimizer"]["lr"], first["trainer"]["max_epochs"]) == (3e-3, 20)
     assert first["scheduler"]["_target_"].endswith("OneCycleLR")
-    with pytest.raises(SettingError, match=r"fine_tuning\.optimizer\.lr: found null, a tenth"):
+    with pytest.raises(SettingError, match=r"fine_tuning\.optimizer\.lr: found null \(a tenth"):
         _stages(rooms, optimizer__lr=None)
 
 
@@ -117,10 +117,10 @@ def test_photos_are_needed_to_train_on_but_not_to_test_a_given_network() -> None
 
 def test_the_plan_for_networks_of_photos() -> None:
     config = composed("transfer", "experiment=zero_shot", "checkpoint=/net.onnx")
-    own = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
+    tangent = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
     size = {"base_level": 0, "level": 9, "dim": 512, "levels": [9, 8]}
-    trained = trained_network(own | size, fixed_size=(512, 512), photo_level=10)
-    stages = _stages(config, trained, representation=own | size)
+    trained = trained_network(tangent | size, fixed_size=(512, 512), photo_level=10)
+    stages = _stages(config, trained, representation=tangent | size)
     assert len(stages) == (1 + len(config.compare)) * len(config.conditions)
     for stage in stages.values():
         made = build_from_config(stage.config["representation"], "representation")
@@ -171,7 +171,7 @@ def test_data_without_folds() -> None:
         ("class_map", "my_map.json"),
     ],
 )
-def test_impossible_settings(rooms: DictConfig, setting: str, value: Any) -> None:
+def test_impossible_settings_are_refused(rooms: DictConfig, setting: str, value: Any) -> None:
     changes: dict[str, Any] = {setting.replace(".", "__"): value}
     with pytest.raises(SettingError, match=rf"^{setting}: found"):
         _stages(rooms, **changes)

@@ -59,7 +59,7 @@ def results(folder: Path) -> dict[str, Any]:
 
 
 def predicted(folder: Path) -> dict[str, Any]:
-    """The entries of a ``summary.json`` by name; none if there is none."""
+    """Return the entries of a ``summary.json`` by name; empty without the file."""
     path = folder / "summary.json"
     images = json.loads(path.read_text())["images"] if path.exists() else []
     return {entry["name"]: entry for entry in images}

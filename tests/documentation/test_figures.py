@@ -117,10 +117,7 @@ def is_found(figure: str, files: list[str]) -> bool:
     return any(number.search(cell) for rows in tables for row in rows for cell in row)
 
 
-TO_DO = {"README"}
-"""Pages without data files so far."""
-
-PAGES = [page for page in sorted(RESULTS.glob("*.md")) if page.stem not in TO_DO]
+PAGES = sorted(RESULTS.glob("*.md"))
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
@@ -143,7 +140,6 @@ def test_every_data_file_is_shown() -> None:
     assert sorted(shown) == sorted(path.name for path in DATA.glob("*.csv"))
 
 
-@pytest.mark.skipif("README" in TO_DO, reason="to do")
 def test_figures_of_the_readme_are_in_the_data() -> None:
     for text, files in blocks((ROOT / "README.md").read_text(encoding="utf-8")):
         if SCORE.search(text) or text.startswith("|") or files:

@@ -62,7 +62,7 @@ def test_a_margin_shows_what_is_beyond_the_face() -> None:
     np.testing.assert_allclose(
         wide.directions()[:, 3:-3, 3:-3], plain.directions(), rtol=0, atol=1e-14
     )
-    assert (wide.pitch, wide.overlapping, plain.overlapping) == (plain.pitch, True, False)
+    assert (wide.pitch, wide.is_overlapping, plain.is_overlapping) == (plain.pitch, True, False)
     directions = random_directions(500)
     np.testing.assert_array_equal(wide.owners(directions), plain.owners(directions))
     for margin in (-1, 7, 0.5):

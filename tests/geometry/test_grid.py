@@ -90,7 +90,7 @@ def test_a_resized_grid_has_other_pixels(original: CubeGrid | TangentGrid, dim: 
     assert grid.dim == dim
     assert grid.dim * grid.pitch == pytest.approx(original.dim * original.pitch, rel=1e-15)
     assert grid.num_images == original.num_images
-    assert grid.overlapping is original.overlapping
+    assert grid.is_overlapping is original.is_overlapping
     np.testing.assert_array_equal(grid.rotation, original.rotation)
     np.testing.assert_array_equal(grid.neighbors, original.neighbors)
     np.testing.assert_array_equal(grid.world_from_camera, original.world_from_camera)

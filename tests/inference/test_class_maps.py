@@ -76,7 +76,7 @@ def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:
 @pytest.mark.parametrize("nothing", [None, [6]], ids=["all", "nothing"])
 @pytest.mark.parametrize("unmapped", ["unknown", "never"])
 def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] | None) -> None:
-    """Against NumPy: labels, and the shares of the classes in what may win."""
+    """Labels and probabilities agree with NumPy."""
     names = ["bed", "wall", "painting", "floor", "sky", "tree"]
     groups = None if nothing is None else [*([k] for k in range(6)), nothing]
     given = ClassMap("m", None, {"wall": ["painting", "wall"], "beam": ["rafter"],

@@ -23,7 +23,7 @@ from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import SUFFIXES, export_network
 from tests.inference.trained import TANGENT
-from tests.tasks.odd_networks import assert_same, own, scores_of, some_images
+from tests.tasks.odd_networks import assert_same, config_section, scores_of, some_images
 from tests.tasks.small_networks import NAMES, UNET, small_trained
 
 
@@ -35,7 +35,7 @@ def trained() -> TrainedNetwork:
 
 @pytest.fixture(scope="module")
 def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """It as files by suffix, not to be changed."""
+    """Its exported files by suffix; tests must not change them."""
     folder = tmp_path_factory.mktemp("exported")
     paths = {suffix: folder / f"net{suffix}" for suffix in SUFFIXES}
     for path in paths.values():
@@ -44,7 +44,7 @@ def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> 
 
 
 def _metadata(path: Path) -> Any:
-    """Read without this package's own code."""
+    """Run a file without code of this package."""
     if path.suffix == ".onnx":
         return json.loads(onnx.load(path).metadata_props[0].value)
     with safe_open(path, "numpy") as file:
@@ -83,6 +83,7 @@ def test_everything_known_of_a_network_comes_back(
         "image_size": [32, 32],
         "size_multiple": 4,
         "fixed_size": None,
+        "photo_level": None,
         "groups": None,
         "score_kind": "logits",
         "settings": UNET if suffix == ".safetensors" else None,
@@ -96,10 +97,10 @@ def test_tensors_keep_their_names_for_other_programs(tmp_path: Path) -> None:
     path = tmp_path / "net.safetensors"
     export_network(trained, path)
     assert isinstance(trained.inner, UNet)
-    own = trained.inner.state_dict()
+    config_section = trained.inner.state_dict()
     written = load_file(path)
-    assert written.keys() == own.keys()
-    for name, tensor in own.items():
+    assert written.keys() == config_section.keys()
+    for name, tensor in config_section.items():
         np.testing.assert_array_equal(written[name], tensor.numpy())
     assert initialize(UNet(4, 4, (4, 8, 8)), path).share == 1  # what init_from= does
 
@@ -107,7 +108,7 @@ def test_tensors_keep_their_names_for_other_programs(tmp_path: Path) -> None:
 def test_only_a_safetensors_file_can_be_exported_again(
     files: dict[str, Path], tmp_path: Path
 ) -> None:
-    trained, trust = small_trained(own("Tied")), own("Tied").values()
+    trained, trust = small_trained(config_section("Tied")), config_section("Tied").values()
     export_network(trained, tmp_path / "net.safetensors")
     export_network(load_trained(tmp_path / "net.safetensors", trust), tmp_path / "net.onnx")
     images = some_images(trained, 2, (32, 36))
@@ -132,10 +133,10 @@ def test_networks_that_are_hard_to_export_are_exported(
 ) -> None:
     """Tied tensors; one size only; sizes that cannot be dynamic in ONNX are in the file."""
     image_size = fixed or (32, 32)
-    trained = small_trained(own(network), image_size=image_size)
+    trained = small_trained(config_section(network), image_size=image_size)
     path = tmp_path / f"net{suffix}"
     export_network(trained, path)
-    again = load_trained(path, own(network).values())
+    again = load_trained(path, config_section(network).values())
     dynamic = network == "TwoSizes" and suffix == ".safetensors"
     assert (again.fixed_size, again.image_size) == (None if dynamic else fixed, image_size)
     images = some_images(trained, 3, size)
@@ -145,7 +146,7 @@ def test_networks_that_are_hard_to_export_are_exported(
 
 
 def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
-    trained = small_trained(own("Tied"))
+    trained = small_trained(config_section("Tied"))
     path = tmp_path / "net.onnx"
     export_network(trained, path, image_size=(7, 9), opset=18)
     again = load_trained(path)
@@ -169,7 +170,7 @@ def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
 def test_files_that_compute_other_scores_are_refused(
     network: str, message: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    trained = small_trained(own(network))
+    trained = small_trained(config_section(network))
     path = tmp_path / "net.onnx"
     path.write_text("before")
     with pytest.raises(SettingError, match=message):

@@ -23,7 +23,7 @@ AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 class Sky(nn.Module):
-    """Sure of bright pixels in the upper half of an image and of dark ones in the lower half."""
+    """Confident for bright pixels in the upper half of an image and dark ones in the lower half."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -37,7 +37,7 @@ class Sky(nn.Module):
 
 
 class WholeSky(Sky):
-    """The same, given all images of a sphere and where they look."""
+    """The same, with all images of a sphere and their viewing rays."""
 
     def forward(self, images: Tensor, rays: Tensor, **_: Any) -> Tensor:  # type: ignore[override]
         assert rays.shape == (1, len(images), 3, 3)

@@ -221,7 +221,7 @@ def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
 
 
 def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
-    """Missing where 0 or NaN; in 16-bit files of 1/512 m it is exactly the same."""
+    """Depth is missing where 0 or NaN; 16-bit files in steps of 1/512 m give equal results."""
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt", TANGENT, channels=4))
     panorama = sphere(32)
     steps = np.random.default_rng(0).integers(0, 2000, (32, 64), np.uint16)
@@ -267,7 +267,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
         (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*fov=.*crop="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
-        (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB of 0 to 255"),
+        (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB from 0 to 255"),
         (_RGB[:0, :0], r"\(0, 0, 3\)"),
         ("room.jpg", "room.jpg: found .*No such file"),
         (Image.new("F", (32, 16)), r"image: found float32 .*; expected colou?rs"),

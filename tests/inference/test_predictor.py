@@ -155,7 +155,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
 
 
 def test_elevation_follows_the_zenith() -> None:
-    """A network that sees nothing but elevation: up is one class, down another."""
+    """A network that only uses elevation: up is one class, down another."""
     network = torch.nn.Conv2d(4, 3, 1)
     with torch.no_grad():
         network.weight.zero_()
@@ -184,7 +184,7 @@ def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
 def test_panoramas_of_any_size_get_labels_of_their_size(
     representation: dict[str, Any], height: int
 ) -> None:
-    """Smooth colors: the labels are those of a network that sees every pixel."""
+    """With smooth colors, labels equal those of a network applied to each pixel."""
     rgb = sphere(height)
     labels = _labels(trained_network(representation), InputImage(rgb))
     assert labels.shape == (height, 2 * height)
@@ -193,7 +193,7 @@ def test_panoramas_of_any_size_get_labels_of_their_size(
 
 
 def test_a_larger_panorama_is_shrunk_without_aliasing() -> None:
-    """A checkerboard finer than the network's pixels looks gray."""
+    """A checkerboard finer than the network's pixels becomes gray."""
     board = (np.indices((128, 256)).sum(axis=0) % 2 * 255).astype(np.uint8)
     rgb = cv2.cvtColor(board, cv2.COLOR_GRAY2RGB)
     trained = trained_network(TANGENT)
@@ -256,7 +256,7 @@ def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
 def test_photos_with_the_networks_pixels_are_labeled_pixel_by_pixel(
     blend: str, channels: int, size: tuple[int, int]
 ) -> None:
-    """Crops that lie on the photo's pixels, a network of single pixels: nothing may move."""
+    """Crops aligned with the photo's pixels and a network without context: labels must not move."""
     network = color_network(channels, kernel=1)
     trained = trained_network(PERSPECTIVE, channels, inner=network)
     pixel = 2 * math.tan(math.radians(22.5)) / 24
@@ -291,7 +291,7 @@ def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> Non
 
 
 def test_a_photo_of_a_telescope_needs_little_memory() -> None:
-    """Far smaller than a crop: mirrored at full resolution it would have 14,000² pixels."""
+    """The photo is far smaller than a crop: mirrored at full resolution it has 14,000² pixels."""
     trained = trained_network(PERSPECTIVE, inner=color_network(kernel=1))
     rgb = np.zeros((600, 800, 3), np.uint8)
     rgb[:, 400:] = 255

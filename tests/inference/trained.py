@@ -32,7 +32,7 @@ def sphere(height: int) -> NDArray[np.uint8]:
 
 
 def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:
-    """Scores that tell dark, green and bright apart."""
+    """A network whose scores distinguish dark, green and bright."""
     generator = torch.Generator().manual_seed(0)
     network = nn.Conv2d(channels, 3, kernel, padding=kernel // 2, padding_mode="replicate")
     with torch.no_grad():
@@ -49,7 +49,7 @@ def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:
 def trained_network(
     representation: dict[str, Any], channels: int = 3, **changes: Any
 ) -> TrainedNetwork:
-    """A network that has been trained with this representation."""
+    """Return a network trained with a representation."""
     settings = {
         "inner": color_network(channels),
         "class_names": CLASS_NAMES,
@@ -65,7 +65,7 @@ def trained_network(
 def write_checkpoint(
     path: Path, representation: dict[str, Any] = TANGENT, channels: int = 3
 ) -> Path:
-    """The checkpoint of such a network, as `tangent-train` writes it."""
+    """Write a checkpoint of such a network, as `tangent-train` does."""
     trained = trained_network(representation, channels)
     network = {"_target_": "torch.nn.Conv2d", "in_channels": None, "out_channels": 3}
     network |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}

@@ -74,7 +74,7 @@ def panorama_position(lonlat: Array, shape: tuple[int, int]) -> tuple[Array, Arr
 
 
 def panorama_row(image: Array, row: NDArray[np.int64], column: Array) -> Array:
-    """Linear along a row. A row beyond a pole is the same row on the other side, half a turn on."""
+    """Interpolate linearly along a row. A row beyond a pole continues half a revolution further."""
     height, width = image.shape[:2]
     beyond = (row < 0) | (row >= height)
     column = np.where(beyond, column + width / 2, column)
@@ -85,7 +85,7 @@ def panorama_row(image: Array, row: NDArray[np.int64], column: Array) -> Array:
 
 
 def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
-    """``(H, W, C)`` at ``(..., 2)`` -> ``(..., C)``."""
+    """Sample ``(H, W, C)`` at ``(..., 2)``; returns ``(..., C)``."""
     height, width = image.shape[:2]
     row, column = panorama_position(lonlat, (height, width))
     if interpolation == "nearest":
@@ -98,7 +98,7 @@ def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
 
 
 def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
-    """``(N, d, d, C)`` bilinear; off the outermost pixel centers their values continue."""
+    """Sample ``(N, d, d, C)`` bilinearly, clamped to the outermost pixel centers."""
     dim = images.shape[1]
     row, column = np.clip(row, 0, dim - 1), np.clip(column, 0, dim - 1)
     top = np.minimum(np.floor(row), dim - 2).astype(int)
@@ -112,7 +112,7 @@ def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Ar
 
 @dataclass(frozen=True)
 class ReferenceGrid:
-    """All tangent images; `rotation` rotates the icosahedron."""
+    """All tangent images of a panorama; `rotation` rotates the icosahedron."""
 
     base_level: int
     level: int

@@ -1,4 +1,4 @@
-"""Functions of images applied to panoramas: those of `equirect_to_tangent` and back."""
+"""Functions of images applied to panoramas agree with rendering forth and back."""
 
 from __future__ import annotations
 

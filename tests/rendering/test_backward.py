@@ -26,7 +26,7 @@ def test_arrays_that_float32_cannot_hold_are_exact(blend: Any, value: Any) -> No
 
 @pytest.mark.parametrize(("base_level", "shape"), [(0, (31, 63)), (1, (32, 64)), (3, (31, 63))])
 def test_one_class_covers_the_whole_panorama(base_level: int, shape: tuple[int, int]) -> None:
-    """No other value anywhere: not at the poles, not at the seam, not between images."""
+    """There are no other values at the poles, at the seam, or between images."""
     grid = TangentGrid(base_level, base_level + 4)
     panorama = np.full(shape, 3, np.uint8)
     for interpolation in ("nearest", "bilinear"):

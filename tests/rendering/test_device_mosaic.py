@@ -1,4 +1,4 @@
-"""The torch backend of mosaics: equal to the compiled one, and on one device alone."""
+"""The torch backend of mosaics agrees with the compiled one and stays on one device."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def _filled(
 
 
 def _scores(sets: Any, classes: int) -> list[torch.Tensor]:
-    """Smooth over the images, as those of a network."""
+    """Return scores that are smooth over the images, like those of a network."""
     generator = torch.Generator().manual_seed(0)
     found = []
     for views in sets:

@@ -1,4 +1,4 @@
-"""Scores put together image by image, against those rendered all at once."""
+"""Scores accumulated image by image, against those rendered in one call."""
 
 from __future__ import annotations
 

@@ -81,12 +81,12 @@ def pair_of(case: Case) -> Pair:
 
 
 def noise(*shape: int, seed: int = 0) -> Array:
-    """White noise in 0 to 1: any pixel fetched from a wrong place shows."""
+    """White noise from 0 to 1, which reveals each pixel from a wrong position."""
     return np.random.default_rng(seed).random(shape)
 
 
 def waves(shape: tuple[int, int]) -> Array:
-    """A smooth panorama ``(H, W, 3)`` in 0 to 1, smooth across the seam and the poles too."""
+    """A panorama ``(H, W, 3)`` from 0 to 1, smooth also across the seam and the poles."""
     x, y, z = np.moveaxis(to_xyz(panorama_lonlat(shape)), -1, 0)
     channels = [np.sin(4 * x + y), np.cos(3 * y - 2 * z), np.sin(5 * z + 2 * x * y)]
     return np.asarray((np.stack(channels, axis=-1) + 1) / 2)

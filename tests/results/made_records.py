@@ -37,11 +37,11 @@ def made_record(
     bands: Sequence[float] = (),
     **settings: Any,
 ) -> Record:
-    """All scores of a class the same, the means those of the classes that are there.
+    """Make a record with one value for all scores of a class, and the means of these.
 
     Args:
-        scores: Of the classes.
-        names: Of the classes.
+        scores: Score of each class.
+        names: Name of each class.
         bands: Score of each band.
         settings: Changes of `SETTINGS`, two underscores for a point.
     """

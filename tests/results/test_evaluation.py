@@ -92,7 +92,7 @@ def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
 
 
 def test_classes_of_no_pixel_are_left_out_of_the_table() -> None:
-    """Neither labelled nor predicted, and without a score that counts in the mean."""
+    """Neither labeled nor predicted, and without a score that counts in the mean."""
     predicted = _matrices({(1, 1): 90, (1, 3): 10, (2, 2): 50})
     shown = {
         "skip": _record(),
@@ -121,11 +121,14 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     assert headline(plain) == "mAcc 46.7\u00a0%, mIoU 35.2\u00a0% over 7 photos"
 
 
-def test_means_over_fewer_classes_say_so() -> None:
-    """Of labels that have one class, 100 % mIoU is not that of all."""
+def test_means_over_fewer_classes_have_a_note() -> None:
+    """100 % mIoU of labels with one class is not the mean over all classes."""
     few = _record(_matrices({(1, 1): 90}))
     assert headline(few).endswith(" over 7 panoramas, 1 of 3 classes")
-    assert result_tables(few)[0].note == "Means without classes that no label has: floor, =sofa."
+    assert (
+        result_tables(few)[0].note
+        == "Means without classes that do not occur in the labels: floor, =sofa."
+    )
     as_zero = _record(_matrices({(1, 1): 90}), "zero")
     assert headline(as_zero).endswith(" over 7 panoramas")
     assert result_tables(as_zero)[0].note == ""
@@ -134,7 +137,7 @@ def test_means_over_fewer_classes_say_so() -> None:
 def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     """Two images, of one class each: a draw has either, or both."""
     of_images = np.zeros((2, 2, 3, 3))
-    of_images[0, :, :, 0] = [100, 100, 90]  # labelled, predicted, hits
+    of_images[0, :, :, 0] = [100, 100, 90]  # labeled, predicted, hits
     of_images[1, 0, :, 1] = [100, 100, 50]
     of_images[1, 1, :, 1] = [10, 10, 4]
     record = _record(_matrices()._replace(of_images=of_images))
@@ -168,7 +171,7 @@ def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
 
 
 def test_the_heat_map_has_shares_of_the_true_class() -> None:
-    """Of which those predicted as unknown are a part."""
+    """The shares include pixels predicted as unknown."""
     matrices = _matrices({(1, 0): 10, (1, 1): 65, (1, 2): 25, (2, 2): 7})
     table = confusion_table(_record(matrices))
     assert table.shades == [[0.65, 0.25, 0], [0, 1, 0], [0, 0, 0]]

@@ -16,7 +16,7 @@ def test_an_overlay_keeps_the_hues_of_the_classes() -> None:
     labels[5] = 0
     mixed = mixed_picture(rgb, labels, 3).astype(float)
     colors = class_colors(3)[labels].astype(float)
-    light = 2 * mixed - colors  # grey, but for rounding
+    light = 2 * mixed - colors  # gray, but for rounding
     inside = labels > 0
     inside[2, 3:] = inside[2:5, 3] = False
     assert np.ptp(light[inside], axis=-1).max() <= 2

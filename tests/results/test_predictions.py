@@ -62,7 +62,7 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
 
 
 def test_pixels_of_photos_count_by_their_solid_angle() -> None:
-    """Of 90°: ∫∫ (1 + x² + y²)^(−3/2) over a rectangle, by the arctangents of its corners."""
+    """A photo of 90°: ∫∫ (1 + x² + y²)^(−3/2) over a rectangle, by arctangents of its corners."""
     size = (200, 200)
     image = InputImage(
         np.zeros((*size, 3), np.uint8), camera_matrix=camera_matrix_from_fov(90.0, size)

@@ -81,8 +81,8 @@ def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
     assert set(cells) == {
         "tangent images (paper)", "Tateno et al. (paper)", "Lee et al. (paper)", "mine",
     }  # fmt: skip
-    ours = cells["tangent images (paper)"]
-    assert (ours["b"], ours["mAcc %"], ours["mIoU %"]) == ("0", "59.1", "44.9")
+    published = cells["tangent images (paper)"]
+    assert (published["b"], published["mAcc %"], published["mIoU %"]) == ("0", "59.1", "44.9")
     assert cells["Lee et al. (paper)"]["mIoU %"] == "–"
     per_class = _cells(report, 1)["tangent images (paper)"]
     assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
@@ -129,7 +129,7 @@ def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> N
     assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
 
 
-def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
+def test_reports_of_shapes_name_their_rotations() -> None:
     classes = [{"class": name, "images": 3, "accuracy": 0.5} for name in MODELNET40]
     settings = {
         "data._target_": "datamodules.ModelNet40",
@@ -145,7 +145,7 @@ def test_shapes_are_told_apart_by_how_they_were_rotated() -> None:
     cells = _cells(_runs_report(record))
     assert cells["shapes"]["rotated in training / test"] == "z / SO3"
     assert cells["shapes"]["accuracy %"] == "80.0"
-    assert cells["shapes"]["mean of the classes %"] == "70.0"
+    assert cells["shapes"]["mean over classes %"] == "70.0"
     assert cells["tangent images (paper)"]["accuracy %"] == "89.1"
     assert len(cells) == 5
 

@@ -47,7 +47,7 @@ def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[Record])
 
 
 @pytest.mark.parametrize("name", ["miou", "miou_solid_angle"])
-def test_what_is_kept_is_the_ratio_of_the_means_over_what_both_have(name: str) -> None:
+def test_the_change_is_the_ratio_of_the_means_over_shared_runs(name: str) -> None:
     """Panoramas compared with photos, two folds of two seeds."""
     photos = {(2, 0): 0.8, (1, 0): 0.4, (1, 1): 0.6, (2, 1): 0.8, (3, 0): 0.1}
     sphere = {(1, 1): 0.5, (1, 0): 0.3, (2, 1): 0.7, (2, 0): 0.9, (3, 1): 0.9}

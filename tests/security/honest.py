@@ -29,10 +29,10 @@ def composed(arguments: list[str]) -> dict[str, Any]:
 
 
 def settled(
-    path: Path, *said: str, root: str | None = "rooms"
+    path: Path, *overrides: str, root: str | None = "rooms"
 ) -> tuple[dict[str, Any], SettingsFile]:
     """The settings of ``tangent-evaluate checkpoint=<path> …``, and where they come from."""
-    typed = [*said, *([] if root is None else [f"data.root={root}"])]
+    typed = [*overrides, *([] if root is None else [f"data.root={root}"])]
     stored = stored_run("evaluate", [f"checkpoint={path}", *typed])
     assert isinstance(stored, StoredRun)
     return stored.settings(composed(stored.arguments))

@@ -26,7 +26,9 @@ def _flip(path: Path, number: bytes, bit: int) -> None:
 
 @pytest.mark.parametrize("bit", [0, 12, 31])
 @pytest.mark.parametrize("name", ["x.ckpt", "x.safetensors", "x.onnx"])
-def test_networks(name: str, bit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_damaged_networks_are_refused(
+    name: str, bit: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     path = write_checkpoint(tmp_path / "x.ckpt")
     if name != path.name:

@@ -32,7 +32,7 @@ _HUGGINGFACE = (
 )
 """Configs of transformers that ask for something on the hub."""
 
-_WITHOUT_NETWORK = [said for said in SETTINGS if not said.startswith("network")]
+_WITHOUT_NETWORK = [message for message in SETTINGS if not message.startswith("network")]
 _CHECKPOINT = "theirs/checkpoints/last.ckpt"
 
 Use = Callable[..., None]
@@ -49,11 +49,11 @@ def use(run: Path, forbidden: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
         with watched(forbidden) as happened, pytest.raises(SystemExit) as ended:
             run_command(monkeypatch, command, *arguments)
         assert happened == []
-        said = str(ended.value)
-        assert said.startswith(f"tangent-{command}: ")
-        assert "theirs" in said or "network.config" in said
-        assert found in said
-        assert "\n" not in said
+        message = str(ended.value)
+        assert message.startswith(f"tangent-{command}: ")
+        assert "theirs" in message or "network.config" in message
+        assert found in message
+        assert "\n" not in message
 
     return refused
 
@@ -81,7 +81,7 @@ def _plain_attack(config: dict[str, Any]) -> dict[str, Any]:
         ("transfer", (f"checkpoint={_CHECKPOINT}", "data.root=rooms", "folds=[1]")),
     ],
 )
-def test_checkpoints(
+def test_hostile_checkpoints_are_refused(
     command: str, arguments: tuple[str, ...], content: dict[str, Any], use: Use
 ) -> None:
     Path(_CHECKPOINT).parent.mkdir(parents=True)
@@ -98,7 +98,7 @@ def test_checkpoints(
 
 
 def noted(note: str, **settings: Any) -> TangentRepresentation:
-    """A representation of the user's own."""
+    """A representation that the user defines."""
     del note
     return TangentRepresentation(**settings)
 
@@ -107,25 +107,28 @@ def test_a_transfer_interpolates_nothing_of_a_file(run: Path, use: Use) -> None:
     """Its stages are configs; here with a class that the user trusts."""
     with safe_open(run.parent / "net.safetensors", "pt") as file:
         described = json.loads(file.metadata()[METADATA_KEY])
-    own = {"_target_": f"{__name__}.noted", "note": f"${{oc.create:{{_target_: {CANARY}.fire}}}}"}
-    described["representation"] |= own
+    section = {
+        "_target_": f"{__name__}.noted",
+        "note": f"${{oc.create:{{_target_: {CANARY}.fire}}}}",
+    }
+    described["representation"] |= section
     text = json.dumps(described)
     save_file(load_file(run.parent / "net.safetensors"), "theirs.safetensors", {METADATA_KEY: text})
     arguments = ("checkpoint=theirs.safetensors", "data.root=rooms", f"trust={__name__}.noted")
     use("expected no ${…} in it", "transfer", *arguments)
 
 
-def test_results(run: Path, use: Use) -> None:
+def test_hostile_results_are_refused(run: Path, use: Use) -> None:
     shutil.copytree(run, "theirs", ignore=shutil.ignore_patterns("checkpoints", "tensorboard"))
     settings = Path("theirs/config.yaml").read_text()
     Path("theirs/config.yaml").write_text(yaml.safe_dump(_attack(yaml.safe_load(settings))))
     use("the name 'data.mask' in settings", "report", "theirs")
     Path("theirs/config.yaml").write_text(f"{settings}\ndata: {{_target_: {CANARY}.fire}}\n")
-    use("a name twice among", "report", "theirs")
+    use("a repeated name among", "report", "theirs")
     Path("theirs/config.yaml").write_text(settings)
     results = Path("theirs/results.json").read_text()
     Path("theirs/results.json").write_text(results.replace("{", '{"classes": [], ', 1))
-    use("'classes' is there twice", "report", "theirs")
+    use("'classes' is repeated", "report", "theirs")
 
 
 def test_results_of_keypoints(use: Use, run: Path) -> None:
@@ -134,7 +137,7 @@ def test_results_of_keypoints(use: Use, run: Path) -> None:
     Path("theirs").mkdir()
     Path("theirs/results.json").write_text('{"settings": {}, "rows": [], "rows": [{"pair": "a"}]}')
     pair = (f"left={panorama}", f"right={panorama}")
-    use("'rows' is there twice", "keypoints", *pair, "output=theirs", "base_level=[0]", "level=5")
+    use("'rows' is repeated", "keypoints", *pair, "output=theirs", "base_level=[0]", "level=5")
 
 
 @pytest.mark.parametrize("network", ["huggingface", "smp", "onnx"])
@@ -147,7 +150,7 @@ def test_networks_of_other_libraries(network: str, use: Use) -> None:
     suffix = "onnx" if network == "onnx" else "ckpt"
     write_linear(Path("net.onnx"), np.zeros((2, 3), np.float32), np.zeros(2, np.float32))
     arguments = (f"network={network}", source, *given, f"output=ours.{suffix}")
-    use("'0' is there twice", "import", *arguments)
+    use("'0' is repeated", "import", *arguments)
     if network == "huggingface":
         labels = {"id2label": {"0": "wall", "1": "floor"}}
         for config, found in _HUGGINGFACE:

@@ -28,7 +28,7 @@ def _depth(path: Path) -> Any:
 
 
 def _png(path: Path, width: int, height: int) -> Path:
-    """A file of 16 bits a pixel that says it has this size."""
+    """Write a file with 16 bits per pixel whose header has this size."""
     Image.new("I;16", (1, 1)).save(path, format="PNG")
     content = path.read_bytes()
     path.write_bytes(sealed_png(content[:16] + struct.pack(">II", width, height) + content[24:]))

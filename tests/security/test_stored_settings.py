@@ -30,7 +30,9 @@ _FIRE = f"{CANARY}.fire"
 _UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}
 
 
-def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidden: Path) -> None:
+def test_settings_of_this_machine_are_not_taken_from_a_file(
+    content: dict[str, Any], forbidden: Path
+) -> None:
     """Compiler options, folders and the number of processes."""
     options = {"options": {"cxx": f"sh -c 'id > {forbidden}/x'"}}
     config = content["config"]
@@ -54,23 +56,27 @@ def test_what_concerns_this_machine_is_its_own(content: dict[str, Any], forbidde
     assert not {"strategy", "num_nodes", "model_registry", "max_time"} & settings["trainer"].keys()
     with pytest.raises(SettingError, match=r"data\.root: found .*The run had data\.root="):
         settled(path, root=None)
-    own = with_config(content, forbidden.parent, data=config["data"] | {"root": "data/rooms_demo"})
-    assert settled(own, root=None)[0]["data"]["root"] == "data/rooms_demo", "as one's own config"
+    changed_path = with_config(
+        content, forbidden.parent, data=config["data"] | {"root": "data/rooms_demo"}
+    )
+    assert settled(changed_path, root=None)[0]["data"]["root"] == "data/rooms_demo", (
+        "as one's own config"
+    )
 
 
 def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
     content: dict[str, Any], tmp_path: Path
 ) -> None:
-    def masked(mask: Any, *said: str) -> tuple[Any, SettingsFile]:
+    def masked(mask: Any, *text: str) -> tuple[Any, SettingsFile]:
         data = content["config"]["data"] | {"mask": mask}
-        settings, source = settled(with_config(content, tmp_path, data=data), *said)
+        settings, source = settled(with_config(content, tmp_path, data=data), *text)
         return settings["data"]["mask"], source
 
     assert masked(-60)[0] == -60
     assert masked(-60, "data.mask=null")[0] is None
     mask, source = masked(-60, "data.mask=pole.png")
     assert (mask, source.gave("data.mask")) == ("pole.png", False)
-    with pytest.raises(SettingError, match=r"data\.mask: found none.*had data\.mask='pole\.png'"):
+    with pytest.raises(SettingError, match=r"data\.mask: found null.*had data\.mask='pole\.png'"):
         masked("pole.png")
 
     settings, source = settled(with_config(content, tmp_path))
@@ -79,14 +85,14 @@ def test_a_mask_is_a_latitude_in_a_file_and_a_path_of_ones_own(
         build(settings, source)
 
 
-def test_names_of_options_are_no_paths(
+def test_names_of_options_are_not_paths(
     content: dict[str, Any], forbidden: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(forbidden.parent)
     (forbidden / "data").mkdir()
     target = content["config"]["data"]["_target_"]
-    theirs = f"# @package data\n_target_: {target}\nroot: rooms\nstore: x_${{oc.env:SECRET}}\n"
-    (forbidden / "data" / "z.yaml").write_text(theirs)
+    option = f"# @package data\n_target_: {target}\nroot: rooms\nstore: x_${{oc.env:SECRET}}\n"
+    (forbidden / "data" / "z.yaml").write_text(option)
     up = "/".join([".."] * 30)
     for option in (f"{up}{forbidden}/data/z", "../data/folder", "a\0b/c", "z", "x\nseed=3"):
         for group in ("data", "experiment", "trainer"):
@@ -110,30 +116,30 @@ def test_where_the_best_epoch_is_does_not_come_out_of_a_file(name: str, tmp_path
     state = dict.fromkeys(("best_model_path", "kth_best_model_path", "last_model_path"), name)
     scores = dict.fromkeys(("best_model_score", "current_score", "kth_value"), low)
     best.load_state_dict({**state, **scores, "best_k_models": {name: low}, "dirpath": "/"})
-    mine = str(tmp_path / "best.ckpt")
+    local_path = str(tmp_path / "best.ckpt")
     assert best.dirpath == str(tmp_path)
-    assert {best.best_model_path, best.kth_best_model_path, *best.best_k_models} == {mine}
+    assert {best.best_model_path, best.kth_best_model_path, *best.best_k_models} == {local_path}
     assert best.last_model_path == ""
     assert best.best_model_score == -1
 
 
-def test_what_cannot_be_resumed_is_said_in_a_line(
+def test_checkpoints_that_cannot_be_resumed_are_refused_in_a_line(
     run: Path, content: dict[str, Any], tmp_path: Path, monkeypatch: Patch
 ) -> None:
     monkeypatch.chdir(run.parent)
-    theirs = tmp_path / "theirs"
-    (theirs / "checkpoints").mkdir(parents=True)
-    said = "found what cannot be resumed"
+    option = tmp_path / "theirs"
+    (option / "checkpoints").mkdir(parents=True)
+    text = "found a checkpoint that cannot be resumed"
     endless = {**content["config"], "trainer": {**content["config"]["trainer"], "max_epochs": {}}}
     for changed, message in (
-        ({"callbacks": "x"}, said),
-        ({"state_dict": {}}, said),
-        ({"optimizer_states": [{"state": {}, "param_groups": "x"}]}, said),
+        ({"callbacks": "x"}, text),
+        ({"state_dict": {}}, text),
+        ({"optimizer_states": [{"state": {}, "param_groups": "x"}]}, text),
         ({"config": endless}, r"trainer\.max_epochs"),
     ):
-        torch.save(content | changed, theirs / "checkpoints" / "last.ckpt")
+        torch.save(content | changed, option / "checkpoints" / "last.ckpt")
         with pytest.raises(SystemExit, match=rf"^tangent-train: .*{message}"):
-            run_command(monkeypatch, "train", f"resume={theirs}", "data.root=rooms")
+            run_command(monkeypatch, "train", f"resume={option}", "data.root=rooms")
 
 
 def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path: Path) -> None:
@@ -160,15 +166,15 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
 
 
 @pytest.mark.parametrize("override", ["+network.inner={a.b:1}", "name='a\x1b[2J'"])
-def test_what_no_reader_takes_is_not_trained(
+def test_settings_that_readers_refuse_are_not_trained(
     override: str, run: Path, tmp_path: Path, monkeypatch: Patch
 ) -> None:
-    """A network of one's own takes any settings; its checkpoints must be readable."""
+    """A user-defined network takes any settings; its checkpoints must be readable."""
     monkeypatch.chdir(run.parent)
-    own = ("data.root=rooms", f"network._target_={OWN}", "~network.widths", override)
+    changed_path = ("data.root=rooms", f"network._target_={OWN}", "~network.widths", override)
     refused = pytest.raises(SystemExit, match=r"config\.yaml: found .*settings\.n.*; expected ")
     with refused:
-        run_command(monkeypatch, "train", *SETTINGS, *own, f"hydra.run.dir={tmp_path}/run")
+        run_command(monkeypatch, "train", *SETTINGS, *changed_path, f"hydra.run.dir={tmp_path}/run")
     assert not (tmp_path / "run" / "checkpoints").exists()
 
 
@@ -193,7 +199,7 @@ class Own(nn.Conv2d):
 OWN = f"{__name__}.Own"
 
 
-def _own(content: dict[str, Any], path: Path, **settings: Any) -> Path:
+def _with_network(content: dict[str, Any], path: Path, **settings: Any) -> Path:
     network = {"_target_": OWN, "in_channels": 3, "num_classes": 13, **settings}
     tensors = {f"network.{n}": t for n, t in Own(3, 13).state_dict().items()}
     changed = content | {"config": content["config"] | {"network": network}}
@@ -202,16 +208,16 @@ def _own(content: dict[str, Any], path: Path, **settings: Any) -> Path:
 
 
 def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
-    path = _own(content, tmp_path / "x.ckpt")
+    path = _with_network(content, tmp_path / "x.ckpt")
     with pytest.raises(DataError, match=f"trust={OWN}"):
         load_trained(path)
     assert load_trained(path, [OWN]).in_channels == 3
-    for said in (f"trust={OWN}", f"trust=['{OWN}',my.Other]", f"network._target_={OWN}"):
-        build(*settled(path, said))
+    for text in (f"trust={OWN}", f"trust=['{OWN}',my.Other]", f"network._target_={OWN}"):
+        build(*settled(path, text))
     with pytest.raises(DataError, match=f"trust={OWN}"):
         build(*settled(path, "trust=my.Other"))
-    # What it is given may be any plain value, but objects inside are checked all the same.
-    path = _own(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
+    # Its arguments may be any plain values, but objects inside are still checked.
+    path = _with_network(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
     with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
         load_trained(path, [OWN])
 
@@ -223,9 +229,9 @@ def test_an_evaluation_needs_no_trust_for_what_only_trains(
     monkeypatch.chdir(run.parent)
     named = {section: {"_target_": _FIRE, "_partial_": True}}
     path = with_config(content, tmp_path, **named)
-    said = (f"checkpoint={path}", "data.root=rooms", f"hydra.run.dir={tmp_path}/evaluated")
+    text = (f"checkpoint={path}", "data.root=rooms", f"hydra.run.dir={tmp_path}/evaluated")
     with watched(tmp_path / "forbidden") as happened:
-        run_command(monkeypatch, "evaluate", *said)
+        run_command(monkeypatch, "evaluate", *text)
     assert happened == []
     assert results(tmp_path / "evaluated") == results(run)
     with pytest.raises(SystemExit, match=rf"{section}\._target_={_FIRE}, which would be called"):

@@ -20,13 +20,13 @@ _watching: list[tuple[list[str], str]] = []
 
 @contextmanager
 def watched(forbidden: Path) -> Iterator[list[str]]:
-    """Note what must not happen while this is on.
+    """Record forbidden events in a block.
 
     Args:
-        forbidden: A folder that only attacks name; all that is done to it is noted.
+        forbidden: Folder that only attacks name; every access to it is recorded.
 
     Yields:
-        What happened: empty if all is well.
+        Forbidden events.
     """
     happened: list[str] = []
     _watching.append((happened, str(forbidden)))

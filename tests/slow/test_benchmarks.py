@@ -19,7 +19,7 @@ def test_every_benchmark_runs(name: str, tmp_path: Path) -> None:
     content = json.loads(path.read_text(encoding="utf-8"))
     for table in content["tables"]:
         assert table["name"].startswith(f"{name}: ")
-        assert any(row["ours"] for row in table["rows"])
+        assert any(row["is_ours"] for row in table["rows"])
         assert all(min(row["values"]) > 0 for row in table["rows"])
     assert content["quotients"]
     for command in ("compare", "baseline"):

@@ -41,7 +41,7 @@ class OneSize(_Plain):
 
 
 class TwoSizes(_Plain):
-    """Another computation for wide images: a trace knows only one of them."""
+    """Another computation for wide images: a trace contains only one of them."""
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
@@ -55,13 +55,13 @@ class Tracing(_Plain):
 
 
 class Looking(_Plain):
-    """Another computation for other values: no exporter knows both."""
+    """Another computation for other values: exporters write only one of them."""
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) * (2 if bool(images.sum() > 0) else 1)
 
 
-def own(name: str) -> dict[str, Any]:
+def config_section(name: str) -> dict[str, Any]:
     """Settings of a network of this module."""
     return {"_target_": f"{__name__}.{name}"}
 
@@ -72,7 +72,7 @@ def some_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> T
 
 
 def scores_of(trained: TrainedNetwork, images: Tensor) -> Tensor:
-    """What PyTorch makes of them."""
+    """Return PyTorch's scores of images."""
     with torch.no_grad():
         scores: Tensor = trained.network(images)
     return scores

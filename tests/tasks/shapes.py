@@ -23,8 +23,8 @@ class Shapes(lightning.LightningDataModule):
     """Shapes whose class is the brightest channel of one of their views, under noise.
 
     Args:
-        count: How many there are, of class k % 3.
-        batch_size: Of training; evaluation takes two at a time.
+        count: Number of shapes; shape k is of class k % 3.
+        batch_size: Number of shapes in a training batch; evaluation takes two at a time.
     """
 
     labels = "image_class"

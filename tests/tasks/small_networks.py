@@ -54,11 +54,11 @@ def small_trained(
 
 
 def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
-    """Write what a run of such a config writes (of Lightning's own entries none is needed).
+    """Write the checkpoint of a run, without entries of Lightning.
 
     Args:
-        path: The file.
-        overrides: Of the composed ``train.yaml``.
+        path: File to write.
+        overrides: Overrides of ``train.yaml``.
 
     Returns:
         The task in evaluation mode, whose tensors are in the file.

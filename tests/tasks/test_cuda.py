@@ -57,13 +57,13 @@ def test_two_steps_and_a_test() -> None:
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])
-def test_mixed_precision(precision: str) -> None:
+def test_mixed_precision_is_close_to_float32(precision: str) -> None:
     expected, found = _trained("cpu"), _trained("gpu", precision=precision)
     torch.testing.assert_close(_weights(found), _weights(expected), rtol=0.05, atol=0.05)
 
 
 @pytest.mark.parametrize(("half", "tolerance"), [(False, 1e-4), (True, 0.02)])
-def test_scores(half: bool, tolerance: float) -> None:
+def test_scores_equal_those_of_the_cpu(half: bool, tolerance: float) -> None:
     images = torch.randn(20, 2, 16, 16)
     exact = _task().double().eval()(images.double()).detach()
     with torch.autocast("cuda", torch.bfloat16, enabled=half):

@@ -52,15 +52,15 @@ def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
         (["enc"], r"task\.frozen: found enc; .* such as encoder, neck, head"),
         (["encoder.7"], r"found encoder\.7; .* such as encoder\.0, encoder\.1, encoder\.2"),
         ([""], "found an empty name"),
-        (["encoder", "neck", "head"], "found all of the network"),
+        (["encoder", "neck", "head"], "found the whole network"),
     ],
 )
-def test_what_cannot_be_frozen_is_refused(names: list[str], message: str) -> None:
+def test_impossible_frozen_parts_are_refused(names: list[str], message: str) -> None:
     with pytest.raises(SettingError, match=message):
         shape_task(SmallNetwork(statistics=True), frozen=names)
 
 
-def test_what_was_loaded_takes_smaller_steps() -> None:
+def test_loaded_tensors_take_smaller_steps() -> None:
     moved = {}
     for factor in (1, 0.25):
         task = shape_task(backbone_lr_factor=factor)

@@ -186,7 +186,8 @@ def test_a_plateau_is_resumed_exactly(until: int, tmp_path: Path) -> None:
     [
         ({"interval": "day"}, r"scheduler\.interval: found day"),
         ({"frequency": 0}, r"scheduler\.frequency: found 0"),
-        ({"monitor": "val/mio"}, r"scheduler\.monitor: found val/mio after epoch 1; .*val/acc"),
+        ({"monitor": "val/mio"}, r"scheduler\.monitor: found val/mio; expected one of .*val/acc"),
+        ({"monitor": "train/los"}, r"scheduler\.monitor: found train/los after epoch 1; .*n/loss"),
         ({"interval": "step"}, r"scheduler\.interval: found step; expected epoch"),
     ],
 )
@@ -200,6 +201,22 @@ def test_impossible_settings_are_refused(
             max_epochs=1,
             limit_val_batches=1,
         )
+
+
+def test_a_misspelled_monitor_is_refused_before_training() -> None:
+    rates = Rates(None)
+    stopping = lightning.pytorch.callbacks.EarlyStopping("val/mio")
+    trainer = quiet_trainer(callbacks=[rates, stopping], max_epochs=1, num_sanity_val_steps=1)
+    with pytest.raises(SettingError, match=r"monitor of EarlyStopping: .*one of .*val/accuracy"):
+        trainer.fit(shape_task(), datamodule=Shapes(3))
+    assert not rates.found
+
+
+@pytest.mark.parametrize("build", [warmup_cosine, partial(lr_scheduler.OneCycleLR, max_lr=LR)])
+def test_a_schedule_shorter_than_the_training_is_refused(build: Any, tmp_path: Path) -> None:
+    schedule = Schedule(partial(build, total_steps=2 * STEPS - 1), "step")
+    with pytest.raises(SettingError, match=r"scheduler\.total_steps: found 5; expected 6 or more"):
+        _train(tmp_path, schedule, max_epochs=2)
 
 
 def test_the_length_of_an_endless_training_is_not_made_up(tmp_path: Path) -> None:

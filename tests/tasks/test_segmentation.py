@@ -1,4 +1,4 @@
-"""Segmentation: what is minimised, and what is scored."""
+"""Segmentation: what is minimized, and what is scored."""
 
 from __future__ import annotations
 
@@ -111,11 +111,11 @@ def test_the_auxiliary_head_adds_its_loss(weight: float) -> None:
     task.class_weights.copy_(WEIGHTS)
     found = task.loss_sum((images,), labels) / task.loss_norm(labels)
     known = labels > 0
-    own, auxiliary = (
+    main, auxiliary = (
         functional.cross_entropy(scores.movedim(1, -1)[known], labels[known].long() - 1, WEIGHTS)
         for scores in network(images).values()
     )
-    torch.testing.assert_close(found, own + weight * auxiliary)
+    torch.testing.assert_close(found, main + weight * auxiliary)
 
 
 class Looking(nn.Module):
@@ -124,14 +124,14 @@ class Looking(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.scale = nn.Parameter(torch.tensor(0.1))
-        self.told: list[tuple[tuple[int, ...], int | None]] = []
+        self.received: list[tuple[tuple[int, ...], int | None]] = []
 
     def forward(
         self, images: Tensor, rays: Tensor | None = None, images_per_chunk: int | None = None
     ) -> Tensor:
         if rays is None:
             rays = torch.eye(3).expand(len(images), 1, 3, 3)
-        self.told.append((tuple(rays.shape), images_per_chunk))
+        self.received.append((tuple(rays.shape), images_per_chunk))
         height, width = images.shape[-2:]
         y, x = torch.meshgrid(_centers(height), _centers(width), indexing="ij")
         pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
@@ -143,29 +143,29 @@ def _centers(count: int) -> Tensor:
     return (2 * torch.arange(count) + 1) / count - 1
 
 
-def test_such_a_network_is_told_where_its_images_look_and_divides_them_itself() -> None:
+def test_such_a_network_gets_viewing_rays_and_divides_its_images() -> None:
     network = Looking()
     task = _task(network, class_weights=[1.0, 1.0], images_per_chunk=3, images_per_forward=7)
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
-    assert network.told == [((2, 20, 3, 3), 3)]
-    network.told.clear()
+    assert network.received == [((2, 20, 3, 3), 3)]
+    network.received.clear()
     task.representation = TangentRepresentation(0, 4, rotations=2)
     target = torch.ones(32, 64, dtype=torch.uint8)
     target[16:] = 2
     samples: Any = [_sample(torch.zeros(40, 2, 16, 16), target)]
     quiet_trainer().test(task, DataLoader(samples), verbose=False)
-    assert network.told == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
+    assert network.received == [((1, 20, 3, 3), 7)] * 2, "of every rotation"
     pixels = task.result.pixels
     assert pixels[1, 1] + pixels[2, 2] == pixels.sum() == 32 * 64
-    network.told.clear()
+    network.received.clear()
     task(torch.zeros(2, 2, 16, 16))
-    assert network.told == [((2, 1, 3, 3), None)]
+    assert network.received == [((2, 1, 3, 3), None)]
 
 
 def test_scores_that_do_not_fit_are_refused() -> None:
     task = _task(nn.Conv2d(2, 3, 1))  # as if unknown were a class
-    told = r"scores of the network: found \(1, 3, 16, 16\); expected \(1, 2, 16, 16\)"
-    with pytest.raises(SettingError, match=told):
+    received = r"scores of the network: found \(1, 3, 16, 16\); expected \(1, 2, 16, 16\)"
+    with pytest.raises(SettingError, match=received):
         task(torch.zeros(1, 2, 16, 16))
 
 

@@ -45,7 +45,7 @@ def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationT
 def _gradients(
     images_per_chunk: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
-    """Of the last step of an epoch of three spheres, and the loss of its last batch."""
+    """Return the gradients of the last step of an epoch of three spheres, and its last loss."""
     gradients = Gradients()
     given = {"max_epochs": 1, "accumulate_grad_batches": 3 // batch_size} | (trainer or {})
     callbacks = {"callbacks": [gradients, *given.get("callbacks", [])]}
@@ -56,7 +56,7 @@ def _gradients(
 
 
 def _expected(batch_size: int, batches: int | None = None) -> tuple[list[Tensor], Tensor]:
-    """Torch's weighted mean over the labelled pixels of the last batches, and of the last one."""
+    """Torch's weighted mean over the labeled pixels of the last batches, and of the last one."""
     network, pixels = _network(), []
     for batch in Data(batch_size=batch_size).train_dataloader():
         labels = batch.labels.flatten(0, 1).long()

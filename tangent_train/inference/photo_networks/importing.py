@@ -54,23 +54,23 @@ def import_network(
     """Try a photo network, write it as a checkpoint and read it again.
 
     Args:
-        network: The network, in evaluation mode afterwards.
-        path: The file: ``.ckpt``, or ``.onnx`` of a network from such a file.
+        network: The network; it is set to evaluation mode.
+        path: File to write: ``.ckpt``, or ``.onnx`` for a network from an ONNX file.
         fov_deg: Horizontal field of view of the photos it was trained on, for labels of photos.
         levels: Levels s of the tangent images; None for `wide_levels`.
         base_level: Base level b of the tangent images; None for the fewest images.
-        unknown_classes: Names of scores of no class, such as a background.
-        unknown_wins: True if these may win, which is then written as unknown (label 0).
-        image_size: The only rows and columns to give the network; None for its own size and, if it
-            takes others, any.
-        score_kind: Output of the network; None for the output that its library declares, or to find
-            it by trial.
+        unknown_classes: Names of scores that are not classes, such as a background.
+        unknown_wins: True if these scores may win; such pixels are unknown (label 0).
+        image_size: Fixed rows and columns of the network's images; None for the size of its
+            training, and for other sizes if it supports them.
+        score_kind: Kind of the network's output; None for the kind that its library declares, or to
+            find it by trial.
 
     Returns:
-        The network as its file gives it back.
+        The network, read from the file.
 
     Raises:
-        SettingError: A setting is impossible, or the names do not fit the scores.
+        SettingError: A setting is invalid, or the names do not fit the scores.
         NoRoomError: The disk is full.
     """
     if image_size not in (None, network.image_size) and network.fixed_size:
@@ -85,7 +85,7 @@ def import_network(
     names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
     scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
-    # Images of a network that takes one size only have its longer side; see `TrainedNetwork`.
+    # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
     chosen = wide_levels(side) if levels is None else level_list(levels, 0)
     level = max(chosen)
@@ -112,20 +112,24 @@ def import_network(
             write_metadata(network.network.path, temporary, described)
         else:
             _write_checkpoint(described, temporary)
-        trained = load_trained(temporary, unregistered(network.settings))  # it was made from them
+        trained = load_trained(
+            temporary, unregistered(network.settings)
+        )  # the classes are from the user
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 
 
 def _photo_level(columns: int, fov_deg: float) -> int:
-    """Level s with the focal length nearest to that of photos, ``2^s / R_v(−1)`` pixels.
+    """Return the level s with the focal length nearest to that of photos.
+
+    The focal length of level s is ``2^s / R_v(−1)`` pixels.
 
     Args:
-        columns: Columns of the photos.
+        columns: Number of columns of the photos.
         fov_deg: Horizontal field of view of the photos.
 
     Raises:
-        SettingError: An impossible field of view.
+        SettingError: The field of view is not between 0° and 180°.
     """
     if not 0 < fov_deg < 180:
         raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")

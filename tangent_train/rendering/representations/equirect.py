@@ -80,7 +80,7 @@ class EquirectViews(Views):
         framed = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=-1)
         x, y = shape[1] / columns, shape[0] / rows
         box = np.array([[-x, -y, shape[1] + x, shape[0] + y]])
-        return framed, PhotoCrops(box, (rows + 2, columns + 2), overlapping=False)
+        return framed, PhotoCrops(box, (rows + 2, columns + 2), is_overlapping=False)
 
 
 @registered

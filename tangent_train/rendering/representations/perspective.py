@@ -44,7 +44,7 @@ class PhotoCrops(Views):
         mirrored: True if the crops are mirrored left to right.
         numbers: ``(n,)`` numbers of the crops that are rendered; None for all.
         canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
-        overlapping: See `Views`.
+        is_overlapping: See `Views`.
     """
 
     boxes: NDArray[np.float64]
@@ -52,7 +52,7 @@ class PhotoCrops(Views):
     mirrored: bool = False
     numbers: NDArray[np.int64] | None = None
     canvas_boxes: NDArray[np.float64] | None = None
-    overlapping: bool = True
+    is_overlapping: bool = True
 
     def __getitem__(self, part: slice) -> Self:
         return replace(self, numbers=self.chosen[part])

@@ -34,12 +34,12 @@ class Views:
     """Some of the N views of a panorama or photo, each an image of a part of it.
 
     Attributes:
-        overlapping: True if every pixel is inside an image, not only on its outer edge.
+        is_overlapping: True if every pixel is inside an image, not only on its outer edge.
         chosen: ``(n,)`` numbers of these views, 0 … N − 1.
         all_images: An object that identifies the set of N views.
     """
 
-    overlapping: bool
+    is_overlapping: bool
     chosen: NDArray[np.int64]
     all_images: object
 
@@ -157,9 +157,9 @@ class PinholeViews(Views):
         return self.grid
 
     @property
-    def overlapping(self) -> bool:  # type: ignore[override]
+    def is_overlapping(self) -> bool:  # type: ignore[override]
         """See `Views`."""
-        return self.grid.overlapping
+        return self.grid.is_overlapping
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`."""

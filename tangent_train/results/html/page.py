@@ -1,4 +1,4 @@
-"""The report as one self-contained HTML file, with compressed panoramas and photos."""
+"""Write a report as one self-contained HTML file, with compressed panoramas and photos."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 
 _SCRIPTS = ("view.js", "surfaces.js", "gestures.js", "viewer.js")
 _SCRIPT = '<script>\n"use strict";\n{{\n{}}}\n</script>'
-"""A block of its own: no names in the page's global scope."""
+"""Block of the scripts, whose names are not in the page's global scope."""
 
 _IMAGES = "<!--images-->\n"
 _PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}")
@@ -39,17 +39,17 @@ class EncodedImage(NamedTuple):
     """A compressed image of the viewer, with its label maps; see `encode_image`.
 
     Attributes:
-        name: Shown beside it.
-        note: A line about it, such as a score.
-        sphere: True for a whole equirectangular panorama; others are shown flat.
-        width: Columns of the image before it was compressed.
-        height: Rows of the image before it was compressed.
-        input: The image, a JPEG.
-        thumbnail: A small JPEG of it.
-        prediction: 8-bit gray PNG of class indices, perhaps of fewer pixels.
-        truth: The same for the ground truth.
-        shares: ``(class index, share of the truth, share of the prediction)``, without the maps
-            that are missing, of the classes that appear; by solid angle on panoramas.
+        name: Name in the list of images.
+        note: Line below the name, e.g. a score.
+        sphere: True for a panorama; False for an image that is shown flat.
+        width: Columns of the image before compression.
+        height: Rows of the image before compression.
+        input: JPEG of the image.
+        thumbnail: Small JPEG of the image.
+        prediction: 8-bit gray PNG of predicted labels, which may have fewer pixels.
+        truth: 8-bit gray PNG of true labels, which may have fewer pixels.
+        shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
+            without shares of missing maps; by solid angle for panoramas.
     """
 
     name: str
@@ -76,16 +76,17 @@ def encode_image(
 ) -> EncodedImage:
     """Compress an image for the report, to a few megabytes at most.
 
-    Sides longer than `MOST_PIXELS` are downsampled, colors by area, labels by nearest neighbour.
+    Images whose longer side exceeds `MOST_PIXELS` are downsampled: colors by area averaging, labels
+    by nearest neighbor.
 
     Args:
-        name: Shown beside it.
-        rgb: ``(H, W, 3)`` the image.
-        class_count: K + 1, the unknown class 0 included; at most 256.
-        prediction: ``(h, w)`` class indices, 0 where there is none; of any size.
-        truth: ``(h, w)`` class indices, 0 unknown; of any size.
-        sphere: True for a whole equirectangular panorama.
-        note: A line about it.
+        name: Name in the list of images.
+        rgb: Image ``(H, W, 3)``.
+        class_count: Number of labels, K + 1, with the unknown class 0; at most 256.
+        prediction: Predicted labels ``(h, w)``, which may have another size than the image.
+        truth: True labels ``(h, w)``; 0 is unknown.
+        sphere: True for a panorama.
+        note: Line below the name.
     """
     maps = {"truth": truth, "prediction": prediction}
     small = {
@@ -102,7 +103,7 @@ def encode_image(
 
 
 def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:
-    """With a longer side of at most `side` pixels."""
+    """Downsample an image so that its longer side has at most `side` pixels."""
     scale = side / max(pixels.shape[:2])
     if scale >= 1:
         return pixels
@@ -121,7 +122,7 @@ def _shares(
 ) -> tuple[tuple[float, ...], ...]:
     shares = []
     for indices in maps:
-        # Row by row: no array of weights as large as the image.
+        # Row by row, without an array of weights as large as the image.
         counts = np.stack([np.bincount(row, minlength=class_count) for row in indices])
         height, width = indices.shape
         weights = equirect_solid_angles((height, width)) if sphere else np.ones(height)
@@ -142,11 +143,11 @@ def write_report(
     """Write a report as one HTML file, atomically.
 
     Args:
-        path: The file.
+        path: File to write.
         title: Title of the page.
-        tables: Below the viewer.
-        images: For the viewer.
-        class_names: K + 1 names of the classes in the label maps, the unknown class first.
+        tables: Tables below the viewer.
+        images: Images in the viewer.
+        class_names: Names of the K + 1 labels, the unknown class first.
         notes: Lines below the title, the most important first.
     """
     parts: dict[str, str] = {
@@ -170,7 +171,7 @@ def write_report(
 
 
 def _viewer(class_names: Sequence[str]) -> str:
-    colors = class_colors(len(class_names)).tolist()[: len(class_names)]  # perhaps no classes
+    colors = class_colors(len(class_names)).tolist()[: len(class_names)]  # empty without classes
     classes = [{"name": name, "rgb": rgb} for name, rgb in zip(class_names, colors, strict=True)]
     parts = {"images": _IMAGES, "classes": _json(classes), "shader": _resource("viewer.frag")}
     return _filled(_resource("viewer.html"), parts)
@@ -189,7 +190,7 @@ def _write_image(file: TextIO, image: EncodedImage) -> None:
 
 
 def _json(content: Any) -> str:
-    """JSON that can neither close the script element around it nor start a comment in it."""
+    """Return JSON that can neither end the script element around it nor start a comment in it."""
     text = json.dumps(content, separators=(",", ":"), default=_base64)
     return text.replace("<", "\\u003c")
 
@@ -199,7 +200,7 @@ def _base64(content: bytes) -> str:
 
 
 def _filled(template: str, parts: dict[str, str]) -> str:
-    """The template with its ``{{names}}`` replaced; inserted text is not scanned again."""
+    """Replace the ``{{names}}`` of a template; inserted text is not scanned again."""
     return _PLACEHOLDER.sub(lambda match: parts[match[1]], template)
 
 

@@ -1,4 +1,4 @@
-"""Detecting, matching and scoring the keypoints of a pair, on several representations."""
+"""Detect, match and score the keypoints of a pair on several representations."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ _Views = tuple[DepthView, DepthView]
 """Depth and pose of the left and of the right panorama."""
 
 _Keypoints = dict[tuple[str, int], dict[str, SphericalKeypoints]]
-"""Keypoints by representation, of a panorama by name and level."""
+"""Keypoints by representation, for a panorama's name and level."""
 
 AS_GIVEN, ROTATED = "as_given", "rotated"
-"""Conditions: both panoramas as they are; the right one randomly rotated."""
+"""Conditions: both panoramas unchanged; the right panorama randomly rotated."""
 
 SHRUNK = "ERP ×0.71"
 """The panorama with pixels as large as those of tangent images, see `shrunk_rows`."""
@@ -61,7 +61,7 @@ CUBE = "cube"
 """The six faces of a cube, 90° over as many pixels as on the panorama's equator."""
 
 AUC_DEG = (5, 10, 20)
-"""Largest errors of the pose up to which the area under the curve of the recall is given."""
+"""Upper limits of the pose error for the area under the recall curve."""
 
 
 class MatchedPair(NamedTuple):
@@ -77,9 +77,9 @@ class Comparison(NamedTuple):
     """A compared pair.
 
     Attributes:
-        rows: Figures.
+        rows: Scores by condition and representation.
         found: Keypoints and matches by condition and representation.
-        images: The left and the right panorama of every condition, as keypoints were detected.
+        images: Left and right panorama in which keypoints were detected, by condition.
     """
 
     rows: list[Row]
@@ -93,12 +93,12 @@ class Comparer:
 
     Attributes:
         base_level: Base levels of the tangent images.
-        margin: Pixels added around every tangent image.
+        margin: Number of pixels added around every tangent image.
         level: Level s; None for the level nearest to the larger panorama.
-        ratio: See `match`.
-        mutual: See `match`.
-        max_error_deg: See `estimate_two_view`, at most 20.
-        seed: Seed of random samples and of the random rotations.
+        ratio: Largest ratio of descriptor distances, see `match`.
+        mutual: True to keep mutual matches only, see `match`.
+        max_error_deg: Largest error of an inlier, see `estimate_two_view`; at most 20.
+        seed: Seed of random samples and random rotations.
         controls: True to compare the downsampled panorama, a cube and the rotated panorama too.
 
     Raises:
@@ -124,7 +124,7 @@ class Comparer:
 
     @property
     def representations(self) -> list[str]:
-        """``ERP``, the shrunk one and the cube with controls, ``L0``, ``L1`` … of base levels."""
+        """Names: ``ERP``; with controls, shrunk ERP and cube; ``L0``, ``L1`` … for base levels."""
         controls = [SHRUNK, CUBE] if self.controls else []
         return ["ERP", *controls, *(f"L{b}" for b in self.base_level)]
 
@@ -132,14 +132,14 @@ class Comparer:
         """Compare all representations on one pair.
 
         Args:
-            pair: The pair.
+            pair: Pair of panoramas.
 
         Returns:
-            Among its figures are n_L and n_R as ``visible_left`` and ``visible_right`` (all
-            keypoints where depth and pose are unknown), PMR, MS and P as shares of 1, and, where
-            depth and pose are known, the errors of the estimated motion, what the pair adds to
-            the area under the curve of its recall, and how many of the ``judged`` matches are
-            ``correct``. None stands for what is undefined.
+            Comparison whose rows have n_L and n_R as ``visible_left`` and ``visible_right`` (all
+            keypoints if depth and pose are unknown), and PMR, MS and P as shares of 1. With depth
+            and pose, they have the errors of the estimated motion, the area under the recall curve
+            of the pair, and the number of ``correct`` matches among the ``judged`` ones.
+            Undefined scores are None.
 
         Raises:
             SettingError: The panoramas are too small for the level or for a base level.
@@ -147,7 +147,7 @@ class Comparer:
         level = self._level(pair)
         sides = (pair.left, pair.right)
         images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
-        # A panorama of the previous pair is not searched again.
+        # Keypoints of a panorama of the previous pair are used again.
         self._cache = {
             (side.name, level): self._cache.get((side.name, level)) or self._detect(image, level)
             for side, image in zip(sides, images, strict=True)
@@ -267,17 +267,17 @@ def _depth_views(pair: PanoramaPair) -> _Views | None:
 
 
 def _defined(value: float) -> float | None:
-    """A score, or None if undefined: JSON has no NaN."""
+    """Return a score, or None for NaN, which JSON lacks."""
     return float(value) if math.isfinite(value) else None
 
 
 def shrunk_rows(level: int) -> int:
-    """Rows of a panorama whose pixels are as large as those of tangent images of a level.
+    """Return the rows of a panorama with pixels as large as those of tangent images of a level.
 
-    Tangent images have pixels R_v(b−1)/2^(s−b) wide, more than the π/2^(s+1) of the panorama:
-    0.709 times as many fit. Fewer, larger pixels have less noise, a gain that is
-    unrelated to distortion. Base levels 0 and 1 have the same pixels, those of level 2 are
-    6 % larger.
+    The pixels of tangent images are R_v(b−1)/2^(s−b) wide, those of the panorama π/2^(s+1): the
+    number of rows is 0.709 times as large. Fewer, larger pixels have less noise, an advantage
+    that is unrelated to distortion. Pixels of base levels 0 and 1 are equal; those of base level 2
+    are 6 % larger.
 
     >>> shrunk_rows(10)
     1453
@@ -286,7 +286,7 @@ def shrunk_rows(level: int) -> int:
 
 
 def _shrunk(rgb: NDArray[np.uint8], rows: int) -> NDArray[np.uint8]:
-    """A panorama, downsampled by area averaging if it has more rows."""
+    """Downsample a panorama by area averaging if it has more rows."""
     if rgb.shape[0] <= rows:
         return rgb
     return cv2.resize(rgb, (2 * rows, rows), interpolation=cv2.INTER_AREA)

@@ -1,4 +1,4 @@
-"""``results.json``, ``pairs.csv``, ``keypoints.md``: the paper's tables; pictures of matches."""
+"""Write the scores of keypoints as the paper's tables, and draw matches."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _METRICS = {
     "translation error °, median": "translation_error_deg",
     **{f"pose AUC {degrees}° %": f"pose_auc_{degrees}" for degrees in AUC_DEG},
 }
-"""Columns of the rows by what tables call them."""
+"""Columns of the rows by their name in tables."""
 
 _VISIBLE = {
     "depth": "n_L and n_R are the keypoints visible to the other panorama, by depth and pose and "
@@ -51,10 +51,10 @@ class KeypointReport:
     """All tables over the pairs of one data set.
 
     Attributes:
-        rows: From `Comparer.compare`, of all pairs.
+        rows: Rows of `Comparer.compare` for all pairs.
         representations: Representations in the order of the columns.
         settings: Settings that affect the scores.
-        published: The paper's pairs by name, where the data are those; else empty.
+        published: The paper's pairs by name; empty for other data.
     """
 
     rows: Sequence[Row]
@@ -73,7 +73,7 @@ class KeypointReport:
         )
 
     def markdown(self) -> str:
-        """All tables."""
+        """Return all tables as Markdown."""
         settings = ", ".join(f"{k} {v}" for k, v in self.settings.items() if k != "data")
         visible = dict.fromkeys(f"{_VISIBLE[row['visible_by']]}\n" for row in self.rows)
         head = [f"# Keypoints\n\nSettings: {settings}.\n", *visible]
@@ -81,7 +81,7 @@ class KeypointReport:
         return "\n".join([*head, *(table.markdown() for table in tables)])
 
     def means(self) -> list[Table]:
-        """Means over the pairs of each split, a table for each condition."""
+        """Return the means over the pairs of each split, one table per condition."""
         header = ("split", "metric", *self.representations)
         return [
             Table(_CONDITIONS[c], header, list(self._mean_rows(c)), text_columns=(0, 1))
@@ -92,7 +92,7 @@ class KeypointReport:
         return [c for c in _CONDITIONS if any(row["condition"] == c for row in self.rows)]
 
     def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
-        """Means over the pairs of which a figure is defined; the paper's below them."""
+        """Yield means over the pairs with a defined score, and the paper's means below them."""
         groups = _grouped(with_splits(self.rows), "split")
         for split in sorted(groups, key=lambda name: (name != "hard", name != "easy")):
             rows = groups[split]
@@ -134,18 +134,18 @@ class KeypointReport:
 
 
 def with_splits(rows: Sequence[Row]) -> list[Row]:
-    """Split pairs in two halves by overlap, as in the paper, unless splits are given.
+    """Split pairs into two halves by overlap, as in the paper, unless they have splits.
 
     Args:
         rows: Rows of all pairs.
 
     Returns:
-        The half with the smaller overlaps is ``hard``, the other, which may have one more,
-        ``easy``. Nothing is divided where an overlap is unknown or all are the same.
+        Rows with splits: the half with smaller overlaps is ``hard``, the other, which may have one
+        more pair, ``easy``. Rows are unchanged if an overlap is unknown or all are equal.
     """
     overlaps = {row["pair"]: row["fov_overlap"] for row in rows}
-    given = any(row["split"] for row in rows)
-    if given or None in overlaps.values() or len(set(overlaps.values())) < 2:
+    has_splits = any(row["split"] for row in rows)
+    if has_splits or None in overlaps.values() or len(set(overlaps.values())) < 2:
         return list(rows)
     ordered = sorted(overlaps, key=lambda name: overlaps[name])
     hard = set(ordered[: len(ordered) // 2])
@@ -160,12 +160,12 @@ def _grouped(rows: Sequence[Row], key: str) -> dict[Any, list[Row]]:
 
 
 def _paper() -> dict[str, dict[str, dict[str, str]]]:
-    """The tables of the paper by split, figure and representation."""
+    """Read the tables of the paper by split, score and representation."""
     text = Path(__file__).with_name("paper.csv").read_text(encoding="utf-8")
-    found: dict[str, dict[str, dict[str, str]]] = {}
+    tables: dict[str, dict[str, dict[str, str]]] = {}
     for row in csv.DictReader(text.splitlines()):
-        found.setdefault(row["split"], {})[row["figure"]] = row
-    return found
+        tables.setdefault(row["split"], {})[row["figure"]] = row
+    return tables
 
 
 def _text(value: float | None, metric: str) -> str:
@@ -179,17 +179,17 @@ def _triple(scores: Sequence[float | None]) -> str:
 
 
 def matches_png(comparison: Comparison, condition: str) -> bytes:
-    """A picture of the matches of one pair, a panel for each representation.
+    """Draw the matches of one pair, with a panel for each representation.
 
-    The left panorama is above the right one. Lines join up to 150 inliers, colored by their
-    longitude on the left, the shorter way around; red dots are other matches.
+    The left panorama is above the right one. Up to 150 inliers are lines, colored by longitude in
+    the left panorama, along the shorter way around the sphere; other matches are red dots.
 
     Args:
-        comparison: The compared pair.
-        condition: One of its conditions.
+        comparison: Compared pair.
+        condition: Condition of the comparison to draw.
 
     Returns:
-        A PNG file.
+        Content of a PNG file.
     """
     with elsewhere():
         from matplotlib.collections import LineCollection
@@ -210,7 +210,7 @@ def matches_png(comparison: Comparison, condition: str) -> bytes:
         shown = np.random.default_rng(0).permutation(np.flatnonzero(inliers))[:_MOST_LINES]
         lines = np.stack([starts[shown], ends[shown]], axis=1)
         lines[:, 1, 0] += width * np.rint((lines[:, 0, 0] - lines[:, 1, 0]) / width)
-        for shift in (-width, 0, width):  # what leaves at one side comes back at the other
+        for shift in (-width, 0, width):  # lines across the seam appear on both sides
             moved = lines + np.array([shift, 0])
             axes.add_collection(
                 LineCollection(list(moved), array=starts[shown, 0], cmap="hsv", clim=(0, width))

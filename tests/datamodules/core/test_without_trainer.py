@@ -56,6 +56,8 @@ def test_samples_have_an_index_or_an_epoch_and_an_index(rooms: Path) -> None:
         assert samples[-1].index == count - 1
         with pytest.raises(IndexError):
             samples[count]
+    with pytest.raises(SettingError, match="split: found trian; expected train, val, test"):
+        data.dataset("trian")  # type: ignore[arg-type]
     samples = data.dataset("train")
     assert torch.equal(samples[1].labels, samples[0, 1].labels)
     assert not torch.equal(samples[1].images[0], samples[1, 1].images[0])

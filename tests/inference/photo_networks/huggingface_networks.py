@@ -135,7 +135,7 @@ def own_logits(network: Any, processor: Any) -> Tensor:
 
 
 def imported(folder: Path, **settings: Any) -> TrainedNetwork:
-    """The same network, as its checkpoint gives it back."""
+    """Import the network and read its checkpoint."""
     given: dict[str, Any] = {"classes": None, "normalization": None} | settings
     network = huggingface.load(model=str(folder), **given)
     return import_network(network, folder / "imported.ckpt")
@@ -143,7 +143,7 @@ def imported(folder: Path, **settings: Any) -> TrainedNetwork:
 
 @torch.no_grad()
 def imported_scores(trained: TrainedNetwork) -> Tensor:
-    """Its scores ``(K, h, w)`` of the photo."""
+    """Return scores ``(K, h, w)`` of the imported network for the photo."""
     rgb = torch.from_numpy(photo()).permute(2, 0, 1) / 255
     mean, std = (
         torch.tensor(values)[:, None, None]
@@ -157,7 +157,7 @@ def assert_same(scores: Tensor, expected: Tensor) -> None:
 
 
 def tokenizer(folder: Path) -> Any:
-    """CLIP's, with single letters as its vocabulary."""
+    """Write CLIP's tokenizer with single letters as its vocabulary."""
     letters = sorted(set("the task is semantic") - {" "})
     words = [*letters, *(f"{c}</w>" for c in letters), "<|startoftext|>", "<|endoftext|>"]
     made = transformers.CLIPTokenizer(vocab={w: k for k, w in enumerate(words)}, merges=[])

@@ -1,4 +1,4 @@
-"""Networks of transformers: their library's own scores, from a checkpoint."""
+"""Networks of transformers: scores of a checkpoint equal those of the library."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A SegFormer as its library saves it."""
+    """A folder with a SegFormer, saved by transformers."""
     networks.saved(networks.segformer, tmp_path / "net")
     return tmp_path / "net"
 
@@ -55,7 +55,7 @@ def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
 def test_scores_are_those_of_the_library(
     made: Callable[[], Any], shares: bool, tmp_path: Path
 ) -> None:
-    """Those of queries are logarithms of shares. MobileViT takes blue first."""
+    """Scores of queries are logarithms of shares. MobileViT takes BGR images."""
     network, processor = networks.saved(made, tmp_path)
     scores = networks.imported_scores(networks.imported(tmp_path))
     expected = networks.own_scores(network, processor)
@@ -264,7 +264,7 @@ def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Pat
 def test_undeclared_settings_are_left_out_or_refused(
     made: Callable[[], Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """They are left out at the import of a folder, and refused in a checkpoint."""
+    """Undeclared settings are left out when a folder is imported, and refused in a checkpoint."""
 
     def load_quantizer(*_: Any, **__: Any) -> None:
         raise AssertionError("a quantizer")
@@ -291,7 +291,7 @@ def test_undeclared_settings_are_left_out_or_refused(
 
 
 def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
-    """A copy with more at a place."""
+    """Return a copy with additional keys in a section."""
     if not place:
         return content | more
     return content | {place[0]: _with(content[place[0]], place[1:], more)}
@@ -328,7 +328,7 @@ def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path
 
 
 def fetching() -> None:
-    """A network that needs a file of the hub, at an address without a server."""
+    """Build a network that needs a file from the hub, whose address has no server."""
     huggingface_hub.hf_hub_download("someone/net", "config.json", endpoint="http://127.0.0.1:9")
 
 

@@ -135,7 +135,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
 
 
 def _quantized(levels: int) -> list[Any]:
-    """Rounding to steps of 1 / levels."""
+    """Round to steps of 1 / levels."""
     return [
         _node("Mul", "p", "many", "levels"),
         _node("Round", "many", "rounded"),
@@ -315,7 +315,7 @@ def test_other_values_of_label_maps_are_unknown(
 
 @pytest.mark.parametrize("batch", [1, "n"])
 def test_one_score_without_an_axis_of_images(batch: int | str, tmp_path: Path) -> None:
-    """Files of a fixed batch of 1 often lack it."""
+    """Files with a fixed batch size of 1 often have no batch axis."""
     nodes = [_node("Sigmoid", "linear", "p"), _node("Squeeze", "p", "scores", "axes")]
     axes, shape = np.array([0, 1]), (batch, 3, 16, 24)
     path = tmp_path / "net.onnx"
@@ -346,7 +346,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
 
 
 class LabelMaps(nn.Module):
-    """Four labels of bright and dark pixels."""
+    """A network with four labels for bright and dark pixels."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -359,7 +359,7 @@ class LabelMaps(nn.Module):
 
 
 class Wrong(nn.Module):
-    """Scores that fit no kind, or a wrong number."""
+    """A network whose scores fit no kind, or have a wrong number."""
 
     def __init__(self, classes: int, function: Any) -> None:
         super().__init__()
@@ -399,7 +399,7 @@ def test_unclear_scores_are_refused(
 
 
 def test_a_stated_kind_is_used(tmp_path: Path) -> None:
-    """Squashed scores in the range of probabilities."""
+    """Scores after a sigmoid, in the range of probabilities, are still logits if stated."""
     path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, _node("Sigmoid", "linear", "scores"))
     trained = _imported(path, score_kind="logits")
     assert (trained.score_kind, trained.groups) == ("logits", None)

@@ -1,4 +1,4 @@
-"""Networks of segmentation-models-pytorch, as its ``save_pretrained`` writes them."""
+"""Networks of segmentation-models-pytorch, saved by ``save_pretrained``."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_scores_are_those_of_the_library(folder: Path, tmp_path: Path) -> None:
 def test_the_normalization_is_that_of_the_encoder(
     largest: int, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As the library applies it to images from 0 to 255."""
+    """The library applies it to images from 0 to 255."""
     given = {
         "mean": [0.5 * largest, 0.4 * largest, 0.3 * largest],
         "std": [0.2 * largest, 0.1 * largest, 0.3 * largest],

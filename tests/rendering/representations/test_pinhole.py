@@ -31,7 +31,7 @@ TILT = rotation_about((1, 2, 0), math.radians(50)) @ rotation_about((0, 0, 1), 1
 
 
 def _labels() -> NDArray[np.uint8]:
-    """Eight octants of the sphere, 1 to 8."""
+    """Labels of the eight octants of the sphere, 1 to 8."""
     positive = equirect_directions(SHAPE) @ [[1, 2, 0], [2, -1, 0], [0, 0.5, 1]] > 0
     return (positive @ [1, 2, 4] + 1).astype(np.uint8)
 
@@ -196,7 +196,7 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
 
 @pytest.mark.parametrize("rows", [24, 100])
 def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> None:
-    """Against bilinear interpolation in double precision, across the seam and beyond the poles."""
+    """Compared with bilinear interpolation in double precision, across seam and poles."""
     scores = torch.randn(1, 3, rows, 2 * rows, generator=torch.Generator().manual_seed(0))
     found = _labels_of(EquirectRepresentation(5, rows=rows), [scores])
     image = scores[0].movedim(0, -1).double().numpy()
@@ -222,10 +222,10 @@ def test_the_identity_counts_as_not_rotated() -> None:
 def test_averages_have_the_highest_mean_probability(
     averaged: dict[str, Any], levels: list[int], blend: Blend, least: float
 ) -> None:
-    """Against the probabilities of every part, rendered on its own in double precision.
+    """Compared with the probabilities of every set of views, rendered in double precision.
 
-    Feathered ones are added up with the weights of all parts, there with those of each: almost the
-    same.
+    Feathered probabilities are summed with the weights of all sets, there with those of each set:
+    almost the same.
     """
     representation = TangentRepresentation(0, 4, blend=blend, **averaged).with_rotation(TILT)
     views, shape = representation.view_sets(), (32, 64)
@@ -251,7 +251,7 @@ def test_averages_have_the_highest_mean_probability(
 
 
 def test_equirectangular_averages_have_the_highest_mean_probability() -> None:
-    """In a tilted frame: scores of every rotation, shifted back, then rotated back."""
+    """In a tilted frame, the scores of every rotation are shifted back, then rotated back."""
     representation = EquirectRepresentation(4, rotations=3).with_rotation(TILT)
     views, shape = representation.view_sets(), (32, 64)
     image = equirect_directions(shape).astype(np.float32)

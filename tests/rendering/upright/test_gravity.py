@@ -1,4 +1,4 @@
-"""The direction of up by rooms drawn with known rotations, and by poses rendered independently."""
+"""The direction of up, from rooms drawn with known rotations and from pose tags."""
 
 from __future__ import annotations
 
@@ -253,11 +253,11 @@ def test_invalid_directions_are_refused(up: Any) -> None:
 
 
 def _horizon_of_pose(pitch_deg: float, roll_deg: float) -> NDArray[np.float64]:
-    """Height in the world, −1 to 1, of what every pixel of a panorama sees.
+    """Return the height in the world, −1 to 1, of every pixel of a panorama.
 
-    By the axes of Google's format: x right, y forward, z up; rotated by the heading (clockwise
-    about z), the pitch about x, the roll about y, in that order, each about the axes as already
-    rotated.
+    Computed in the axes of Google's format: x right, y forward, z up. They are rotated by the
+    heading (clockwise about z), the pitch (about x) and the roll (about y), in that order, each
+    about the rotated axes.
     """
     rotation = Rotation.from_euler("ZXY", [-77, pitch_deg, roll_deg], degrees=True).as_matrix()
     local = equirect_directions((360, 720))[..., [1, 0, 2]]

@@ -43,7 +43,7 @@ def test_figures_are_those_of_the_counts_and_of_the_truth(pair: PanoramaPair) ->
         assert (row["geometry"], row["judged"]) == ("general", p)
         assert row["rotation_error_deg"] < 1
         assert row["translation_error_deg"] < 5
-        # Of one pair the recall is 0 up to its error and 1 from there on.
+        # The recall of one pair is 0 up to its error, and 1 beyond.
         worst = max(row["rotation_error_deg"], row["translation_error_deg"])
         recall = np.linspace(0, 10, 10_001) >= worst
         assert row["pose_auc_10"] == pytest.approx(recall.mean(), abs=1e-3)

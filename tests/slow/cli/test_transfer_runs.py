@@ -71,6 +71,6 @@ def test_classes_and_cameras_are_compared_before_training(tmp_path: Path, run: R
 
     (rooms / "classes.json").write_text(classes)
     write_photo(photos, "scene_1/new.png", 1, film_mm=None)
-    message = r"stage P, in photos: my_photos/images/scene_1/new\.png: found no K in cameras\.json"
+    message = r"stage P: my_photos/images/scene_1/new\.png: found no K in cameras\.json"
     with pytest.raises(SystemExit, match=message):
         run("transfer", *_SETTINGS)

@@ -66,7 +66,7 @@ def test_nan_weights_never_replace_a_good_checkpoint(stanford_root: Path, tmp_pa
         )
     assert _last(tmp_path)["global_step"] == 1
     assert all(tensor.isfinite().all() for tensor in _last(tmp_path)["state_dict"].values())
-    with pytest.raises(SettingError, match=r"loss of step 2 .* not finite already: network\."):
+    with pytest.raises(SettingError, match=r"loss of step 2 .* not finite before: network\."):
         run_trainer(tmp_path / "unsaved", max_epochs=1).fit(
             small_task(Faulty(1, network.wrong)), datamodule=small_data(stanford_root)
         )
