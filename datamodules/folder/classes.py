@@ -119,8 +119,9 @@ def read_classes(path: Path) -> FolderClasses:
 
           {"wall": "#ff0000", "floor": ["#00ff00", "#00ee00"]}
 
-    Other values and colors, including 255, are unknown: such pixels are ignored in training and
-    evaluation. "unknown" is therefore not a class.
+    Other colors, and values that an object does not name, are unknown: such pixels are ignored in
+    training and evaluation. With a list, only 255 (and 65535 of 16 bits) are unknown; other values
+    past its end are errors. "unknown" is therefore not a class.
 
     Args:
         path: File to read.

@@ -344,7 +344,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Key 'levl' is not in struct"),
         ("evaluate", "levels=9", "Is representation.levels meant?"),
-        ("import", "level=9", "Is levels meant?"),
+        ("import_network", "level=9", "Is levels meant?"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
     ],
 )

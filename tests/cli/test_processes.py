@@ -53,7 +53,7 @@ def test_a_signal_to_this_process_reaches_the_job_which_may_finish_its_checkpoin
 def test_ctrl_c_ends_a_job_that_does_not_listen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(processes, "_PATIENCE_S", 0.3)
+    monkeypatch.setattr(processes, "_CHECKPOINT_S", 0.3)
     number = tmp_path / "pid"
     code = (
         f"open({str(number)!r}, 'w').write(str(os.getpid()))\n"

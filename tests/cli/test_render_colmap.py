@@ -199,7 +199,7 @@ def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: P
 
 def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refused) -> None:
     settings = {"output": tmp_path / "poses.json", "cameras": project}
-    assert "expected a folder with a sparse model" in refused(poses=project, **settings)
+    assert "expected a folder with a sparse COLMAP model" in refused(poses=project, **settings)
     (tmp_path / "empty").mkdir()
     pycolmap.Reconstruction().write(tmp_path / "empty")
     assert "found none of the panoramas" in refused(poses=tmp_path / "empty", **settings)

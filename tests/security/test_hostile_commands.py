@@ -115,7 +115,7 @@ def test_a_transfer_interpolates_nothing_of_a_file(run: Path, use: Use) -> None:
     text = json.dumps(described)
     save_file(load_file(run.parent / "net.safetensors"), "theirs.safetensors", {METADATA_KEY: text})
     arguments = ("checkpoint=theirs.safetensors", "data.root=rooms", f"trust={__name__}.noted")
-    use("expected no ${…} in it", "transfer", *arguments)
+    use("expected no ${…}: settings", "transfer", *arguments)
 
 
 def test_hostile_results_are_refused(run: Path, use: Use) -> None:
