@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tangent_train.cli.compose import config_folder
-from tangent_train.cli.help import Setting, description, read_settings
+from tangent_train.cli.help import Setting, bases, description, read_settings
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -57,15 +57,15 @@ def pages() -> dict[Path, str]:
 def _command(name: str) -> str:
     file = CONFIGS / f"{name}.yaml"
     settings = [s for s in read_settings(file) if not s.name.startswith("hydra")]
-    bases = [f"[tangent-{base}](#tangent-{base})" for base in _bases(file)]
-    note = _based_on("It has the settings of", bases, settings)
+    names = [f"[tangent-{base}](#tangent-{base})" for base in _bases(file)]
+    note = _based_on("It has the settings of", names, settings)
     return f"### tangent-{name}\n\n{_text(description(file)[0])}\n\n{note}{_table(settings)}"
 
 
 def _option(file: Path) -> str:
     settings = [s for s in read_settings(file) if not s.name.endswith(("_target_", "_partial_"))]
-    bases = [f"`{file.parent.name}={base}`" for base in _bases(file)]
-    note = _based_on("Based on", bases, settings)
+    names = [f"`{file.parent.name}={base}`" for base in _bases(file)]
+    note = _based_on("Based on", names, settings)
     return f"#### {file.parent.name}={file.stem}\n\n{_prose(file)}\n\n{note}{_table(settings)}"
 
 
@@ -76,14 +76,13 @@ def _experiment(file: Path) -> str:
 
 
 def _bases(file: Path) -> list[str]:
-    defaults = file.read_text("utf-8").partition("defaults:\n")[2].partition("\n\n")[0]
-    return re.findall(r"^  - (?!_self_)(\w+)$", defaults, re.MULTILINE)
+    return [name for group, _, name in bases(file) if not group]
 
 
-def _based_on(start: str, bases: list[str], settings: list[Setting]) -> str:
-    if not bases:
+def _based_on(start: str, names: list[str], settings: list[Setting]) -> str:
+    if not names:
         return ""
-    return f"{start} {' and '.join(bases)}{', with:' if settings else '.'}\n\n"
+    return f"{start} {' and '.join(names)}{', with:' if settings else '.'}\n\n"
 
 
 def _table(settings: Iterable[Setting]) -> str:

@@ -21,7 +21,10 @@ from tangent_train.registry import without_interpolation
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
 """Text that Hydra reads literally without quotes."""
 
-_OPTIONS_WITH_VALUE = "--config-dir -cd --config-name -cn --config-path -cp --package -p --info -i"
+_OPTION_WITH_VALUE = re.compile(
+    "--(cfg|config-(dir|name|path)|experimental-rerun|info|package)|-(c|cd|cn|cp|i|p)"
+)
+"""Options of Hydra whose value is the next argument."""
 
 _SWEEP_VALUE = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
 """One value of a sweep, and the comma after it."""
@@ -40,19 +43,14 @@ def overrides_first(arguments: Sequence[str]) -> list[str]:
     Args:
         arguments: Command line after the program's name.
 
-    >>> overrides_first(["level=7", "--config-dir", "own", "seed=1", "-m"])
-    ['level=7', 'seed=1', '--config-dir', 'own', '-m']
+    >>> overrides_first(["level=7", "--config-dir", "own", "level=8", "-m", "--cfg", "job"])
+    ['level=7', 'level=8', '--config-dir', 'own', '-m', '--cfg', 'job']
     """
-    options = [
-        argument.startswith("-") or before in _OPTIONS_WITH_VALUE
-        for before, argument in pairwise(["", *arguments])
-    ]
-    return [
-        a
-        for wanted in (False, True)
-        for a, o in zip(arguments, options, strict=True)
-        if o is wanted
-    ]
+    ordered = sorted(  # which keeps the order of the overrides: the last one of a setting wins
+        pairwise(["", *arguments]),
+        key=lambda pair: pair[1].startswith("-") or bool(_OPTION_WITH_VALUE.fullmatch(pair[0])),
+    )
+    return [argument for _, argument in ordered]
 
 
 def literal_paths(command: str, arguments: Sequence[str]) -> list[str]:

@@ -66,6 +66,15 @@ def description(file: Path) -> list[str]:
     return [line[2:] for line in top[0].splitlines() if "@package" not in line] if top else []
 
 
+def bases(file: Path) -> list[tuple[str, str, str]]:
+    """Return group, package and name of the options that a config file builds on.
+
+    Group and package are empty for options of the file's own group.
+    """
+    defaults = file.read_text("utf-8").partition("defaults:\n")[2].partition("\n\n")[0]
+    return _BASE.findall(defaults)
+
+
 def _settings(section: Any, text: str, prefix: str) -> Iterator[Setting]:
     for key, value in section.value:
         comment = text.splitlines()[key.start_mark.line].partition(" # ")[2].strip()
@@ -101,8 +110,7 @@ def _option_comments(folder: Path) -> Comments:
 
 def _with_bases(file: Path) -> dict[str, Setting]:
     settings: dict[str, Setting] = {}
-    defaults = file.read_text("utf-8").partition("defaults:\n")[2].partition("\n\n")[0]
-    for group, package, name in _BASE.findall(defaults):
+    for group, package, name in bases(file):
         base = _with_bases(file.parents[1] / (group or file.parent.name) / f"{name}.yaml")
         renamed = (s._replace(name=f"{package}.{s.name}".lstrip(".")) for s in base.values())
         settings |= {setting.name: setting for setting in renamed}

@@ -65,11 +65,11 @@ def check_names(command: str, settings: Mapping[str, Any], references: str) -> N
 
 
 def probable_setting(command: str, name: str) -> str:
-    """A sentence with the setting that a refused name probably means; "" without one.
+    """Return a question with the setting that a refused name probably means, or "".
 
     Args:
-        command: The command.
-        name: The name, such as ``levels``, which is ``representation.levels`` of a run.
+        command: Name of the command.
+        name: Refused name, e.g. ``levels``, which is ``representation.levels`` of a run.
     """
     declared = declared_settings(command)
     views = yaml.safe_load((config_folder() / "representation/tangent.yaml").read_text("utf-8"))

@@ -244,10 +244,10 @@ def panorama_settings(
         )
     if is_tangent and (side := trained.photo_side) is not None:
         dim = settings.get("dim")
-        of_side = images_of_side(side, level, base_level)
+        # The network divides larger images.
         settings |= (
-            of_side if dim is None else {"dim": max(dim, side)}
-        )  # the network divides larger images
+            images_of_side(side, level, base_level) if dim is None else {"dim": max(dim, side)}
+        )
     return settings
 
 

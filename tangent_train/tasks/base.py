@@ -424,10 +424,7 @@ class Task(lightning.LightningModule, ABC):
             )
 
     def _check_monitors(self, logged: Collection[str]) -> None:
-        """Refuse monitored validation values that are not logged.
-
-        The first check comes before the training: Lightning validates a few images first.
-        """
+        """Refuse monitored validation values that are not logged, before a callback reads them."""
         monitors = [
             (f"monitor of {type(callback).__name__}", getattr(callback, "monitor", None))
             for callback in self.trainer.callbacks  # type: ignore[attr-defined]
@@ -444,8 +441,7 @@ class Task(lightning.LightningModule, ABC):
                     name,
                     found=monitor,
                     expected=f"one of {', '.join(sorted(logged))}",
-                    remedy="A callback that logs values only later needs "
-                    "trainer.num_sanity_val_steps=0.",
+                    remedy="Your own callback can log it in on_validation_epoch_end.",
                 )
 
     test_step = validation_step

@@ -112,9 +112,8 @@ def import_network(
             write_metadata(network.network.path, temporary, described)
         else:
             _write_checkpoint(described, temporary)
-        trained = load_trained(
-            temporary, unregistered(network.settings)
-        )  # the classes are from the user
+        # The classes are from the user.
+        trained = load_trained(temporary, unregistered(network.settings))
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 

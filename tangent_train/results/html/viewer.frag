@@ -10,7 +10,7 @@ const float PI = 3.14159265358979;
 const int INSIDE = 0, PLANET = 1, FLAT = 2;
 const int INPUT = 0, TRUTH = 1, PREDICTION = 2, ERROR = 3, OVERLAY = 4;
 const vec3 OUTSIDE = vec3(0.086, 0.094, 0.11);
-const vec3 WRONG = vec3(214.0, 39.0, 40.0) / 255.0, UNLABELLED = vec3(110.0 / 255.0);
+const vec3 WRONG = vec3(214.0, 39.0, 40.0) / 255.0, UNLABELED = vec3(110.0 / 255.0);
 // Four samples in a turned square: class borders without steps.
 const vec2 OFFSETS[4] =
     vec2[](vec2(-0.125, -0.375), vec2(0.375, -0.125), vec2(0.125, 0.375), vec2(-0.375, 0.125));
@@ -89,7 +89,7 @@ vec3 shown(vec3 photo, vec2 uv) {
   if (uLayer == OVERLAY) return visible && index > 0 ? mix(photo, entry.rgb, uOpacity) : photo;
   if (!visible) return vec3(0.4 * gray);
   if (uLayer != ERROR) return entry.rgb;
-  if (truth == 0) return UNLABELLED;
+  if (truth == 0) return UNLABELED;
   return truth == prediction ? vec3(0.75 + 0.25 * gray) : WRONG;
 }
 

@@ -260,8 +260,8 @@ class Viewer {
       "-": () => view.zoom(0.8),
       0: () => view.reset(),
       Home: () => view.reset(),
-      PageUp: () => this.neighbour(-1),
-      PageDown: () => this.neighbour(1),
+      PageUp: () => this.neighbor(-1),
+      PageDown: () => this.neighbor(1),
       f: () => this.fullScreen(),
     };
     LAYERS.forEach((layer, k) => (actions[k + 1] = () => this.setLayer(layer)));
@@ -272,7 +272,7 @@ class Viewer {
     this.redraw();
   }
 
-  neighbour(step) {
+  neighbor(step) {
     const { items } = this;
     this.choose(items[(items.indexOf(this.current) + step + items.length) % items.length]);
   }
