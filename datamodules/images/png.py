@@ -157,5 +157,5 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
             "representation.erp_height",
             found=erp_height,
             expected=f"at most the {height} rows of {path}",
-            remedy=f"Set representation.erp_height={height}, or a lower level.",
+            remedy=f"Set representation.erp_height={height}, or a lower level if it is not set.",
         )

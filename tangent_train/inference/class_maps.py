@@ -58,12 +58,14 @@ class MappedNetwork:
     Attributes:
         trained: The network.
         classes: Classes of the original network in each target class.
+        absent: Source classes of the map that the original network lacks.
         unmapped: Other classes of the original network.
         unmapped_wins: True if unmapped classes may win, as label 0.
     """
 
     trained: TrainedNetwork
     classes: Mapping[str, Sequence[str]]
+    absent: Sequence[str]
     unmapped: Sequence[str]
     unmapped_wins: bool
 
@@ -73,6 +75,8 @@ class MappedNetwork:
         missing = [name for name, names in self.classes.items() if not names]
         if missing:
             parts.append(f"not predicted: {', '.join(missing)}")
+        if self.absent:
+            parts.append(f"not in the network: {', '.join(self.absent)}")
         if self.unmapped:
             effect = "unknown where they win" if self.unmapped_wins else "never win"
             parts.append(f"{effect}: {', '.join(self.unmapped)}")
@@ -172,6 +176,7 @@ def map_classes(
     return MappedNetwork(
         trained=replace(trained, class_names=("unknown", *targets), groups=scores),
         classes=found,
+        absent=[n for n in target_of if n not in map(_plain, names)],
         unmapped=[names[k] for k in remaining],
         unmapped_wins=unmapped == "unknown",
     )

@@ -108,8 +108,8 @@ def find_blocks(name: str, text: str) -> Iterator[Block]:
 
 
 def split_line(line: str) -> tuple[dict[str, str], list[str]]:
-    """Return the variables and the words of a command line, split like a shell does."""
-    joined = _OPEN.sub(lambda found: found[0].replace(" ", "_"), line)
+    """Return the variables and words of a command line before a pipe, split like a shell does."""
+    joined = _OPEN.sub(lambda found: found[0].replace(" ", "_"), line.partition(" | ")[0])
     words = shlex.split(joined, comments=True)
     variables: dict[str, str] = {}
     while words and (words[0] == "export" or re.match(r"\w+=", words[0])):
@@ -138,7 +138,7 @@ def fill_in(words: list[str], world: Path) -> list[str]:
             value = value.partition(",")[0]
         filled.append(f"{name}{equals}{value}")
     if program == "tangent-predict" and not any(word.startswith("depth=") for word in arguments):
-        filled = [word.replace("runs/demo", "runs/rgb") for word in filled]
+        filled = [re.sub("runs/(demo|student)", "runs/rgb", word) for word in filled]
     if "data=stanford2d3ds_pairs" in filled:
         filled = [word.replace("data/2d3ds", "data/pairs") for word in filled]
     return [program, *(word for word in filled if word != "-m" or not is_sweep)]
