@@ -71,6 +71,7 @@ def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:
     mapped = map_classes(_trained(names), given)
     assert mapped.classes == {"seat": names[:1], "hole": names[1:2], "ground": names[2:3]}
     assert mapped.unmapped == ["floor"]
+    assert "; not in the network: window; unknown where they win: floor" in f"{mapped}"
 
 
 @pytest.mark.parametrize("nothing", [None, [6]], ids=["all", "nothing"])
