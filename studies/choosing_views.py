@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from studies.output import COLORS, Row, save
-from tangent_train.geometry import PinholeGrid, TangentGrid, lonlat_to_equirect
+from tangent_train.geometry import TangentGrid, lonlat_to_equirect
 from tangent_train.inference.representations import images_of_side, wide_levels
 from tangent_train.rendering import equirect_to_tangent
 
@@ -31,15 +31,6 @@ DIRECTION = (0.45, -0.2, -0.87)
 """The views are the nearest ones to this direction: ahead and down."""
 
 
-def width_deg(grid: PinholeGrid) -> float:
-    """Return the angle across the middle of an image, from edge to edge.
-
-    Args:
-        grid: The images.
-    """
-    return 2 * math.degrees(math.atan(grid.half_extent))
-
-
 def wide_views() -> list[Row]:
     """Return the views that `tangent-import` stores, by the side of the network's images."""
     rows: list[Row] = []
@@ -48,7 +39,7 @@ def wide_views() -> list[Row]:
         grids = [TangentGrid(level=level, **images_of_side(side, levels[0])) for level in levels]
         row: Row = {"network's images": f"{side} × {side}", "levels": f"[{levels[0]},{levels[1]}]"}
         row["views"] = sum(grid.num_images for grid in grids)
-        row["wide, degrees"] = ", ".join(f"{width_deg(grid):.0f}" for grid in grids)
+        row["wide, degrees"] = ", ".join(f"{grid.width_deg:.0f}" for grid in grids)
         densities = [math.radians(1 / grid.pitch) for grid in grids]
         row["pixels per degree"] = ", ".join(f"{density:.1f}" for density in densities)
         rows.append(row)
@@ -85,7 +76,7 @@ def picture(panorama: NDArray[np.uint8]) -> Figure:
         axes["A"].plot(*pixels.T, ".", color=color, markersize=2.5)
         axes[name].imshow(equirect_to_tangent(panorama, grid)[face])
         axes[name].set_title(
-            f"level {level}, base level {base_level}: {width_deg(grid):.0f}°", color=color
+            f"level {level}, base level {base_level}: {grid.width_deg:.0f}°", color=color
         )
     for one in axes.values():
         one.set_axis_off()

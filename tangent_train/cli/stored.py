@@ -43,7 +43,7 @@ _RUN = {
 }
 """Settings outside the sections, with their kinds."""
 
-_ONLY_FOR_TRAINING = ("ema", "init_from", "optimizer", "resume", "scheduler")
+_NOT_EVALUATED = ("ema", "init_from", "optimizer", "resume", "scheduler")
 """Settings that an evaluation does not read."""
 
 _EXPECTED = "the settings of a run"
@@ -308,7 +308,7 @@ def _check_evaluation(path: Path, typed: set[str], *, is_run: bool) -> None:
         section = name.partition(".")[0]
         if section == "network" and (not is_run or "class_map" in typed):
             raise SettingError(name, found="a value", expected=f"none: the network is in {path}")
-        if section in _ONLY_FOR_TRAINING:
+        if section in _NOT_EVALUATED:
             expected = "none: tangent-evaluate does not train"
             raise SettingError(name, found="a value", expected=expected, remedy="Remove it.")
 

@@ -112,6 +112,11 @@ class PinholeGrid(ABC):
         return (self.dim - 1) / 2 * self.pitch
 
     @property
+    def width_deg(self) -> float:
+        """Angle across the middle of an image, between its outer pixel edges, in degrees."""
+        return math.degrees(2 * math.atan(self.dim * self.pitch / 2))
+
+    @property
     def fov_deg(self) -> float:
         """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
         return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))

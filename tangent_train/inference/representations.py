@@ -105,7 +105,7 @@ class PanoramaViews:
         if not tangent:
             return text
         parts = [
-            f"level {level}: {math.degrees(2 * math.atan(grid.dim / 2 * grid.pitch)):.0f}° wide, "
+            f"level {level}: {grid.width_deg:.0f}° wide, "
             f"{math.radians(1 / grid.pitch):.1f} pixels per degree in the middle"
             for level, grid in tangent.items()
         ]

@@ -7,7 +7,6 @@ Their world frame is right-handed: x forward (to the middle column of the panora
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -109,7 +108,7 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
             "width": grid.dim,
             "height": grid.dim,
             "matrix": grid.camera_matrix.tolist(),
-            "fov_deg": math.degrees(2 * math.atan(grid.dim * grid.pitch / 2)),
+            "fov_deg": grid.width_deg,
         },
         "images": [
             {

@@ -142,3 +142,11 @@ def test_least_dim_covers_the_voronoi_cells_exactly(base_level: int, finer: int)
         TangentGrid(base_level, level, least - 1)
     assert TangentGrid(base_level, level, least).half_extent >= voronoi_extent(base_level)
     assert TangentGrid.least_dim(base_level, level) == least
+
+
+def test_the_width_is_the_angle_between_outer_pixel_edges() -> None:
+    for base_level, width_deg in enumerate((95.82, 57.94, 32.83, 17.01, 8.59)):
+        grid = TangentGrid(base_level, 10)
+        edges = (np.array([-0.5, grid.dim - 0.5]) - grid.camera_matrix[0, 2]) * grid.pitch
+        assert grid.width_deg == pytest.approx(np.degrees(np.ptp(np.arctan(edges))))
+        assert grid.width_deg == pytest.approx(width_deg, abs=0.005)
