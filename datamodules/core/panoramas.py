@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.labels import ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
@@ -329,18 +330,26 @@ class _Reading:
         reader: Reader of the data set.
         num_classes: K + 1, including the unknown class.
         shape: Rows and columns of the result; None for the size of the files.
+        class_set: Classes of the result; None for the classes of the reader.
         kind: Named tuple that is returned, `Panorama` or `Photo`.
     """
 
     reader: ImageReader
     num_classes: int
     shape: tuple[int, int] | None = None
+    class_set: ClassSet | None = None
     kind: ClassVar[type[Panorama | Photo]]
 
     @property
     def store_name(self) -> str:
         """Name of the images in a store."""
         return "photos" if self.shape is None else "{}x{}".format(*self.shape)
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """See `ImageReader`; with the classes."""
+        classes = {} if self.class_set is None else {"classes": repr(self.class_set)}
+        return {**self.reader.settings, **classes}
 
     @property
     def layout(self) -> Layout:
@@ -355,6 +364,7 @@ class _Reading:
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Return only the labels, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
+        labels = labels if self.class_set is None else self.class_set.relabel(labels)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
