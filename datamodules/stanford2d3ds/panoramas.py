@@ -36,7 +36,7 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.index import Split, draw_groups
 from datamodules.core.panoramas import ImageFiles, Unknown
 from datamodules.core.problems import Problems
-from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, FOLDS, GET_IT, list_pictures
+from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, CLASSES, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
@@ -61,6 +61,7 @@ class StanfordAreas(ImageDataModule):
         SettingError: A setting is invalid.
     """
 
+    class_names = ("unknown", *CLASSES)
     class_sets = CLASS_SETS
     group: ClassVar[Literal["pano", "data"]]
 
