@@ -31,6 +31,7 @@ from datamodules.core.panoramas import (
     PanoramaReading,
     PhotoReading,
     TestRotation,
+    Unknown,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -65,6 +66,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
         classes: Name of a set of classes of the data set; None for the first.
+        unknown: Black pixels that are unknown too, see `mask_black`.
 
     Attributes:
         normalizations: Default normalizations, without and with depth.
@@ -84,6 +86,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
     classes: str | int | None = None
+    unknown: Unknown = "labels"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -93,6 +96,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         self.class_set = None if chosen is None else self.class_sets[chosen]
         if self.class_set is not None:
             self.class_names = ("unknown", *self.class_set.names)
+        known = ("labels", "any_black", "all_black")
+        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         given = self.normalization or self.normalizations[with_depth]
@@ -214,7 +219,7 @@ class PanoramaDataModule(ImageDataModule):
     def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        return PanoramaReading(reader, len(self.class_names), shape, self.class_set)
+        return PanoramaReading(reader, len(self.class_names), shape, self.class_set, self.unknown)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; also checks that the panorama has a mask."""
@@ -301,7 +306,7 @@ class PhotoDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return PhotoReading(reader, len(self.class_names), None, self.class_set)
+        return PhotoReading(reader, len(self.class_names), None, self.class_set, self.unknown)
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""

@@ -331,6 +331,7 @@ class _Reading:
         num_classes: K + 1, including the unknown class.
         shape: Rows and columns of the result; None for the size of the files.
         class_set: Classes of the result; None for the classes of the reader.
+        unknown: Black pixels that are unknown, see `mask_black`.
         kind: Named tuple that is returned, `Panorama` or `Photo`.
     """
 
@@ -338,6 +339,7 @@ class _Reading:
     num_classes: int
     shape: tuple[int, int] | None = None
     class_set: ClassSet | None = None
+    unknown: Unknown = "labels"
     kind: ClassVar[type[Panorama | Photo]]
 
     @property
@@ -347,9 +349,9 @@ class _Reading:
 
     @property
     def settings(self) -> Mapping[str, str]:
-        """See `ImageReader`; with the classes."""
-        classes = {} if self.class_set is None else {"classes": repr(self.class_set)}
-        return {**self.reader.settings, **classes}
+        """See `ImageReader`; also classes and black pixels."""
+        own = {"classes": repr(self.class_set), "unknown": self.unknown}
+        return {**self.reader.settings, **own}
 
     @property
     def layout(self) -> Layout:
@@ -365,6 +367,10 @@ class _Reading:
         """Return only the labels, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
         labels = labels if self.class_set is None else self.class_set.relabel(labels)
+        if self.unknown != "labels":
+            rgb = self.reader.rgb(files)
+            rgb = rgb if self.shape is None else resize_nearest(rgb, self.shape)
+            labels = mask_black(labels, rgb, self.unknown)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
