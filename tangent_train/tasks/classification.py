@@ -31,7 +31,7 @@ class ClassificationTask(Task):
         result: Counts ``(K, K)`` of the last evaluation; rows are true, columns predicted classes.
     """
 
-    labels: ClassVar[str] = IMAGE_CLASS
+    label_kind: ClassVar[str] = IMAGE_CLASS
     predicts: ClassVar[str] = IMAGE_CLASS
     headings: ClassVar[Mapping[str, Heading]] = {
         "accuracy": Heading("accuracy"),
