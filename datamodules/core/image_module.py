@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -48,7 +49,7 @@ from datamodules.core.transforms import (
 )
 from datamodules.images.gpano import whole_area
 from datamodules.images.masks import Mask, Masks
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tangent_train.geometry import shift_range
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
@@ -111,6 +112,11 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         Raises:
             DataError: The data set as a whole cannot be used.
         """
+
+    def groups(self, files: ImageFiles) -> Sequence[str]:
+        """Return the rows of the results that an image belongs to, such as a weather."""
+        del files
+        return ()
 
     @abstractmethod
     def reading(self, reader: ImageReader) -> PanoramaReading | PhotoReading:
@@ -318,9 +324,14 @@ class PhotoDataModule(ImageDataModule):
             try:
                 shift_range(camera_matrix, size, representation.fov_deg, representation.image_size)
             except SettingError as error:
-                raise DataError(
-                    files.rgb,
-                    found=error.found,
+                columns = representation.image_size[1]
+                extent = camera_matrix[1, 1] * math.tan(math.radians(representation.fov_deg) / 2)
+                rows = int(size[0] / 2 / extent * columns)
+                # A setting: if it fits none of the photos, it is refused once.
+                raise SettingError(
+                    "representation.fov_deg",
+                    found=f"{error.found}, {files.rgb}",
                     expected=f"all of a crop of {representation.fov_deg:g}°",
-                    remedy="Lower representation.fov_deg, or remove the photo.",
+                    remedy="Lower it, make the crops less high with "
+                    f"representation.dim=[{rows},{columns}] or fewer rows, or remove the photo.",
                 ) from error
