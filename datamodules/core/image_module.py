@@ -23,6 +23,7 @@ from datamodules.core.inputs import (
     ordered_inputs,
 )
 from datamodules.core.labeled_images import LabeledImages
+from datamodules.core.labels import ClassSet
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
@@ -30,6 +31,7 @@ from datamodules.core.panoramas import (
     PanoramaReading,
     PhotoReading,
     TestRotation,
+    Unknown,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -65,9 +67,12 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
+        classes: Name of a set of classes of the data set; None for the first.
+        unknown: Black pixels that are unknown too, see `mask_black`.
 
     Attributes:
         normalizations: Default normalizations, without and with depth.
+        class_sets: Sets of classes by name, see `class_sets`; empty if there is only one.
 
     Raises:
         SettingError: A setting is invalid.
@@ -78,11 +83,23 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         RGBD_NORMALIZATION,
     )
 
+    class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
+    classes: str | int | None = None
+    unknown: Unknown = "labels"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        chosen = next(iter(self.class_sets), None) if self.classes is None else str(self.classes)
+        fine = chosen is None or chosen in self.class_sets
+        self.require("classes", fine, " or ".join(self.class_sets) or "null: no other classes")
+        self.class_set = None if chosen is None else self.class_sets[chosen]
+        if self.class_set is not None:
+            self.class_names = ("unknown", *self.class_set.names)
+        known = ("labels", "any_black", "all_black")
+        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         given = self.normalization or self.normalizations[with_depth]
@@ -114,7 +131,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """See `LabeledData`."""
         reader, splits = self.find_images(problems)
         read = self.reading(reader)
-        store = Store.of(self.store, read.store_name, reader.settings, read.layout)
+        store = Store.of(self.store, read.store_name, read.settings, read.layout)
         index = DatasetIndex(self.noun, splits, read, read.kind, store)
         check = partial(self.check_image, reader=reader, problems=problems)
         for _ in in_threads(check, index.of()):
@@ -214,7 +231,8 @@ class PanoramaDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
-        return PanoramaReading(reader, len(self.class_names), self.canvas.image_shape)
+        shape, count = self.canvas.image_shape, len(self.class_names)
+        return PanoramaReading(reader, count, shape, self.class_set, self.unknown)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; also checks that the panorama has a mask."""
@@ -312,7 +330,7 @@ class PhotoDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return PhotoReading(reader, len(self.class_names))
+        return PhotoReading(reader, len(self.class_names), None, self.class_set, self.unknown)
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""
