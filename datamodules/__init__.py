@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datamodules.cityscapes.photos import Cityscapes as Cityscapes
     from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
     from datamodules.folder.labeled import FolderPanoramas as FolderPanoramas
     from datamodules.folder.labeled import FolderPhotos as FolderPhotos
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     )
     from datamodules.structured3d.rooms import Structured3D as Structured3D
     from datamodules.structured3d.rooms import Structured3DPerspective as Structured3DPerspective
+    from datamodules.synpass.panoramas import SynPASS as SynPASS
     from datamodules.synthia.omnisynthia import OmniSynthia as OmniSynthia
     from datamodules.synthia.omnisynthia import SynthiaPerspective as SynthiaPerspective
     from datamodules.synthrooms.datamodule import SynthRooms as SynthRooms
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
     from datamodules.zind.panoramas import Zind as Zind
 
 _CLASSES = {
+    "cityscapes.photos": ("Cityscapes",),
     "core.panorama_pairs": ("ImagePairs",),
     "folder.labeled": ("FolderPanoramas", "FolderPhotos"),
     "matterport360.panoramas": ("Matterport360",),
@@ -39,6 +42,7 @@ _CLASSES = {
     "stanford2d3ds.pairs": ("StanfordPairs",),
     "stanford2d3ds.panoramas": ("Stanford2D3DS", "Stanford2D3DSPerspective"),
     "structured3d.rooms": ("Structured3D", "Structured3DPerspective"),
+    "synpass.panoramas": ("SynPASS",),
     "synthia.omnisynthia": ("OmniSynthia", "SynthiaPerspective"),
     "synthrooms.datamodule": ("SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"),
     "synthshapes.datamodule": ("SynthShapes",),

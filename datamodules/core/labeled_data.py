@@ -58,7 +58,7 @@ class LabeledData(ABC, Generic[_Item]):
 
     Attributes:
         class_names: Name of every label; for pixel labels the first is unknown, not a class.
-        label_kind: Kind of labels of the items, see `datamodules.core.labels`.
+        labels: Kind of labels of the items, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
         label_counts: After `check`, ``(K+1,)`` pixels of each label in the files, by split.
 
@@ -66,7 +66,7 @@ class LabeledData(ABC, Generic[_Item]):
         SettingError: A setting is invalid.
     """
 
-    label_kind: ClassVar[str] = PIXEL_CLASSES
+    labels: ClassVar[str] = PIXEL_CLASSES
     noun: ClassVar[str]
 
     root: Path = field(kw_only=False)
@@ -187,7 +187,7 @@ class LabeledData(ABC, Generic[_Item]):
         """
         names = getattr(self, "class_names", ())
         setting = f"class_names of {type(self).__name__}"
-        if not names or (self.label_kind == PIXEL_CLASSES and names[0] != "unknown"):
+        if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
             raise SettingError(
                 setting,
                 found=f"{names[0]} first" if names else "none",
@@ -312,7 +312,7 @@ class LabeledData(ABC, Generic[_Item]):
     @property
     def num_classes(self) -> int:
         """Number of classes K, which is the number of scores of a network."""
-        return len(self.class_names) - (self.label_kind == PIXEL_CLASSES)
+        return len(self.class_names) - (self.labels == PIXEL_CLASSES)
 
     def source(self, split: Split) -> SplitReader[_Item, Any]:
         """Return the source of a split; with `in_memory`, read everything now."""

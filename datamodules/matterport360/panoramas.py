@@ -5,13 +5,13 @@ different classes and scenes: ten scenes for training in `sfss` are for the test
 
 On disk, as released; 8-bit labels, 16-bit depth, 0 = missing::
 
-    root/                            protocol=360fv (360FV-Matterport, of 360BEV)
+    root/                            release=360fv (360FV-Matterport, of 360BEV)
       <scene>/rgb/<uuid>.png         or .jpg
       <scene>/semantic/<uuid>.png    0 to 41, see ``classes.csv``
       <scene>/depth/<uuid>.png       1/4000 m
-    root/                            protocol=sfss (Matterport3D-1K, of SFSS-MMSI)
+    root/                            release=sfss (Matterport3D-1K, of SFSS-MMSI)
       <scene>/panorama/undistorted_color_images/<uuid>.png
-      <scene>/panorama/segmentation_maps_classes/<uuid>.png    0 to 41, one more than above
+      <scene>/panorama/segmentation_maps_classes/<uuid>.png    0 to 41, one higher than above
       <scene>/panorama/undistorted_depth_images/<uuid>.png     taken as 1/4000 m
       train.txt validation.txt test.txt    only compared: they are known to be incomplete
 
@@ -30,18 +30,31 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.index import SPLITS, Split, published_splits
 from datamodules.core.inputs import Input
+from datamodules.core.labels import ClassSet
 from datamodules.core.numbered import NumberedReader
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
+
+_HERE = Path(__file__).parent
+
+
+def read_table(name: str) -> list[dict[str, str]]:
+    """Read ``classes.csv`` or ``scenes.csv``: rows of values by column."""
+    with (_HERE / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in read_table("classes.csv"))
+"""Categories of the numbers 0 to 41 of `360fv`; those of `sfss` are one higher, 0 is the last."""
 
 CLASSES: tuple[str, ...] = (
     *("wall", "floor", "chair", "door", "table", "picture", "furniture", "objects", "window"),
@@ -49,6 +62,13 @@ CLASSES: tuple[str, ...] = (
     *("counter", "shelving"),
 )
 """The 20 classes of `360fv`."""
+
+
+def _merged(column: str) -> ClassSet:
+    """Return the 20 classes by a column of ``classes.csv``."""
+    merged = {row["category"]: row[column] for row in read_table("classes.csv")}
+    return ClassSet(CLASSES, CATEGORIES, merged)
+
 
 _GET_IT = (
     "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from 360BEV "
@@ -68,25 +88,17 @@ _FOLDERS = {
 }
 """Folders of a scene: color, classes, depth."""
 
-_PUBLISHED: Mapping[str, Mapping[Split, int]] = {"360fv": {"train": 7829, "val": 772, "test": 2014}}
+_PUBLISHED: Mapping[str, Mapping[str, int]] = {"360fv": {"train": 7829, "val": 772, "test": 2014}}
 _LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
-
-
-def read_table(name: str) -> list[dict[str, str]]:
-    """Read ``classes.csv`` or ``scenes.csv``: rows of values by column."""
-    with Path(__file__).with_name(name).open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
 
 
 @registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Matterport360(PanoramaDataModule):
-    """Panoramas of Matterport3D, 20 classes, or 41 with ``protocol=sfss``.
+    """Panoramas of Matterport3D, 20 classes, or 41 with ``release=sfss``.
 
     Args:
-        protocol: `360fv` or `sfss`, see above.
-        labels: Classes of three numbers with `360fv`: `corrected`, or `360bev` as in the table of
-            that repository (column is picture, furniture is objects, unlabeled is objects).
+        release: `360fv` or `sfss`, see above.
         test_split: Published split of the test panoramas. With `val`, validation uses scenes
             drawn from the training scenes, so that nothing is selected on the test panoramas.
 
@@ -94,25 +106,22 @@ class Matterport360(PanoramaDataModule):
         SettingError: A setting is invalid.
     """
 
+    class_sets: ClassVar[Mapping[str, ClassSet]] = {
+        "20": _merged("corrected"),
+        "360bev": _merged("360bev"),
+        "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
+    }
+
     inputs: Sequence[Input] = ("rgb",)
-    protocol: Literal["360fv", "sfss"] = "360fv"
-    labels: Literal["corrected", "360bev"] = "corrected"
+    release: Literal["360fv", "sfss"] = "360fv"
     test_split: Literal["test", "val"] = "test"
 
     def __post_init__(self) -> None:
-        self.require_one_of("protocol", "360fv", "sfss")
-        self.require_one_of("labels", "corrected", "360bev")
+        self.require_one_of("release", "360fv", "sfss")
         self.require_one_of("test_split", "test", "val")
-        is_fine = self.protocol == "360fv" or self.labels == "corrected"
-        self.require("labels", is_fine, "corrected: sfss has other classes")
-        self._table = np.full(256, 255, np.uint8)
-        rows = read_table("classes.csv")
-        if self.protocol == "sfss":
-            self.class_names = ("unknown", *(row["category"] for row in rows[:-1]))
-            self._table[: len(rows)] = range(len(rows))
-        else:
-            self.class_names = ("unknown", *CLASSES)
-            self._table[: len(rows)] = [self.class_names.index(row[self.labels]) for row in rows]
+        is_sfss = self.release == "sfss"
+        self.classes = str(self.classes or (41 if is_sfss else 20))
+        self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
         super().__post_init__()
 
     def find_images(
@@ -122,29 +131,32 @@ class Matterport360(PanoramaDataModule):
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
         rows = read_table("scenes.csv")
         for split in SPLITS:
-            scenes = [row["scene"] for row in rows if row[self.protocol] == split]
-            found = {scene: self._list_images(scene) for scene in scenes}
-            splits[split] = [files for images in found.values() for files in images]
-            missing = [scene for scene in scenes if not found[scene]]
+            scenes = [row["scene"] for row in rows if row[self.release] == split]
+            listed = {scene: self._list_images(scene) for scene in scenes}
+            splits[split] = [files for images in listed.values() for files in images]
+            missing = [scene for scene in scenes if not listed[scene]]
             if missing:
                 problems.warnings.append(
                     f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "
                     f"{', '.join(missing[:3])}"
                 )
         if not any(splits.values()):
-            expected = f"{'/<uuid>.png, <scene>/'.join(_FOLDERS[self.protocol])}/<uuid>.png"
-            found = f"no panoramas of protocol={self.protocol}"
+            expected = f"{'/<uuid>.png, <scene>/'.join(_FOLDERS[self.release])}/<uuid>.png"
+            found = f"no panoramas of release={self.release}"
             raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
-        if self.protocol in _PUBLISHED:
-            counts = {split: len(images) for split, images in splits.items()}
-            problems.compare_counts(counts, [_PUBLISHED[self.protocol]])
+        if self.release in _PUBLISHED:
+            counts: dict[str, int] = {split: len(images) for split, images in splits.items()}
+            problems.compare_counts(counts, [_PUBLISHED[self.release]])
         else:
             self._compare_lists(splits, problems)
         given = self.test_split, self.validation_fraction, self.seed
-        return NumberedReader(self._table, units_per_m=4000), published_splits(splits, *given)
+        numbers = len(CATEGORIES)
+        table = np.full(256, 255, np.uint8)
+        table[:numbers] = np.arange(numbers) + (self.release == "360fv")
+        return NumberedReader(table, units_per_m=4000), published_splits(splits, *given)
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
-        rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.protocol])
+        rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
         found = {path.stem: path for path in sorted((*rgb.glob("*.jpg"), *rgb.glob("*.png")))}
         images = []
         for stem, path in found.items():

@@ -65,7 +65,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
-    label_kind: ClassVar[str] = IMAGE_CLASS
+    labels: ClassVar[str] = IMAGE_CLASS
 
     shapes_per_step: int = 16
     test_rotation: TestRotation = None

@@ -53,7 +53,7 @@ _GET_IT = (
     "Request Structured3D at https://structured3d-dataset.org and point data.root at the folder "
     "with scene_00000 and the others."
 )
-_PUBLISHED: Sequence[Mapping[Split, int]] = ({"train": 18362, "val": 1776, "test": 1697},)
+_PUBLISHED: Sequence[Mapping[str, int]] = ({"train": 18362, "val": 1776, "test": 1697},)
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
 

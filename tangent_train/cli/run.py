@@ -240,12 +240,12 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
     data = build_from_config(settings["data"], "data", source, representation=representation)
     data.check_classes()
     task = resolve_target(settings["task"], "task", source)
-    needed = getattr(task, "label_kind", data.label_kind)
-    if needed != data.label_kind:
+    needed = getattr(task, "labels", data.labels)
+    if needed != data.labels:
         raise SettingError(
             "task",
             found=f"{getattr(task, '__name__', task)}, which needs {needed}",
-            expected=f"a task for {data.label_kind}, the labels of {type(data).__name__}",
+            expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
         )
     return data
 

@@ -58,7 +58,7 @@ class Task(lightning.LightningModule, ABC):
         backbone_lr_factor: Factor of the learning rate of parameters that are not `fresh`.
 
     Attributes:
-        label_kind: Kind of labels that a data set must have, see `datamodules.core.labels`.
+        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
         predicts: Kind of predictions, e.g. `PIXEL_CLASSES`, for commands that read a checkpoint.
         monitor: Score on the validation split that selects the best epoch.
         monitor_mode: ``max`` if a larger score is better, ``min`` if a smaller one is.
@@ -74,7 +74,7 @@ class Task(lightning.LightningModule, ABC):
         SettingError: A setting is invalid.
     """
 
-    label_kind: ClassVar[str] = PIXEL_CLASSES
+    labels: ClassVar[str] = PIXEL_CLASSES
     predicts: ClassVar[str] = ""
     monitor: ClassVar[str]
     monitor_mode: ClassVar[Literal["max", "min"]] = "max"

@@ -31,7 +31,7 @@ class ClassificationTask(Task):
         result: Counts ``(K, K)`` of the last evaluation; rows are true, columns predicted classes.
     """
 
-    label_kind: ClassVar[str] = IMAGE_CLASS
+    labels: ClassVar[str] = IMAGE_CLASS
     predicts: ClassVar[str] = IMAGE_CLASS
     headings: ClassVar[Mapping[str, Heading]] = {
         "accuracy": Heading("accuracy"),

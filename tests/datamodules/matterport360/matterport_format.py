@@ -23,17 +23,17 @@ FOLDERS = {
 
 
 def write_matterport(
-    root: Path, protocol: str, scenes: Sequence[str] = SCENES, height: int = 32
+    root: Path, release: str, scenes: Sequence[str] = SCENES, height: int = 32
 ) -> Path:
     """Two panoramas of each scene: stripes of all numbers, with 2,500 units of depth each.
 
-    The colors of the second panorama are a JPEG file with ``protocol=360fv``. A fifth of the rows
+    The colors of the second panorama are a JPEG file with ``release=360fv``. A fifth of the rows
     is black in both.
     """
     numbers = np.broadcast_to(np.arange(2 * height) % 42, (height, 2 * height)).astype(np.uint8)
     for scene in scenes:
-        for k, ending in enumerate(("png", "jpg" if protocol == "360fv" else "png")):
-            rgb, semantic, depth = (root / scene / folder for folder in FOLDERS[protocol])
+        for k, ending in enumerate(("png", "jpg" if release == "360fv" else "png")):
+            rgb, semantic, depth = (root / scene / folder for folder in FOLDERS[release])
             color = np.full((height, 2 * height, 3), 90, np.uint8)
             color[: height // 5] = 0
             write_png(rgb / f"{k}{scene}.{ending}", color)

@@ -28,12 +28,13 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_panorama_is_what_the_files_hold(root: Path, erp: Any) -> None:
     data = Structured3D(root, erp, inputs=["rgb", "depth"], lighting="coldlight")
     panorama = data.source("test").read(0)
-    labels = data.index().read.reader.labels(data.source("test").items[0])
+    reading: Any = data.index().read
+    labels = reading.reader.labels(data.source("test").items[0])
     np.testing.assert_array_equal(labels[0], np.arange(64) % 41, "indices, not colors")
     assert (panorama.rgb[10:] == 102).all()
     assert data.class_names == ("unknown", *CLASSES)
     assert (CLASSES[0], CLASSES[21], CLASSES[39]) == ("wall", "ceiling", "other prop")
-    depth = data.index().read.reader.depth(data.source("test").items[0])
+    depth = reading.reader.depth(data.source("test").items[0])
     for number in range(41):
         expected = round(25 * number * 512 / 1000)
         assert set(depth[:, np.arange(64) % 41 == number].flat) == {expected}
@@ -115,7 +116,7 @@ def test_both_sets_are_read(root: Path, erp: Any) -> None:
     np.testing.assert_array_equal(after[same], before[same])
 
 
-# What cannot be used.
+# Files and settings that are refused.
 
 
 def test_broken_files_are_refused(tmp_path: Path, erp: Any) -> None:
