@@ -195,6 +195,18 @@ class PanoramaDataModule(ImageDataModule):
         if not self._masks.of_each:
             self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`; also size, area, unknown pixels and rotation of the panoramas."""
+        mask, area = self.mask, getattr(self, "area", None)
+        return super().protocol | {
+            "size": f"{2 * self.erp_height} × {self.erp_height}",
+            "area": "sphere" if area is None else ", ".join(f"{degrees:g}" for degrees in area),
+            "unknown": "labels",
+            "mask": "none" if mask is None else Path(str(mask)).name,
+            "rotation": str(self.test_rotation or "none"),
+        }
+
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 7."""
         return TangentRepresentation(0, 7 if self.level is None else self.level)
@@ -282,6 +294,15 @@ class PhotoDataModule(ImageDataModule):
             "Train on photos without it, then on panoramas with it and init_from=…: "
             "its filters start at zero.",
         )
+
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`; also the crops, which cover all pixels of a photo."""
+        representation: Any = self.representation
+        height, width = representation.image_size
+        return super().protocol | {
+            "size": f"crops of {representation.fov_deg:g}° in {width} × {height}"
+        }
 
     def default_representation(self) -> PerspectiveRepresentation:
         """Crops of 45° at the resolution of level 7."""

@@ -80,6 +80,14 @@ class StanfordAreas(ImageDataModule):
             f"{', '.join(FOLDS[self.fold])}) and for training (others)",
         )
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`: the fold itself is not part of it."""
+        all_areas = set(self.areas) == set(AREAS)
+        return super().protocol | {
+            "split": "folds" if all_areas else f"folds of areas {', '.join(self.areas)}"
+        }
+
     def find_images(
         self, problems: Problems
     ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:
@@ -145,6 +153,11 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
         super().__post_init__()
         known = ("labels", "any_black", "all_black")
         self.require("unknown", self.unknown in known, "labels, any_black or all_black")
+
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`."""
+        return super().protocol | {"unknown": self.unknown}
 
 
 @registered
