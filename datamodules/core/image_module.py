@@ -23,6 +23,7 @@ from datamodules.core.inputs import (
     ordered_inputs,
 )
 from datamodules.core.labeled_images import LabeledImages
+from datamodules.core.labels import ClassSet
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
@@ -30,6 +31,7 @@ from datamodules.core.panoramas import (
     PanoramaReading,
     PhotoReading,
     TestRotation,
+    Unknown,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -63,9 +65,12 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
+        classes: Name of a set of classes of the data set; None for the first.
+        unknown: Black pixels that are unknown too, see `mask_black`.
 
     Attributes:
         normalizations: Default normalizations, without and with depth.
+        class_sets: Sets of classes by name, see `class_sets`; empty if there is only one.
 
     Raises:
         SettingError: A setting is invalid.
@@ -76,16 +81,34 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         RGBD_NORMALIZATION,
     )
 
+    class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
+    classes: str | int | None = None
+    unknown: Unknown = "labels"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        chosen = next(iter(self.class_sets), None) if self.classes is None else str(self.classes)
+        fine = chosen is None or chosen in self.class_sets
+        self.require("classes", fine, " or ".join(self.class_sets) or "null: no other classes")
+        self.class_set = None if chosen is None else self.class_sets[chosen]
+        if self.class_set is not None:
+            self.class_names = ("unknown", *self.class_set.names)
+        known = ("labels", "any_black", "all_black")
+        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         given = self.normalization or self.normalizations[with_depth]
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
+
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`; also the set of classes and unknown pixels."""
+        classes = {} if self.classes is None else {"classes": str(self.classes)}
+        return super().protocol | {**classes, "unknown": self.unknown}
 
     @abstractmethod
     def find_images(
@@ -112,7 +135,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """See `LabeledData`."""
         reader, splits = self.find_images(problems)
         read = self.reading(reader)
-        store = Store.of(self.store, read.store_name, reader.settings, read.layout)
+        store = Store.of(self.store, read.store_name, read.settings, read.layout)
         index = DatasetIndex(self.noun, splits, read, read.kind, store)
         check = partial(self.check_image, reader=reader, problems=problems)
         for _ in in_threads(check, index.of()):
@@ -197,12 +220,11 @@ class PanoramaDataModule(ImageDataModule):
 
     @property
     def protocol(self) -> dict[str, str]:
-        """See `LabeledData`; also size, area, unknown pixels and rotation of the panoramas."""
+        """See `ImageDataModule`; also size, area, mask and rotation of the panoramas."""
         mask, area = self.mask, getattr(self, "area", None)
         return super().protocol | {
             "size": f"{2 * self.erp_height} × {self.erp_height}",
             "area": "sphere" if area is None else ", ".join(f"{degrees:g}" for degrees in area),
-            "unknown": "labels",
             "mask": "none" if mask is None else Path(str(mask)).name,
             "rotation": str(self.test_rotation or "none"),
         }
@@ -214,7 +236,7 @@ class PanoramaDataModule(ImageDataModule):
     def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        return PanoramaReading(reader, len(self.class_names), shape)
+        return PanoramaReading(reader, len(self.class_names), shape, self.class_set, self.unknown)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; also checks that the panorama has a mask."""
@@ -297,7 +319,7 @@ class PhotoDataModule(ImageDataModule):
 
     @property
     def protocol(self) -> dict[str, str]:
-        """See `LabeledData`; also the crops, which cover all pixels of a photo."""
+        """See `ImageDataModule`; also the crops, which cover all pixels of a photo."""
         representation: Any = self.representation
         height, width = representation.image_size
         return super().protocol | {
@@ -310,7 +332,7 @@ class PhotoDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return PhotoReading(reader, len(self.class_names))
+        return PhotoReading(reader, len(self.class_names), None, self.class_set, self.unknown)
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.labels import ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
@@ -329,18 +330,28 @@ class _Reading:
         reader: Reader of the data set.
         num_classes: K + 1, including the unknown class.
         shape: Rows and columns of the result; None for the size of the files.
+        class_set: Classes of the result; None for the classes of the reader.
+        unknown: Black pixels that are unknown, see `mask_black`.
         kind: Named tuple that is returned, `Panorama` or `Photo`.
     """
 
     reader: ImageReader
     num_classes: int
     shape: tuple[int, int] | None = None
+    class_set: ClassSet | None = None
+    unknown: Unknown = "labels"
     kind: ClassVar[type[Panorama | Photo]]
 
     @property
     def store_name(self) -> str:
         """Name of the images in a store."""
         return "photos" if self.shape is None else "{}x{}".format(*self.shape)
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """See `ImageReader`; also classes and black pixels."""
+        own = {"classes": repr(self.class_set), "unknown": self.unknown}
+        return {**self.reader.settings, **own}
 
     @property
     def layout(self) -> Layout:
@@ -355,6 +366,11 @@ class _Reading:
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Return only the labels, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
+        labels = labels if self.class_set is None else self.class_set.relabel(labels)
+        if self.unknown != "labels":
+            rgb = self.reader.rgb(files)
+            rgb = rgb if self.shape is None else resize_nearest(rgb, self.shape)
+            labels = mask_black(labels, rgb, self.unknown)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,

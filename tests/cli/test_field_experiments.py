@@ -24,13 +24,13 @@ PROTOCOLS = {
 
 
 def _with_a_small_network(experiment: str) -> list[str]:
-    """Arguments of an experiment with another network, without the settings of its own."""
+    """Arguments of an experiment with another network, without the settings of the experiment's network."""
     arguments = [f"experiment={experiment}", "network=unet_small"]
-    own = (
+    removed = (
         composed("train", *arguments).network.keys()
         - composed("train", arguments[1]).network.keys()
     )
-    return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in own)]
+    return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in removed)]
 
 
 def _data_set(settings: dict[str, Any]) -> str:
