@@ -24,7 +24,7 @@ PROTOCOLS = {
 
 
 def _with_a_small_network(experiment: str) -> list[str]:
-    """Arguments of an experiment with another network, without the settings of the experiment's network."""
+    """Arguments of an experiment with another network and no other settings of a network."""
     arguments = [f"experiment={experiment}", "network=unet_small"]
     removed = (
         composed("train", *arguments).network.keys()
