@@ -107,6 +107,12 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`; also the set of classes and unknown pixels."""
+        classes = {} if self.classes is None else {"classes": str(self.classes)}
+        return super().protocol | {**classes, "unknown": self.unknown}
+
     @abstractmethod
     def find_images(
         self, problems: Problems
@@ -231,6 +237,17 @@ class PanoramaDataModule(ImageDataModule):
         if not self._masks.of_each:
             self._masks.read("", self.canvas)
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `ImageDataModule`; also size, area, mask and rotation of the panoramas."""
+        mask, area = self.mask, getattr(self, "area", None)
+        return super().protocol | {
+            "size": f"{2 * self.erp_height} × {self.erp_height}",
+            "area": "sphere" if area is None else ", ".join(f"{degrees:g}" for degrees in area),
+            "mask": "none" if mask is None else Path(str(mask)).name,
+            "rotation": str(self.test_rotation or "none"),
+        }
+
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 7."""
         return TangentRepresentation(0, 7 if self.level is None else self.level)
@@ -329,6 +346,15 @@ class PhotoDataModule(ImageDataModule):
             "Train on photos without it, then on panoramas with it and init_from=…: "
             "its filters start at zero.",
         )
+
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `ImageDataModule`; also the crops, which cover all pixels of a photo."""
+        representation: Any = self.representation
+        height, width = representation.image_size
+        return super().protocol | {
+            "size": f"crops of {representation.fov_deg:g}° in {width} × {height}"
+        }
 
     def default_representation(self) -> PerspectiveRepresentation:
         """Crops of 45° at the resolution of level 7."""

@@ -300,6 +300,17 @@ class LabeledData(ABC, Generic[_Item]):
     # --- reading -------------------------------------------------------------------------------
 
     @property
+    def protocol(self) -> dict[str, str]:
+        """Facts that scores on the test split depend on; see `tangent_train.results.published`.
+
+        A data set adds its settings that change the tested images, their labels or their classes.
+        """
+        kind = type(self)
+        is_here = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
+        name = kind.__name__ if is_here else f"{kind.__module__}.{kind.__name__}"
+        return {"data": name, "split": "test", "classes": str(self.num_classes)}
+
+    @property
     def num_classes(self) -> int:
         """Number of classes K, which is the number of scores of a network."""
         return len(self.class_names) - (self.labels == PIXEL_CLASSES)

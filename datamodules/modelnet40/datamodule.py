@@ -81,6 +81,11 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`."""
+        return super().protocol | {"rotation": self.test_rotation or "none"}
+
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 5."""
         return TangentRepresentation(0, 5 if self.level is None else self.level)

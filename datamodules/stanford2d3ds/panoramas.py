@@ -81,6 +81,14 @@ class StanfordAreas(ImageDataModule):
             f"{', '.join(FOLDS[self.fold])}) and for training (others)",
         )
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`: the fold itself is not part of it."""
+        all_areas = set(self.areas) == set(AREAS)
+        return super().protocol | {
+            "split": "folds" if all_areas else f"folds of areas {', '.join(self.areas)}"
+        }
+
     def find_images(
         self, problems: Problems
     ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:

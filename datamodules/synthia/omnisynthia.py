@@ -83,6 +83,11 @@ class SynthiaSequences(ImageDataModule):
         """Training sequences, then test sequences."""
         return (*self.train_sequences, *self.test_sequences)
 
+    @property
+    def protocol(self) -> dict[str, str]:
+        """See `LabeledData`."""
+        return super().protocol | {"split": f"sequences {', '.join(self.test_sequences)}"}
+
     @abstractmethod
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """Return the images of every frame of a sequence, if any."""
