@@ -85,7 +85,7 @@ def test_missing_labels_other_sizes_and_an_empty_folder_are_refused(tmp_path: Pa
 
 
 def test_training_is_refused(shared: Path) -> None:
-    data = panoramas(shared)
+    data: Any = panoramas(shared)
     data.trainer = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING), world_size=1)
     with pytest.raises(DataError, match=r"found no panoramas for training.*Train on other"):
         data.prepare_data()
