@@ -85,6 +85,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     )
 
     class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+    fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
 
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
@@ -202,6 +203,7 @@ class PanoramaDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "panoramas"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size", "area", "mask", "test_rotation")
 
     panoramas_per_step: int = 4
     area: Sequence[float] | None = None
@@ -229,6 +231,11 @@ class PanoramaDataModule(ImageDataModule):
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", self.canvas)
+
+    @property
+    def size(self) -> str:
+        """Width and height of the panoramas whose pixels are scored."""
+        return f"{2 * self.erp_height} × {self.erp_height}"
 
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 7."""
@@ -315,6 +322,7 @@ class PhotoDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "photos"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     photos_per_step: int = 16
 
@@ -328,6 +336,13 @@ class PhotoDataModule(ImageDataModule):
             "Train on photos without it, then on panoramas with it and init_from=…: "
             "its filters start at zero.",
         )
+
+    @property
+    def size(self) -> str:
+        """Size of the crops that are scored, which cover all pixels of a photo."""
+        representation: Any = self.representation
+        height, width = representation.image_size
+        return f"crops of {representation.fov_deg:g}° in {width} × {height}"
 
     def default_representation(self) -> PerspectiveRepresentation:
         """Crops of 45° at the resolution of level 7."""

@@ -65,6 +65,8 @@ class StanfordAreas(ImageDataModule):
     class_sets = CLASS_SETS
     group: ClassVar[Literal["pano", "data"]]
 
+    fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
+
     fold: int = 1
     areas: Sequence[str] = AREAS
     label_table: Path | None = None
