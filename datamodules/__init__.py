@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from datamodules.cityscapes.photos import Cityscapes as Cityscapes
     from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
     from datamodules.folder.labeled import FolderPanoramas as FolderPanoramas
     from datamodules.folder.labeled import FolderPhotos as FolderPhotos
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from datamodules.stanford2d3ds.panoramas import (
         Stanford2D3DSPerspective as Stanford2D3DSPerspective,
     )
+    from datamodules.synpass.panoramas import SynPASS as SynPASS
     from datamodules.synthia.omnisynthia import OmniSynthia as OmniSynthia
     from datamodules.synthia.omnisynthia import SynthiaPerspective as SynthiaPerspective
     from datamodules.synthrooms.datamodule import SynthRooms as SynthRooms
@@ -29,11 +31,13 @@ if TYPE_CHECKING:
     from datamodules.zind.panoramas import Zind as Zind
 
 _CLASSES = {
+    "cityscapes.photos": ("Cityscapes",),
     "core.panorama_pairs": ("ImagePairs",),
     "folder.labeled": ("FolderPanoramas", "FolderPhotos"),
     "modelnet40.datamodule": ("ModelNet40",),
     "stanford2d3ds.pairs": ("StanfordPairs",),
     "stanford2d3ds.panoramas": ("Stanford2D3DS", "Stanford2D3DSPerspective"),
+    "synpass.panoramas": ("SynPASS",),
     "synthia.omnisynthia": ("OmniSynthia", "SynthiaPerspective"),
     "synthrooms.datamodule": ("SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"),
     "synthshapes.datamodule": ("SynthShapes",),

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, get_args
 
 from torch import Tensor
 from torch.utils.data import DataLoader
@@ -23,6 +24,7 @@ from datamodules.core.inputs import (
     ordered_inputs,
 )
 from datamodules.core.labeled_images import LabeledImages
+from datamodules.core.labels import ClassSet
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
@@ -30,6 +32,7 @@ from datamodules.core.panoramas import (
     PanoramaReading,
     PhotoReading,
     TestRotation,
+    Unknown,
     check_headers,
 )
 from datamodules.core.problems import Problems
@@ -44,11 +47,13 @@ from datamodules.core.transforms import (
     PosedUp,
     RotatedPanoramas,
     masked,
+    placed,
 )
-from datamodules.images.gpano import whole_area
+from datamodules.images.gpano import Fill, PanoramaArea, check_area_size
 from datamodules.images.masks import Mask, Masks
-from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import shift_range
+from datamodules.images.png import check_panorama_size
+from tangent_train.errors import SettingError
+from tangent_train.geometry import SphereArea, shift_range
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
@@ -63,9 +68,12 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     Args:
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
+        classes: Name of a set of classes of the data set; None for the first.
+        unknown: Black pixels that are unknown too, see `mask_black`.
 
     Attributes:
         normalizations: Default normalizations, without and with depth.
+        class_sets: Sets of classes by name, see `class_sets`; empty if there is only one.
 
     Raises:
         SettingError: A setting is invalid.
@@ -76,11 +84,24 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         RGBD_NORMALIZATION,
     )
 
+    class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+    fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
+
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
+    classes: str | int | None = None
+    unknown: Unknown = "labels"
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        chosen = next(iter(self.class_sets), None) if self.classes is None else str(self.classes)
+        fine = chosen is None or chosen in self.class_sets
+        self.require("classes", fine, " or ".join(self.class_sets) or "null: no other classes")
+        self.class_set = None if chosen is None else self.class_sets[chosen]
+        if self.class_set is not None:
+            self.class_names = ("unknown", *self.class_set.names)
+        known = ("labels", "any_black", "all_black")
+        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         given = self.normalization or self.normalizations[with_depth]
@@ -100,6 +121,11 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
             DataError: The data set as a whole cannot be used.
         """
 
+    def groups(self, files: ImageFiles) -> Sequence[str]:
+        """Return the rows of the results that an image belongs to, such as a weather."""
+        del files
+        return ()
+
     @abstractmethod
     def reading(self, reader: ImageReader) -> PanoramaReading | PhotoReading:
         """Return a function that reads one image as it is stored."""
@@ -112,7 +138,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         """See `LabeledData`."""
         reader, splits = self.find_images(problems)
         read = self.reading(reader)
-        store = Store.of(self.store, read.store_name, reader.settings, read.layout)
+        store = Store.of(self.store, read.store_name, read.settings, read.layout)
         index = DatasetIndex(self.noun, splits, read, read.kind, store)
         check = partial(self.check_image, reader=reader, problems=problems)
         for _ in in_threads(check, index.of()):
@@ -144,6 +170,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
 
 _HALF_TURN_DEG = 180
+_PARTIAL = "If all images show the same part, give data.area=[west,east,south,north] in degrees."
 
 Upright = Literal["pose", "auto"] | None
 """Source of the up direction of a panorama."""
@@ -155,6 +182,9 @@ class PanoramaDataModule(ImageDataModule):
 
     Args:
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
+        area: The part of the sphere that all files show: west, east, south and north in degrees,
+            see `SphereArea`; None for the whole sphere.
+        fill: Colors of the panorama outside the area, for the pixels of views that leave it.
         mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
             their labels are unknown. See `Masks`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
@@ -165,6 +195,8 @@ class PanoramaDataModule(ImageDataModule):
 
     Attributes:
         erp_height: Rows of the panoramas read.
+        sphere_area: `area` as a geometric object.
+        canvas: The area, in pixels of these panoramas.
 
     Raises:
         DataError: The mask cannot be used.
@@ -172,8 +204,11 @@ class PanoramaDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "panoramas"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size", "area", "mask", "test_rotation")
 
     panoramas_per_step: int = 4
+    area: Sequence[float] | None = None
+    fill: Fill = "black"
     mask: Mask = None
     test_rotation: TestRotation = None
     upright: Upright = None
@@ -191,9 +226,17 @@ class PanoramaDataModule(ImageDataModule):
         self.require("upright", self.upright in (None, "pose", "auto"), "null, pose or auto")
         fine = 0 < self.max_tilt_deg <= _HALF_TURN_DEG
         self.require("max_tilt_deg", fine, "more than 0, at most 180")
+        self.require("fill", self.fill in get_args(Fill), ", ".join(get_args(Fill)))
+        self.sphere_area = SphereArea.of(self.area, "data.area")
+        self.canvas = PanoramaArea.on_canvas(self.sphere_area, self.erp_height)
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
-            self._masks.read("", whole_area(Path(), (self.erp_height, 2 * self.erp_height)))
+            self._masks.read("", self.canvas)
+
+    @property
+    def size(self) -> str:
+        """Width and height of the panoramas whose pixels are scored."""
+        return f"{2 * self.erp_height} × {self.erp_height}"
 
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 7."""
@@ -201,22 +244,30 @@ class PanoramaDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
-        shape = self.erp_height, 2 * self.erp_height
-        return PanoramaReading(reader, len(self.class_names), shape)
+        shape, count = self.canvas.image_shape, len(self.class_names)
+        return PanoramaReading(reader, count, shape, self.class_set, self.unknown)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; also checks that the panorama has a mask."""
-        check_headers(files, reader, problems, self.erp_height)
+        check_headers(files, reader, problems, self._check_size)
         if self._masks.of_each:
             with problems.noted(files.name):
-                self._masks.check(files.name)
+                self._masks.check(files.name, self.canvas)
+
+    def _check_size(self, path: Path, size: tuple[int, int]) -> None:
+        if self.canvas.is_whole:
+            check_panorama_size(path, size, self.erp_height, _PARTIAL)
+        else:
+            check_area_size(path, size, self.sphere_area, self.canvas)
 
     def transforms(self, split: Split) -> Sequence[Transform[Panorama, Any]]:
-        """See `LabeledData`: mask, rotation, then alignment with gravity."""
+        """See `LabeledData`: placing, mask, rotation, then alignment with gravity."""
         transforms: list[Transform[Panorama, Any]] = []
         rotated = None
+        if not self.canvas.is_whole:
+            transforms.append(partial(placed, self.canvas, self.fill))
         if self.mask is not None:
-            transforms.append(partial(masked, self._masks))
+            transforms.append(partial(masked, self._masks, self.canvas))
         if self.upright is not None:
             transforms.append(PosedUp())
         if split == "test" and self.test_rotation is not None:
@@ -226,7 +277,10 @@ class PanoramaDataModule(ImageDataModule):
         if self.upright == "auto":
             judge = self._judge if split == "test" else None
             reading: Any = self.index().read
-            transforms.append(EstimatedUp(self.max_tilt_deg, reading.reader.rgb, rotated, judge))
+            read = reading.reader.rgb
+            transforms.append(
+                EstimatedUp(self.max_tilt_deg, read, rotated, judge, self.sphere_area)
+            )
         return transforms
 
     def panoramas(self, split: Split) -> LabeledImages:
@@ -269,6 +323,7 @@ class PhotoDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "photos"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     photos_per_step: int = 16
 
@@ -283,13 +338,20 @@ class PhotoDataModule(ImageDataModule):
             "its filters start at zero.",
         )
 
+    @property
+    def size(self) -> str:
+        """Size of the crops that are scored, which cover all pixels of a photo."""
+        representation: Any = self.representation
+        height, width = representation.image_size
+        return f"crops of {representation.fov_deg:g}° in {width} × {height}"
+
     def default_representation(self) -> PerspectiveRepresentation:
         """Crops of 45° at the resolution of level 7."""
         return PerspectiveRepresentation(7 if self.level is None else self.level)
 
     def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return PhotoReading(reader, len(self.class_names))
+        return PhotoReading(reader, len(self.class_names), None, self.class_set, self.unknown)
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""
@@ -306,9 +368,14 @@ class PhotoDataModule(ImageDataModule):
             try:
                 shift_range(camera_matrix, size, representation.fov_deg, representation.image_size)
             except SettingError as error:
-                raise DataError(
-                    files.rgb,
-                    found=error.found,
+                columns = representation.image_size[1]
+                extent = camera_matrix[1, 1] * math.tan(math.radians(representation.fov_deg) / 2)
+                rows = int(size[0] / 2 / extent * columns)
+                # A setting: if it fits none of the photos, it is refused once.
+                raise SettingError(
+                    "representation.fov_deg",
+                    found=f"{error.found}, {files.rgb}",
                     expected=f"all of a crop of {representation.fov_deg:g}°",
-                    remedy="Lower representation.fov_deg, or remove the photo.",
+                    remedy="Lower it, make the crops less high with "
+                    f"representation.dim=[{rows},{columns}] or fewer rows, or remove the photo.",
                 ) from error

@@ -18,12 +18,13 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.labels import ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
-from datamodules.images.png import check_panorama_size, check_png
+from datamodules.images.png import check_png
 from tangent_train.errors import DataError, width_height
-from tangent_train.geometry import PanoramaPose
+from tangent_train.geometry import PanoramaPose, SphereArea
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -162,6 +163,8 @@ class Panorama(NamedTuple):
             if not read. See `steps_to_meters`.
         labels: ``(H, W)`` uint8, 0 where unknown.
         up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
+        area: The part of the sphere that was recorded; None for all of it. Outside, labels and
+            depth are 0, and colors are filled.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -170,6 +173,7 @@ class Panorama(NamedTuple):
     depth: NDArray[np.uint16] | None
     labels: NDArray[np.uint8]
     up: NDArray[np.float64] | None = None
+    area: SphereArea | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
         """Return the sampler of its views: the representation, aligned with gravity."""
@@ -328,19 +332,30 @@ class _Reading:
     Attributes:
         reader: Reader of the data set.
         num_classes: K + 1, including the unknown class.
-        shape: Rows and columns of the result; None for the size of the files.
+        shape: Rows and columns of the result, of the area that the files show; None for the size
+            of the files.
+        class_set: Classes of the result; None for the classes of the reader.
+        unknown: Black pixels that are unknown, see `mask_black`.
         kind: Named tuple that is returned, `Panorama` or `Photo`.
     """
 
     reader: ImageReader
     num_classes: int
     shape: tuple[int, int] | None = None
+    class_set: ClassSet | None = None
+    unknown: Unknown = "labels"
     kind: ClassVar[type[Panorama | Photo]]
 
     @property
     def store_name(self) -> str:
         """Name of the images in a store."""
         return "photos" if self.shape is None else "{}x{}".format(*self.shape)
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """See `ImageReader`; also classes and black pixels."""
+        own = {"classes": repr(self.class_set), "unknown": self.unknown}
+        return {**self.reader.settings, **own}
 
     @property
     def layout(self) -> Layout:
@@ -355,6 +370,11 @@ class _Reading:
     def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Return only the labels, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
+        labels = labels if self.class_set is None else self.class_set.relabel(labels)
+        if self.unknown != "labels":
+            rgb = self.reader.rgb(files)
+            rgb = rgb if self.shape is None else resize_nearest(rgb, self.shape)
+            labels = mask_black(labels, rgb, self.unknown)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
@@ -417,7 +437,10 @@ class PhotoReading(_Reading):
 
 
 def check_headers(
-    files: ImageFiles, reader: ImageReader, problems: Problems, erp_height: int | None = None
+    files: ImageFiles,
+    reader: ImageReader,
+    problems: Problems,
+    check_size: Callable[[Path, tuple[int, int]], None] = lambda path, size: None,
 ) -> tuple[int, int] | None:
     """Check, without decoding, that the files of an image are complete and have one size.
 
@@ -425,7 +448,7 @@ def check_headers(
         files: Files of the image.
         reader: Reader of the data set.
         problems: Collects problems under the image's name.
-        erp_height: Required rows of a panorama; None for photos.
+        check_size: Function that refuses rows and columns of a color image.
 
     Returns:
         Rows and columns; None if the color image cannot be used.
@@ -441,8 +464,7 @@ def check_headers(
                 continue
             if part == "rgb":
                 size = found
-                if erp_height is not None:
-                    check_panorama_size(path, found, erp_height)
+                check_size(path, found)
             elif size not in (None, found):
                 remedy = "Export or copy both at one size."
                 if found[::-1] == size:

@@ -11,7 +11,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import NoRoomError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable, Iterator, Mapping, Sequence
 
     from datamodules.core.index import Item
 
@@ -84,6 +84,33 @@ class Problems:
     def add_all(self, others: Problems) -> None:
         """Add the problems of another check."""
         self._noted += others._noted
+
+    def compare_counts(
+        self, found: Mapping[str, int], published: Sequence[Mapping[str, int]]
+    ) -> None:
+        """Warn if the numbers of images of the splits are not published ones.
+
+        Args:
+            found: Number of images of each split.
+            published: Published numbers, one or several.
+        """
+        if not any(found == numbers for numbers in published):
+            counts, *others = (
+                ", ".join(f"{count} {split}" for split, count in numbers.items())
+                for numbers in (found, *published)
+            )
+            self.warnings.append(f"found {counts}; published are {' or '.join(others)}")
+
+    def note_strays(self, labels: Iterable[Path], images: Iterable[Item]) -> None:
+        """Warn of label images that belong to none of the images."""
+        strays = set(labels) - {image.parts["labels"] for image in images}
+        self.note_absent("label images", map(str, strays))
+
+    def note_absent(self, source: str, names: Iterable[str]) -> None:
+        """Warn of names in a list or folder that belong to no image."""
+        shown = sorted(repr(name)[1:-1] for name in names)
+        if shown:
+            self.warnings.append(f"{source}: {len(shown)} without an image, e.g. {shown[0]}")
 
     def listed(self) -> list[Problem]:
         """Problems without duplicates, sorted by file."""

@@ -92,7 +92,7 @@ class SplitReader(Generic[_Item, _Image]):
             with problems.noted(self.name(index)):
                 image: Any = self.read(index)
                 # Copies, because arrays that are views of a file keep it open.
-                return image._make(None if a is None else np.array(a) for a in image)
+                return image._make(np.array(a) if isinstance(a, np.ndarray) else a for a in image)
 
         kept = list(in_threads(keep, range(len(self))))
         problems.refuse(root)

@@ -1,4 +1,4 @@
-"""Transforms of panoramas after reading: mask, rotation, alignment with gravity."""
+"""Transforms of panoramas after reading: placing, mask, rotation, alignment with gravity."""
 
 from __future__ import annotations
 
@@ -12,9 +12,14 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from datamodules.images.gpano import read_up, whole_area
+from datamodules.images.gpano import Fill, PanoramaArea, read_up
 from datamodules.images.masks import Masks
-from tangent_train.geometry import random_rotation, rotation_about
+from tangent_train.geometry import (
+    SphereArea,
+    equirect_directions,
+    random_rotation,
+    rotation_about,
+)
 from tangent_train.rendering import rotate_equirect
 from tangent_train.rendering.upright.gravity import estimate_up
 from tangent_train.rendering.upright.manhattan import MOST_ROWS
@@ -23,17 +28,45 @@ PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]
 """Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
 
-def masked(masks: Masks, panorama: Panorama, index: int, files: ImageFiles) -> Panorama:
+_WHOLE = SphereArea.of(None)
+
+
+def placed(
+    canvas: PanoramaArea, fill: Fill, panorama: Panorama, index: int, files: ImageFiles
+) -> Panorama:
+    """Place a partial panorama on the whole sphere; a `Transform`.
+
+    Args:
+        canvas: Its area, in pixels of the whole panorama.
+        fill: Colors outside.
+        panorama: Panorama of the area's shape.
+        index: Ignored.
+        files: Ignored.
+    """
+    del index, files
+    rgb, depth, labels, *_ = panorama
+    return Panorama(
+        canvas.filled(canvas.place(rgb), fill),
+        None if depth is None else canvas.place(depth),
+        canvas.place(labels),
+        area=canvas.sphere,
+    )
+
+
+def masked(
+    masks: Masks, canvas: PanoramaArea, panorama: Panorama, index: int, files: ImageFiles
+) -> Panorama:
     """Make the labels of masked pixels unknown; a `Transform`.
 
     Args:
         masks: Masks of the panoramas.
+        canvas: The area of the panoramas.
         panorama: Panorama; colors and depth stay unchanged.
         index: Ignored.
         files: Files of the panorama.
     """
     del index
-    counts = masks.read(files.name, whole_area(files.rgb, panorama.labels.shape))
+    counts = masks.read(files.name, canvas)
     return panorama._replace(labels=panorama.labels & counts)
 
 
@@ -62,6 +95,7 @@ class EstimatedUp:
         rotated: Rotation of the panoramas, if any.
         judge: Function that returns log-likelihoods of up directions, see `estimate_up`; it is not
             passed to other processes.
+        area: The part of the sphere that the files show.
     """
 
     def __init__(
@@ -70,9 +104,11 @@ class EstimatedUp:
         rgb: Callable[[ImageFiles], NDArray[np.uint8]],
         rotated: RotatedPanoramas | None = None,
         judge: PanoramaJudge | None = None,
+        area: SphereArea = _WHOLE,
     ) -> None:
         self._max_tilt_deg = max_tilt_deg
         self._rgb = rgb
+        self._area = area
         self._rotated = rotated
         self._judge = judge
         self._ups: dict[int, NDArray[np.float64] | None] = {}
@@ -83,20 +119,32 @@ class EstimatedUp:
             return panorama
         if index not in self._ups:
             judge = None if self._judge is None else partial(self._judge, panorama)
-            rgb = panorama.rgb if len(panorama.rgb) >= MOST_ROWS else self._larger(index, files)
+            if len(panorama.rgb) >= MOST_ROWS:
+                rgb = _without_fill(panorama)
+            else:
+                rgb = self._larger(index, files)
             self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
         return panorama._replace(up=self._ups[index])
 
     def _larger(self, index: int, files: ImageFiles) -> NDArray[np.uint8]:
         rgb = self._rgb(files)
-        rows = min(len(rgb), MOST_ROWS)
-        rgb = resize_area(rgb, (rows, 2 * rows))
+        rows = round(rgb.shape[1] / self._area.width_deg * 180)
+        canvas = PanoramaArea.on_canvas(self._area, min(rows, MOST_ROWS))
+        rgb = canvas.place(resize_area(rgb, canvas.image_shape))
         if self._rotated is None:
             return rgb
         return rotate_equirect(rgb, self._rotated.rotation(index), "bilinear")
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_judge": None}
+
+
+def _without_fill(panorama: Panorama) -> NDArray[np.uint8]:
+    """Return the colors, black outside the area: an estimate ignores what is black."""
+    if panorama.area is None:
+        return panorama.rgb
+    inside = panorama.area.contains(equirect_directions(panorama.labels.shape))
+    return np.where(inside[..., None], panorama.rgb, np.uint8(0))
 
 
 class RotatedPanoramas:
@@ -130,7 +178,7 @@ class RotatedPanoramas:
     def __call__(self, panorama: Panorama, index: int, files: Any = None) -> Panorama:
         """Return the rotated panorama: RGB bilinear, depth and labels nearest."""
         del files
-        rgb, depth, labels, before = panorama
+        rgb, depth, labels, before, area = panorama
         rotation = self.rotation(index)
         up = rotation[:, 2] if before is None else rotation @ before
         return Panorama(
@@ -138,4 +186,5 @@ class RotatedPanoramas:
             None if depth is None else rotate_equirect(depth, rotation, "nearest"),
             rotate_equirect(labels, rotation, "nearest"),
             up if self._known else None,
+            None if area is None else area.rotated(rotation),
         )

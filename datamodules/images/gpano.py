@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import resize_nearest
 from datamodules.images.xmp import read_properties
 from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.geometry import SphereArea
 from tangent_train.rendering.upright.gravity import up_from_pose
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
@@ -37,16 +38,20 @@ _SIZES = (
 _REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _TOLERANCE = 0.02  # tolerance of square pixels: angles and sizes are rounded
 _MOST_COLUMNS = 32768  # columns of the whole panorama
-_SAY_IT = "Give crop=[west,east,south,north] in degrees: the part of the sphere that it shows."
+_SAY_IT = "Give area=[west,east,south,north] in degrees: the part of the sphere that it shows."
 _NOT_WHOLE = (
-    "If it is a part of a panorama, say which with crop=[west,east,south,north] in degrees or with "
+    "If it is a part of a panorama, say which with area=[west,east,south,north] in degrees or with "
     "GPano tags in its XMP data. Photos are for tangent-predict with projection=perspective."
 )
+
+Fill = Literal["black", "mean", "edge", "reflect"]
+"""Colors of a panorama outside its area: black; the mean color of the image; its nearest edge
+pixel; or the image, mirrored at its edges."""
 
 
 @dataclass(frozen=True)
 class PanoramaArea:
-    """The part of the sphere that an image shows.
+    """The part of the sphere that an image shows, in pixels of the whole panorama.
 
     Attributes:
         full_shape: Rows H and columns W = 2 H of the whole panorama.
@@ -61,6 +66,33 @@ class PanoramaArea:
     rows: tuple[int, int]
     columns: tuple[int, int]
     image_shape: tuple[int, int]
+
+    @classmethod
+    def on_canvas(cls, area: SphereArea, rows: int) -> Self:
+        """Return the pixels that show an area, in a panorama of some rows; `rotation` is ignored.
+
+        Args:
+            area: The area; its size and position are rounded to pixels.
+            rows: Rows H of the whole panorama.
+        """
+        height = max(1, round((area.north - area.south) / 180 * rows))
+        width = max(1, round(area.width_deg / 180 * rows))
+        top = min(round((90 - area.north) / 180 * rows), rows - height)
+        left = round((area.west + 180) / 180 * rows) % (2 * rows)
+        bounds = (top, top + height), (left, left + width)
+        return cls((rows, 2 * rows), *bounds, (height, width))
+
+    @property
+    def sphere(self) -> SphereArea:
+        """The area in degrees."""
+        height, width = self.full_shape
+        if self.columns[1] - self.columns[0] == width:
+            west = -180.0
+            east = 180.0
+        else:
+            west, east = (360 * (column % width) / width - 180 for column in self.columns)
+        north, south = (90 - 180 * row / height for row in self.rows)
+        return SphereArea(west, east, south, north)
 
     @property
     def is_whole(self) -> bool:
@@ -77,6 +109,21 @@ class PanoramaArea:
         whole = np.zeros((*self.full_shape, *image.shape[2:]), image.dtype)
         whole[rows, columns] = placed
         return whole
+
+    def filled(self, whole: NDArray[_Pixel], fill: Fill) -> NDArray[_Pixel]:
+        """Return a panorama ``(H, W[, C])`` with its colors outside the area replaced."""
+        if self.is_whole or fill == "black":
+            return whole
+        sides = zip((self.rows, self.columns), self.full_shape, strict=True)
+        if fill == "mean":
+            inside = self.place(np.ones(self.image_shape, np.bool_))
+            mean = whole[inside].mean(axis=0).round().astype(whole.dtype)
+            return np.where(inside[..., None] if whole.ndim > 2 else inside, whole, mean)
+        rows, columns = (
+            _sources(*side, length, fill, wraps=wraps)
+            for (side, length), wraps in zip(sides, (False, True), strict=True)
+        )
+        return whole[rows[:, None], columns]
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
         """Cut the image ``(h, w[, C])`` out of a panorama ``(H, W[, C])``; inverse of `place`.
@@ -97,6 +144,19 @@ class PanoramaArea:
 
 
 def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
+    """Return the part of the sphere that an image shows: by `tagged_area`, else by `whole_area`.
+
+    Args:
+        path: JPEG, PNG, TIFF or WebP.
+        size: Rows and columns of the image.
+
+    Raises:
+        DataError: The tags contradict the image, or it is not 2:1 and has no tags.
+    """
+    return tagged_area(path, size) or whole_area(path, size)
+
+
+def tagged_area(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
     """Return the part of the sphere that an image shows, by its GPano tags.
 
     Images resized after the tags were written are assumed to show the same area.
@@ -106,10 +166,10 @@ def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
         size: Rows and columns of the image.
 
     Returns:
-        The whole sphere if tags are missing, see `whole_area`.
+        The area; None if tags are missing.
 
     Raises:
-        DataError: The tags contradict the image, or it is not 2:1 and has no tags.
+        DataError: The tags contradict the image.
     """
     tags = read_properties(path, _NAMESPACE)
     projection = tags.get("ProjectionType", "equirectangular")
@@ -121,7 +181,7 @@ def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
             remedy="Export the panorama in that projection.",
         )
     if not all(name in tags for name in _SIZES):
-        return whole_area(path, size)
+        return None
     full_width, full_height, width, height, left, top = (
         _number(path, name, tags[name], 1e9) for name in _SIZES
     )
@@ -144,39 +204,65 @@ def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
     return _area(path, size, (west, width / full_width), (top / full_height, height / full_height))
 
 
-def area_of_crop(size: tuple[int, int], crop: Sequence[float]) -> PanoramaArea:
+def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaArea:
     """Return the part of the sphere between the angles of an image's outer edges.
 
     Args:
         size: Rows and columns of the image.
-        crop: West, east (−180 to 180; west > east for an image across ±180°), south and north
+        angles: West, east (−180 to 180; west > east for an image across ±180°), south and north
             (−90 to 90) in degrees.
 
     Raises:
         SettingError: The angles are invalid, or the image would not have square pixels.
         DataError: The whole panorama would be too large.
     """
-    west, east, south, north = crop if len(crop) == 4 else (0, 0, 0, 0)
-    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90) or (
-        (east - west) % 360 == 0 and (west, east) != (-180, 180)
-    ):
-        raise SettingError(
-            "crop",
-            found=list(crop),
-            expected="[west,east,south,north] in degrees, −180 to 180 and −90 to 90, south below "
-            "north, east other than west; [-180,180,…] is all around",
-        )
-    width = east - west if east > west else east - west + 360
-    pixels_deg = width / size[1], (north - south) / size[0]
+    area = SphereArea.of(angles)
+    width, height = area.width_deg, area.north - area.south
+    pixels_deg = width / size[1], height / size[0]
     if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
         raise SettingError(
-            "crop",
-            found=f"{list(crop)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
+            "area",
+            found=f"{list(angles)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
             f"in an image of {width_height(size)}",
             expected="angles that make them square",
         )
-    across, down = ((west + 180) / 360, width / 360), ((90 - north) / 180, (north - south) / 180)
-    return _area(f"crop={list(crop)}", size, across, down)
+    across, down = ((area.west + 180) / 360, width / 360), ((90 - area.north) / 180, height / 180)
+    return _area(f"area={list(angles)}", size, across, down)
+
+
+def check_area_size(
+    path: Path, size: tuple[int, int], area: SphereArea, canvas: PanoramaArea
+) -> None:
+    """Check that an image fits the area of its data set, and has enough pixels.
+
+    Args:
+        path: The image.
+        size: Rows and columns of the image.
+        area: The area.
+        canvas: The area, in pixels of the panoramas that a run reads.
+
+    Raises:
+        DataError: Its pixels would not be square.
+        SettingError: It has fewer pixels.
+    """
+    height, width = canvas.image_shape
+    ratio = (area.north - area.south) / area.width_deg
+    if not math.isclose(size[0], size[1] * ratio, rel_tol=_TOLERANCE):
+        raise DataError(
+            path,
+            found=width_height(size),
+            expected=f"{width_height((round(size[1] * ratio), size[1]))}, for square pixels in "
+            f"data.area={list(area.angles)}",
+            remedy="Correct data.area; all images of a data set show the same area.",
+        )
+    if size[0] < height - 1 or size[1] < width - 1:
+        rows = round(size[1] / width * canvas.full_shape[0])
+        raise SettingError(
+            "representation.erp_height",
+            found=canvas.full_shape[0],
+            expected=f"at most {rows}, the rows of a whole panorama with the pixels of {path}",
+            remedy=f"Set representation.erp_height={rows}, or a lower level if it is not set.",
+        )
 
 
 def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> PanoramaArea:
@@ -259,3 +345,24 @@ def _area(
     height = min(height, full_height)
     top = min(round(down[0] * full_height), full_height - height)
     return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
+
+
+def _sources(start: int, stop: int, length: int, fill: Fill, *, wraps: bool) -> NDArray[np.intp]:
+    """Return the row or column inside an area whose pixels fill each one of the panorama.
+
+    Args:
+        start: First row or column of the area.
+        stop: The one after its last.
+        length: Rows or columns of the panorama.
+        fill: ``edge`` or ``reflect``.
+        wraps: True for columns: half of the gap is filled from either edge of the area.
+    """
+    count, lines = stop - start, np.arange(length)
+    inside = (lines - start) % length if wraps else lines - start
+    if wraps:
+        inside = np.where(inside >= (count + length) / 2, inside - length, inside)
+    if fill == "edge":
+        inside = inside.clip(0, count - 1)
+    else:
+        inside = np.minimum(inside % (2 * count), ~inside % (2 * count))
+    return (start + inside) % length

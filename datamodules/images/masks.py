@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from datamodules.core.panoramas import resize_nearest
 from datamodules.images.gpano import PanoramaArea, whole_area
 from datamodules.images.image_files import NamedFiles
 from datamodules.images.pixel_files import LOSSY_SUFFIXES, read_image_size, read_pixels
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, width_height
 
 Mask = float | Path | None
 """Pixels of panoramas that do not count: below a latitude, −90 to 0 degrees; black in a file, for
@@ -22,12 +23,30 @@ all panoramas, or in the PNG files of a folder, which has one for each; or none.
 Counts = Callable[[Path], NDArray[np.bool_]]
 """Reads a mask: where it counts, ``(H, W)``."""
 
+_TOLERANCE = 0.02  # of the ratio of width and height
 _REMEDY = "Make a mask of the size of its image, or of the whole panorama."
 
 
 def _not_black(path: Path) -> NDArray[np.bool_]:
     pixels = read_pixels(path, indices=False)
     return np.asarray((pixels != 0).reshape(*pixels.shape[:2], -1).any(axis=-1))
+
+
+def _area_of_mask(path: Path, size: tuple[int, int], area: PanoramaArea) -> PanoramaArea:
+    """Return the area that a mask of rows and columns covers, see `Masks.read`."""
+    height, width = area.image_shape
+    has_shape = math.isclose(size[1] * height, size[0] * width, rel_tol=_TOLERANCE)
+    if size == area.image_shape or (has_shape and abs(width - 2 * height) > 1):
+        return area
+    if has_shape and not area.is_whole and size != area.full_shape:
+        raise DataError(
+            path,
+            found=width_height(size),
+            expected=f"{width_height(area.image_shape)} for the part that the panorama shows, or "
+            f"{width_height(area.full_shape)} for the whole sphere",
+            remedy="Resize the mask: both have the same shape.",
+        )
+    return whole_area(path, size, _REMEDY)
 
 
 class Masks:
@@ -69,25 +88,26 @@ class Masks:
             expected = "a latitude above −90, at most 0 degrees; a file or folder; or null"
             raise SettingError(setting, found=mask, expected=expected)
 
-    def check(self, name: str) -> None:
+    def check(self, name: str, area: PanoramaArea) -> None:
         """Check the header of the mask of one panorama.
 
         Args:
             name: See `read`.
+            area: See `read`.
 
         Raises:
-            DataError: It is missing, or not twice as wide as high.
+            DataError: It is missing, or has the shape of neither the panorama nor the sphere.
         """
         path = self._checked(self._file(name))
-        whole_area(path, read_image_size(path), _REMEDY)
+        _area_of_mask(path, read_image_size(path), area)
 
     def read(self, name: str, area: PanoramaArea) -> NDArray[np.uint8]:
         """Return 255 where a panorama counts, and 0 elsewhere and where it shows nothing.
 
         Args:
             name: Path of the panorama in its folder, without suffix.
-            area: The part of the sphere that it shows. A mask of its size is of that part; others
-                are of the whole sphere and sampled without interpolation.
+            area: The part of the sphere that it shows. A mask of its size or shape is of that
+                part, others are of the whole sphere; they are sampled without interpolation.
 
         Returns:
             ``(H, W)`` of the whole sphere, not to be written to.
@@ -106,9 +126,7 @@ class Masks:
         rows = area.full_shape[0]
         counts[90 - (np.arange(rows) + 0.5) * 180 / rows < self._lowest_deg] = 0
         if stored is not None:
-            rows, columns = stored.shape
-            fits = (rows, columns) == area.image_shape
-            place = area if fits else whole_area(path, (rows, columns), _REMEDY)
+            place = _area_of_mask(path, stored.shape, area)
             counts[~resize_nearest(place.place(stored), area.full_shape)] = 0
         if not self.of_each:
             self._kept = area, counts

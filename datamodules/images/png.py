@@ -132,13 +132,19 @@ def check_png(path: Path, bits: int, colors: Sequence[str]) -> PngHeader:
     return header
 
 
-def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> None:
+def check_panorama_size(
+    path: Path,
+    size: tuple[int, int],
+    erp_height: int,
+    remedy: str = "Only full 360°×180° panoramas can be used.",
+) -> None:
     """Check that an image is a full panorama of enough rows.
 
     Args:
         path: The image.
         size: Rows and columns of the image.
         erp_height: Rows needed.
+        remedy: Remedy for a part of a panorama.
 
     Raises:
         DataError: It is not twice as wide as high.
@@ -150,7 +156,7 @@ def check_panorama_size(path: Path, size: tuple[int, int], erp_height: int) -> N
             path,
             found=width_height(size),
             expected="twice as wide as high",
-            remedy="Only full 360°×180° panoramas can be used.",
+            remedy=remedy,
         )
     if height < erp_height:
         raise SettingError(

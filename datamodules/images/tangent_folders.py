@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea, area_of_crop, read_area, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_angles, read_area, whole_area
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.images.videos import VIDEO_SUFFIXES
 from tangent_train.errors import SettingError
@@ -25,21 +25,21 @@ _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 
 
 def panorama_area(
-    path: Path, size: tuple[int, int], crop: Sequence[float] | None = None
+    path: Path, size: tuple[int, int], angles: Sequence[float] | None = None
 ) -> PanoramaArea:
     """Return the part of the sphere that a file shows.
 
     Args:
         path: Image, array or video; arrays and videos have no GPano tags.
         size: Rows and columns of the image or of a frame of the video.
-        crop: Part of the sphere, see `area_of_crop`; None to read it from GPano tags.
+        angles: Part of the sphere, see `area_of_angles`; None to read it from GPano tags.
 
     Raises:
         DataError: The file is neither a whole panorama nor tagged as a part.
-        SettingError: The crop does not fit.
+        SettingError: The angles do not fit.
     """
-    if crop is not None:
-        return area_of_crop(size, crop)
+    if angles is not None:
+        return area_of_angles(size, angles)
     is_tagged = path.suffix.lower() not in (".npy", ".exr", *VIDEO_SUFFIXES)
     return read_area(path, size) if is_tagged else whole_area(path, size)
 
@@ -47,7 +47,7 @@ def panorama_area(
 def read_placed(
     path: Path,
     interpolation: Interpolation,
-    crop: Sequence[float] | None = None,
+    angles: Sequence[float] | None = None,
     frame: Callable[[], NDArray[np.uint8]] | None = None,
 ) -> tuple[NDArray[Any], PanoramaArea]:
     """Read a panorama of any dtype; place a part of a panorama on the whole sphere.
@@ -55,7 +55,7 @@ def read_placed(
     Args:
         path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
-        crop: See `panorama_area`.
+        angles: See `panorama_area`.
         frame: Function that returns the frame of a video.
 
     Returns:
@@ -63,10 +63,10 @@ def read_placed(
 
     Raises:
         DataError: The file cannot be used.
-        SettingError: The crop does not fit.
+        SettingError: The angles do not fit.
     """
     image = read_pixels(path, indices=interpolation == "nearest") if frame is None else frame()
-    area = panorama_area(path, (image.shape[0], image.shape[1]), crop)
+    area = panorama_area(path, (image.shape[0], image.shape[1]), angles)
     return area.place(image), area
 
 

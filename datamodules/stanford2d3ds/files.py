@@ -6,6 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+from datamodules.core.labels import ClassSet, class_sets
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
@@ -32,6 +33,14 @@ CLASSES: tuple[str, ...] = (
     "window",
 )
 """The 13 classes; the label of a class is its index plus one."""
+
+EIGHT: tuple[str, ...] = (
+    *("ceiling", "chair", "door", "floor", "sofa", "table", "wall", "window"),
+)
+"""The classes of the adaptation benchmarks SPin8, SPan8 and S3D8."""
+
+CLASS_SETS = class_sets(CLASSES, {"8": ClassSet(EIGHT, CLASSES)})
+"""Values of the setting `classes`."""
 
 UNKNOWN_CLASS = "<UNK>"
 """Class of unlabeled instances."""

@@ -34,9 +34,9 @@ from typing import ClassVar, Literal
 
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.index import Split, draw_groups
-from datamodules.core.panoramas import ImageFiles, Unknown
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, GET_IT, list_pictures
+from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, CLASSES, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader
 from tangent_train.errors import DataError
 from tangent_train.registry import registered
@@ -62,7 +62,10 @@ class StanfordAreas(ImageDataModule):
     """
 
     class_names = ("unknown", *CLASSES)
+    class_sets = CLASS_SETS
     group: ClassVar[Literal["pano", "data"]]
+
+    fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
 
     fold: int = 1
     areas: Sequence[str] = AREAS
@@ -110,7 +113,7 @@ class StanfordAreas(ImageDataModule):
         }
 
     def _reader(self) -> StanfordReader:
-        """Return the reader, with the class table and the setting for unknown pixels."""
+        """Return the reader, with the class table."""
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         if self.label_table is not None:
             places = [self.label_table]
@@ -122,7 +125,7 @@ class StanfordAreas(ImageDataModule):
                 expected=f"it there or at {places[-1]}",
                 remedy="Copy it from the release (assets), or name it in data.label_table.",
             )
-        return StanfordReader(LabelTable.from_json(table), getattr(self, "unknown", "labels"))
+        return StanfordReader(LabelTable.from_json(table))
 
 
 @registered
@@ -130,21 +133,11 @@ class StanfordAreas(ImageDataModule):
 class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
 
-    Args:
-        unknown: Pixels that are unknown, see `mask_black`.
-
     Raises:
         SettingError: A setting is invalid.
     """
 
     group = "pano"
-
-    unknown: Unknown = "labels"
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        known = ("labels", "any_black", "all_black")
-        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
 
 
 @registered

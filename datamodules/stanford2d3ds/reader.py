@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import ImageFiles, PngReader, Unknown, mask_black, resize_nearest
+from datamodules.core.panoramas import ImageFiles, PngReader, resize_nearest
 from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
@@ -111,28 +111,21 @@ class StanfordReader(PngReader):
 
     Attributes:
         table: Classes of the instances.
-        unknown: Pixels that are unknown, see `mask_black`.
     """
 
     table: LabelTable
-    unknown: Unknown = "labels"
 
     formats = _FORMATS
 
     @property
     def settings(self) -> dict[str, str]:
-        """See `ImageReader`: unknown pixels and a digest of the class table."""
-        classes = hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()
-        return {"unknown": self.unknown, "class table": classes}
+        """See `ImageReader`: a digest of the class table."""
+        return {"class table": hashlib.sha256(self.table.class_ids.tobytes()).hexdigest()}
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return the labels by the class table; masked black pixels are 0."""
+        """Return the labels by the class table."""
         colors = read_rgb(files.labels)
-        shape = shape or (colors.shape[0], colors.shape[1])
-        labels = self.table.decode(resize_nearest(colors, shape))
-        if self.unknown == "labels":
-            return labels
-        return mask_black(labels, resize_nearest(self.rgb(files), shape), self.unknown)
+        return self.table.decode(colors if shape is None else resize_nearest(colors, shape))
 
     def label_warning(self, files: ImageFiles) -> str:
         """See `ImageReader`: instances past the end of the class table."""

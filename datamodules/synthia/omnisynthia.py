@@ -63,6 +63,8 @@ class SynthiaSequences(ImageDataModule):
     formats: ClassVar[reader.Formats]
     remedy: ClassVar[str] = reader.GET_IT
 
+    fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
+
     inputs: Sequence[Input] = ("rgb",)
     train_sequences: Sequence[str] = TRAIN
     test_sequences: Sequence[str] = TEST

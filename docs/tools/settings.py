@@ -1,4 +1,4 @@
-"""Write the reference pages of settings and experiments from the config files.
+"""Write the reference pages of settings, experiments and protocols from their files.
 
 ``python -m docs.tools.settings`` writes them; a test fails if they are out of date.
 """
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.help import Setting, bases, description, read_settings
+from tangent_train.results.published import facts, protocols, published_lines
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
@@ -41,6 +42,34 @@ command line override it. This page is generated from the files in `configs/expe
 meanings of the settings are on the page [Settings](settings.md).
 """
 
+_PROTOCOLS = """# Protocols
+
+A protocol is the set of facts that decide which scores can be compared. Every run derives its facts
+from its data set, its settings and its task and stores them in
+[results.json](file_formats.md#resultsjson). `tangent-report` and `results.md` show a published
+score beside a result if all facts are the same, and name the facts in which the nearest other
+protocols differ. Different data sets are not compared.
+
+| fact | meaning |
+| --- | --- |
+| `data` | class of the data set |
+| `size` | width × height of the panorama whose pixels are scored; of photos, the crops |
+| `area` | part of the sphere: west, east, south and north in degrees; none is the whole sphere |
+| `unknown` | black pixels that are unknown too, see `data.unknown` |
+| `mask` | further ignored pixels, see `data.mask` |
+| `test_rotation` | rotation of the test images, see `data.test_rotation` |
+| `classes` | set of classes: their number, or a name, see `data.classes` |
+| `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
+| `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
+
+Further facts are settings of single data sets. Folds are compared separately. "Not stated" is a
+fact that the source does not state: such scores stand beside no result. Reasons are on the page
+[Comparison](../explanation/comparison.md#published-scores), commands on the page
+[Benchmarks of the field](../how-to/field_benchmarks.md).
+
+This page is generated from `protocols.yaml` and `published.csv` in `tangent_train/results`.
+"""
+
 
 def pages() -> dict[Path, str]:
     """Return the generated pages by their paths."""
@@ -51,7 +80,24 @@ def pages() -> dict[Path, str]:
     return {
         REFERENCE / "settings.md": "\n".join(settings),
         REFERENCE / "experiments.md": "\n".join([_EXPERIMENTS, *experiments]),
+        REFERENCE / "protocols.md": "\n".join([_PROTOCOLS, *map(_protocol, protocols())]),
     }
+
+
+def _protocol(name: str) -> str:
+    entry = protocols()[name]
+    run = f"\n\n`experiment={entry['experiment']}`" if "experiment" in entry else ""
+    listed = [f"| `{fact}` | {value} |" for fact, value in facts(name).items()]
+    lines = [line for line in published_lines() if line["protocol"] == name and line["mean"]]
+    columns = ("method", "stage", "trained_on", "level", "inputs", "fold", "score", "mean")
+    shown = [column for column in columns if any(line[column] for line in lines)]
+    rows = [
+        f"| {' | '.join(line[c] or '–' for c in shown)} | <{line['source']}> |" for line in lines
+    ]
+    head = [*(column.replace("_", " ") for column in shown), "source"]
+    table = [f"| {' | '.join(head)} |", f"| {' | '.join('---' for _ in head)} |", *rows]
+    text = f"## {name}\n\n{entry['about']}{run}\n\n| fact | value |\n| --- | --- |\n"
+    return text + "\n".join([*listed, "", *(table if lines else ["No score is published."]), ""])
 
 
 def _command(name: str) -> str:

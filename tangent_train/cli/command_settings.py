@@ -84,13 +84,13 @@ class InputSettings:
 
     Attributes:
         input: Images, see `datamodules.images.image_files.image_paths`.
-        crop: Part of the sphere that panoramas show, see `area_of_crop`; None for the part that
+        area: Part of the sphere that panoramas show, see `area_of_angles`; None for the part that
             their GPano tags name.
         every: Step between the frames of a video: 1 for all, n for the first and every n-th one.
     """
 
     input: str | Path | None = field(metadata=_IMAGES)
-    crop: tuple[float, ...] | None
+    area: tuple[float, ...] | None
     every: int
 
 

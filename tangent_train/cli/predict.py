@@ -47,7 +47,7 @@ from tangent_train.results.predictions import (
 )
 
 _DECISIVE = (
-    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "crop", "fov", "levels",
+    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "levels",
     "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
@@ -198,7 +198,7 @@ class _Labeler:
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
             return read_photo(image, settings.fov, depth), None
-        return read_panorama(image, settings.crop, settings.upright, depth)
+        return read_panorama(image, settings.area, settings.upright, depth)
 
     def __call__(self, job: Job, progress: Callable[[float], object]) -> LabeledImage:
         """Predict the labels of one image."""
@@ -286,7 +286,7 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
     def check_size(path: Path, size: tuple[int, int]) -> None:
         if settings.projection == "equirectangular":
-            panorama_area(path, size, settings.crop)
+            panorama_area(path, size, settings.area)
 
     inputs = Inputs.find(settings, is_result_in(settings.output), check_size)
     pictures = {"color", "overlay"}.intersection(settings.write)
@@ -311,7 +311,7 @@ def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
 def _check_projection(settings: PredictSettings) -> None:
     """Refuse settings of photos for panoramas, and of panoramas for photos."""
     is_photo = settings.projection == "perspective"
-    others = ("crop", "upright", "mask") if is_photo else ("fov",)
+    others = ("area", "upright", "mask") if is_photo else ("fov",)
     for name in others:
         if (found := getattr(settings, name)) is not None:
             expected = "null for photos" if is_photo else "null without projection=perspective"

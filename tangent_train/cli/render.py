@@ -111,7 +111,7 @@ def _rendering_jobs(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work
     check_new(settings, *folders, settings.figure)
 
     def work(job: Job, progress: Callable[[float], object]) -> Path:
-        image, _ = read_placed(job.path, settings.interpolation, settings.crop, job.value)
+        image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
         shape = image.shape[0], image.shape[1]
         grid, faces = _grid(settings, shape[0])
         if settings.figure is not None:
@@ -137,7 +137,7 @@ def _panoramas(settings: RenderSettings) -> Inputs:
         return in_project or path.name == RIG_FILE or (path.parent / CAMERAS_FILE).exists()
 
     def check_size(path: Path, size: tuple[int, int]) -> None:
-        panorama_area(path, size, settings.crop)
+        panorama_area(path, size, settings.area)
 
     return Inputs.find(settings, is_result, check_size)
 
@@ -178,7 +178,7 @@ def _render_project(settings: RenderSettings) -> None:
 
         def work(job: Job, progress: Callable[[float], object]) -> Path:
             name, path = job.item, job.path
-            image, area = read_placed(path, settings.interpolation, settings.crop, job.value)
+            image, area = read_placed(path, settings.interpolation, settings.area, job.value)
             file = name if is_video(path) else name.removesuffix(path.suffix) + path.suffix
             project.add(names[name], file, image, masks.read(name, area), progress)
             return output
@@ -209,7 +209,7 @@ def _rows(settings: RenderSettings, inputs: Inputs) -> Iterator[int]:
         with suppress(DataError, SettingError):
             if video is None or video.value is not None:
                 size = read_image_size(path) if video is None else video.value[1:]
-                rows = panorama_area(path, size, settings.crop).full_shape[0]
+                rows = panorama_area(path, size, settings.area).full_shape[0]
         yield rows
 
 

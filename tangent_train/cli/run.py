@@ -41,7 +41,9 @@ from tangent_train.results.evaluation import (
     write_results,
 )
 from tangent_train.results.html import write_report
+from tangent_train.results.published import Comparison
 from tangent_train.results.record import Record
+from tangent_train.setting_rules import flat_settings
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -172,9 +174,16 @@ class Run:
         is_inside = checkpoint.is_relative_to(self.folder)
         # A relative path stays right when the folder is moved.
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
-        record = replace(record, checkpoint=name, class_map=self.settings.get("class_map"))
+        record = replace(
+            record,
+            protocol={**self.data.facts, **self.task.facts},
+            checkpoint=name,
+            class_map=self.settings.get("class_map"),
+            settings=dict(flat_settings(self.settings)),
+        )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
-        write_results(record, self.folder, notes)
+        published = Comparison.of([record])
+        write_results(record, self.folder, [*notes, *published.notes], published.tables(record))
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",

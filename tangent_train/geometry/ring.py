@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry.coverage import DirectionSet, check_coverage, overlaps
+from tangent_train.geometry.area import SphereArea
+from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 
 _WIDEST_DEG = 170.0
@@ -44,7 +45,7 @@ class RingGrid(PinholeGrid):
             edges. Pixels are square: if `size` has another ratio, one field of view is larger.
         size: Rows and columns of the images.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
-        part: Part of the sphere that the images must cover; None for all of it.
+        area: Area that the images must cover; None for the sphere.
         by_owners: See `check_coverage`.
 
     Raises:
@@ -67,7 +68,7 @@ class RingGrid(PinholeGrid):
         fov_deg: tuple[float, float],
         size: tuple[int, int],
         rotation: ArrayLike | None = None,
-        part: DirectionSet | None = None,
+        area: SphereArea | None = None,
         *,
         by_owners: bool = False,
     ) -> None:
@@ -85,8 +86,8 @@ class RingGrid(PinholeGrid):
                 remedy="Give each pitch once, with one view at 90 and -90.",
             )
         self._set(None, rings=checked, size=(rows, columns), pitch=pitch, _axes=axes)
-        check_coverage(self, part, by_owners=by_owners)
-        self._set(rotation, _is_overlapping=overlaps(self, part))
+        check_coverage(self, area, by_owners=by_owners)
+        self._set(rotation, _is_overlapping=overlaps(self, area))
         for cached in ("world_from_camera", "centers_xyz"):
             vars(self).pop(cached, None)
 

@@ -39,7 +39,7 @@ _ASPECT_TOLERANCE = 0.01
 _IN_MEMORY = Path("image")
 _NOT_WHOLE = (
     "For a photo, give fov=, its horizontal field of view in degrees; for a part of a panorama, "
-    "crop=[west, east, south, north] in degrees."
+    "area=[west, east, south, north] in degrees."
 )
 
 
@@ -112,7 +112,7 @@ class DepthFolder:
 
 def read_panorama(
     image: Picture,
-    crop: Sequence[float] | None = None,
+    angles: Sequence[float] | None = None,
     upright: Upright = None,
     depth: DepthOfSize | None = None,
 ) -> tuple[InputImage, PanoramaArea]:
@@ -120,7 +120,7 @@ def read_panorama(
 
     Args:
         image: The panorama; only files have GPano tags.
-        crop: Part of the sphere that it covers, see `area_of_crop`; None to use its GPano tags.
+        angles: Part of the sphere that it covers, see `area_of_angles`; None to use its GPano tags.
         upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
             `with_up` estimates it for ``auto``); None for z.
         depth: Function that returns its depth.
@@ -130,12 +130,12 @@ def read_panorama(
 
     Raises:
         DataError: A file cannot be used, or the image is not a whole panorama.
-        SettingError: The crop does not fit the image, or the value is not an image.
+        SettingError: The angles do not fit the image, or the value is not an image.
     """
     rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
     size = rgb.shape[0], rgb.shape[1]
-    if path is not None or crop is not None:
-        area = panorama_area(path or _IN_MEMORY, size, crop)
+    if path is not None or angles is not None:
+        area = panorama_area(path or _IN_MEMORY, size, angles)
     else:
         area = whole_area(_IN_MEMORY, size, _NOT_WHOLE)
     steps = None if depth is None else depth(size)

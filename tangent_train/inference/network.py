@@ -146,7 +146,7 @@ class Network:
         *,
         depth: Depth = None,
         fov: float | None = None,
-        crop: Sequence[float] | None = None,
+        area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
         mask: Mask | str | NDArray[Any] | Tensor = None,
@@ -158,9 +158,9 @@ class Network:
             depth: ``(H, W)`` floats in meters, 0 or NaN where missing, for networks with depth as
                 an input: distance from the center for panoramas, z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
-            crop: West, east, south and north of a part of a panorama in degrees, see
-                `area_of_crop`. None to use the GPano tags of a file, or the whole sphere (W = 2 H)
-                without tags.
+            area: West, east, south and north of a part of a panorama in degrees, see
+                `area_of_angles`. None to use the GPano tags of a file, or the whole sphere
+                (W = 2 H) without tags.
             upright: Align a panorama with gravity: ``pose`` uses the GPano tags of a file; ``auto``
                 uses them too, or an estimate from the image without tags.
             max_tilt_deg: Largest tilt that ``auto`` considers, in degrees.
@@ -178,12 +178,12 @@ class Network:
         if mask is not None and fov is not None:
             raise SettingError("mask", found="one, with fov=", expected="None for photos")
         masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
-        how: dict[str, Any] = {"depth": depth, "fov": fov, "crop": crop, "upright": upright}
-        mosaic, area = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
+        how: dict[str, Any] = {"depth": depth, "fov": fov, "area": area, "upright": upright}
+        mosaic, shown = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
         labels: Any = self.trained.labels(mosaic.labels())
-        if area is not None:
+        if shown is not None:
             name = Path(image).stem if isinstance(image, str | Path) else ""
-            labels = area.cut(np.where(masks.read(name, area) > 0, labels, labels.dtype.type(0)))
+            labels = shown.cut(np.where(masks.read(name, shown) > 0, labels, labels.dtype.type(0)))
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
@@ -204,10 +204,10 @@ class Network:
             DataError: See `labels`.
             SettingError: See `labels`.
         """
-        mosaic, area = self._predict(image, probabilities=True, **settings)
+        mosaic, shown = self._predict(image, probabilities=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        if area is not None:
-            scores = torch.from_numpy(np.ascontiguousarray(area.cut(scores.cpu().numpy())))
+        if shown is not None:
+            scores = torch.from_numpy(np.ascontiguousarray(shown.cut(scores.cpu().numpy())))
         if isinstance(image, Tensor):
             return scores.movedim(-1, 0).contiguous().to(image.device)
         return scores.contiguous().cpu().numpy()
@@ -218,7 +218,7 @@ class Network:
         *,
         depth: Any = None,
         fov: float | None = None,
-        crop: Sequence[float] | None = None,
+        area: Sequence[float] | None = None,
         upright: Any = None,
         max_tilt_deg: float = 60.0,
         probabilities: bool = False,
@@ -226,8 +226,8 @@ class Network:
         """Predict a photo, or a panorama with the area of the sphere that it covers."""
         of_size = partial(self._depth, depth)
         if fov is not None:
-            if crop is not None or upright is not None:
-                given = "crop" if crop is not None else "upright"
+            if area is not None or upright is not None:
+                given = "area" if area is not None else "upright"
                 raise SettingError(given, found="one, with fov=", expected="None for photos")
             photo = read_photo(image, fov, of_size)
             return self._photos().predict(photo, probabilities=probabilities), None
@@ -240,10 +240,10 @@ class Network:
                     expected="auto or None: only files have GPano tags",
                     remedy="Give the path of the panorama.",
                 )
-        panorama, area = read_panorama(image, crop, upright, of_size)
+        panorama, shown = read_panorama(image, area, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._judge)
-        return self._panoramas.predict(panorama, probabilities=probabilities), area
+        return self._panoramas.predict(panorama, probabilities=probabilities), shown
 
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
         """Return depth in steps of 1/512 m; refuse depth of another size or kind."""

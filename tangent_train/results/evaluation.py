@@ -151,18 +151,21 @@ def confusion_table(record: Record) -> Table:
     return Table("Confusion", ("", *record.class_names), rows, note, shades=shares.tolist())
 
 
-def write_results(record: Record, folder: Path, notes: Sequence[str] = ()) -> None:
+def write_results(
+    record: Record, folder: Path, notes: Sequence[str] = (), published: Sequence[Table] = ()
+) -> None:
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
         record: Record of the evaluation.
         folder: Output folder.
         notes: Paragraphs in ``results.md`` below the headline.
+        published: Tables of published scores in ``results.md``.
     """
     write_text(folder / RESULTS_FILE, record.json())
     network = {"checkpoint": record.checkpoint, "class_map": record.class_map}
     lines = [{**entry, **network} for entry in record.classes or [record.means]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
-    tables = "\n".join(table.markdown() for table in result_tables(record))
+    tables = "\n".join(table.markdown() for table in (*result_tables(record), *published))
     text = "\n\n".join(["# Results", headline(record), *notes, tables])
     write_text(folder / "results.md", text)

@@ -95,6 +95,7 @@ _FIELDS = {
     "latitude_bands": list,
     "confusion": list[list[int]],
     "intervals": dict[str, list[float]],
+    "protocol": dict[str, Text],
     "checkpoint": Text,
     "class_map": Text | None,
 }
@@ -116,6 +117,7 @@ class Record:
             photos.
         confusion: Counts; rows are true, columns predicted classes. Empty without classes.
         intervals: 95 % bootstrap intervals over the images, for means that have one.
+        protocol: Facts that make scores comparable, see `results.published`.
         checkpoint: File of the network, relative to the run folder if it is inside.
         class_map: File or name of the map to the classes of the data; None without a map.
         settings: Resolved config of the run, with names ``section.setting``.
@@ -130,6 +132,7 @@ class Record:
     latitude_bands: Sequence[Mapping[str, Any]] = ()
     confusion: Sequence[Sequence[int]] = ()
     intervals: Mapping[str, Interval] = field(default_factory=dict)
+    protocol: Mapping[str, str] = field(default_factory=dict)
     checkpoint: str = ""
     class_map: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)

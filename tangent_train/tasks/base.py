@@ -197,6 +197,11 @@ class Task(lightning.LightningModule, ABC):
         means = scores | {name: None for name in self.headings if name not in scores}
         return Record(noun, self.evaluated, self.headings, means)
 
+    @property
+    def facts(self) -> dict[str, str]:
+        """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
+        return {}
+
     def targets(self, batch: Any) -> Tensor:
         """Return the true labels of an evaluated batch, one item per prediction."""
         targets: Tensor = batch.target

@@ -318,6 +318,11 @@ class SegmentationTask(Task):
             intervals=intervals[0] | by_solid_angle(intervals[1]),
         )
 
+    @property
+    def facts(self) -> dict[str, str]:
+        """See `Task`: the scores count pixels of all images together, then average classes."""
+        return {"absent_class": self.absent_class, "weighting": "pixels"}
+
     def _absent_classes(self, result: SegmentationCounts) -> tuple[AbsentClass, AbsentClass]:
         """Return the treatment of absent classes for scores by pixels and by solid angle."""
         return self.absent_class, self.absent_class if result.solid_angle.any() else "skip"

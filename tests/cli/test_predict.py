@@ -61,7 +61,7 @@ def test_a_folder_of_panoramas(tmp_path: Path, predict: Predict, capsys: Capture
     assert rows["a=b.png"]["dark"] == str(entries["a=b"]["classes"]["dark"])
     names = json.loads((output / "classes.json").read_text())
     assert names == {"dark": [1], "green": [2], "bright": [3]}
-    for remedy in ("16 × 16", "crop=", "GPano", "projection=perspective"):
+    for remedy in ("16 × 16", "area=", "GPano", "projection=perspective"):
         assert remedy in entries["square"]["error"]
     assert sum(entries["a=b"]["classes"].values()) == pytest.approx(1)
     page = (output / "report.html").read_text()
@@ -175,7 +175,7 @@ def test_a_part_of_a_panorama_is_labeled_as_that_part(tmp_path: Path, predict: P
     write_pixels(part, sphere(64)[rows][:, columns])
     common = {"blend": "nearest", "write": "[labels,probabilities]"}
     predict(**common, input=whole, output=tmp_path / "w")
-    predict(**common, input=part, output=tmp_path / "p", crop="[135,-135,-45,45]")
+    predict(**common, input=part, output=tmp_path / "p", area="[135,-135,-45,45]")
     inner = slice(8, -8)
     for read in (
         lambda folder, name: read_png(folder / "labels" / f"{name}.png"),
@@ -250,7 +250,7 @@ def test_depth_is_that_of_the_image_in_its_folder(tmp_path: Path, predict: Predi
         *(
             ({"projection": "perspective", **of_panoramas}, f"{next(iter(of_panoramas))}: found")
             for of_panoramas in (
-                {"crop": "[0,90,0,45]"},
+                {"area": "[0,90,0,45]"},
                 {"upright": "auto"},
                 {"mask": -30},
                 {"rotations": 2},

@@ -308,17 +308,17 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
     write_pixels(tmp_path / "strip.png", whole[8:24])
     settings = {"base_level": 0, "faces": [9], "colmap": colmap}
     message = refused(input=tmp_path / "strip.png", output=tmp_path / "none", **settings)
-    assert "crop=[west,east,south,north]" in message
+    assert "area=[west,east,south,north]" in message
     assert "tangent-predict with projection=perspective" in message
-    crop = [-180, 180, -45, 45]
-    render_with(input=tmp_path / "strip.png", output=tmp_path / "strip", crop=crop, **settings)
+    area = [-180, 180, -45, 45]
+    render_with(input=tmp_path / "strip.png", output=tmp_path / "strip", area=area, **settings)
     render_with(input=tmp_path / "whole.png", output=tmp_path / "whole", **settings)
     images = "images/face_009/strip.png" if colmap else "strip/face_009.png"
     again = _read(tmp_path / "strip" / images)
     expected = _read(tmp_path / "whole" / images.replace("strip", "whole"))
     np.testing.assert_array_equal(again, expected)
-    message = refused(input=tmp_path / "whole.png", output=tmp_path / "no", crop=crop, **settings)
-    assert "crop: found" in message
+    message = refused(input=tmp_path / "whole.png", output=tmp_path / "no", area=area, **settings)
+    assert "area: found" in message
     if colmap:
         assert not _read(tmp_path / "strip" / "masks" / "face_009" / "strip.png.png").all()
 

@@ -2,7 +2,7 @@
 
 A comment before a table or paragraph names the file: ``<!-- data: demo.csv -->``. A table of a
 results page equals its file. In README.md, a table or paragraph with a score names one or more
-files, and its figures are found in them; ``paper.csv`` is the paper's, in `tangent_train.results`.
+files, and its figures are found in them; ``published.csv`` is in `tangent_train.results`.
 """
 
 from __future__ import annotations
@@ -15,6 +15,8 @@ from statistics import fmean
 from typing import NamedTuple
 
 import pytest
+
+from tangent_train.results.published import published_lines
 
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "docs" / "results"
@@ -95,13 +97,13 @@ def tables(page: Path) -> Iterator[tuple[list[list[str]], list[str]]]:
 
 
 def published() -> list[list[str]]:
-    """Return the paper's figures, one in each row, with the means over its folds."""
-    with (ROOT / "tangent_train" / "results" / "paper.csv").open(encoding="utf-8") as stream:
-        rows = [row for row in csv.DictReader(stream) if row["mean"]]
+    """Return the published figures, one in each row, with the means over folds."""
+    rows = [row for row in published_lines() if row["mean"]]
     folds: dict[tuple[str, ...], list[float]] = {}
     for row in rows:
-        names = ("data", "stage", "method", "level", "base_level", "inputs", "score")
-        folds.setdefault(tuple(row[name] for name in names), []).append(float(row["mean"]))
+        names = ("protocol", "stage", "method", "trained_on", "level", "base_level", "inputs")
+        key = (*(row[name] for name in names), row["score"])
+        folds.setdefault(key, []).append(float(row["mean"]))
     return [[row["mean"]] for row in rows] + [[f"{fmean(found):.1f}"] for found in folds.values()]
 
 
@@ -113,7 +115,7 @@ def is_found(figure: str, files: list[str]) -> bool:
         files: Names of data files.
     """
     number = re.compile(rf"(?<![\d.]){re.escape(figure)}(?![\d.])")
-    tables = [published() if file == "paper.csv" else cells(file) for file in files]
+    tables = [published() if file == "published.csv" else cells(file) for file in files]
     return any(number.search(cell) for rows in tables for row in rows for cell in row)
 
 

@@ -10,23 +10,20 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid, PinholeGrid, RingGrid, TangentGrid, rotation_about
+from tangent_train.geometry import (
+    CubeGrid,
+    PinholeGrid,
+    RingGrid,
+    SphereArea,
+    TangentGrid,
+    rotation_about,
+)
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.rendering.tables import find_owned_spans, owners
 from tests.geometry.directions import angle_deg, random_directions
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
 STANDARD = ((0, 8), (40, 5), (-40, 5))
-
-
-class Cap:
-    """A cap around the direction x."""
-
-    def __init__(self, radius_deg: float) -> None:
-        self.cosine = math.cos(math.radians(radius_deg))
-
-    def contains(self, directions_xyz: Any) -> NDArray[np.bool_]:
-        return np.asarray(np.asarray(directions_xyz)[..., 0] > self.cosine)
 
 
 def grid_of(
@@ -40,7 +37,7 @@ def grid_of(
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
 def test_views_are_yawed_and_pitched_but_not_rolled(rotation: NDArray[np.float64] | None) -> None:
-    """Compared with a camera at longitude 0 that is turned up, then around the vertical."""
+    """Compared with a camera at longitude 0 that is pitched, then yawed around the vertical."""
     grid = grid_of(((0, 8), (50, 4), (-50, 4)), (70, 90), (20, 15), rotation=rotation)
     tangent = math.tan(math.radians(45)) * 2 / 20  # the vertical field of view is decisive
     assert grid.pitch == pytest.approx(tangent)
@@ -48,10 +45,10 @@ def test_views_are_yawed_and_pitched_but_not_rolled(rotation: NDArray[np.float64
     for pitch_deg, views in ((0, 8), (50, 4), (-50, 4)):
         for yaw_deg in np.arange(views) * 360 / views:
             around = rotation_about((0, 0, 1), math.radians(yaw_deg))
-            turned = around @ rotation_about((0, 1, 0), -math.radians(pitch_deg))
+            camera = around @ rotation_about((0, 1, 0), -math.radians(pitch_deg))
             for row, column in ((0, 0), (19, 14), (3, 11)):
                 seen = [1, (column - 7) * tangent, -(row - 9.5) * tangent]
-                expected = (np.eye(3) if rotation is None else rotation) @ turned @ seen
+                expected = (np.eye(3) if rotation is None else rotation) @ camera @ seen
                 found = grid.directions([view])[0, row, column]
                 assert angle_deg(found, expected) < 1e-9
                 pixel = grid.project(3 * expected, view)
@@ -135,8 +132,12 @@ def test_coverage_agrees_with_random_directions(seed: int) -> None:
 @pytest.mark.parametrize(
     ("rings", "fov", "message"),
     [
-        (((0, 8),), (100, 100), r"8 views that miss longitude .*°, latitude \d\d°; expected"),
-        (((0, 4), (90, 1), (-90, 1)), (89, 89), r"6 views that miss longitude -?\d+°, latitude -?\d\d°"),
+        (((0, 8),), (100, 100), r"8 views that miss longitude .*°, latitude -?\d\d°; expected"),
+        (
+            ((0, 4), (90, 1), (-90, 1)),
+            (89, 89),
+            r"6 views that miss longitude -?\d+°, latitude -?\d\d°",
+        ),
         (((0, 3), (60, 3), (-60, 3)), (85, 85), "9 views that miss"),
         (((0, 1),), (90, 90), "1 views that miss"),
     ],
@@ -156,13 +157,13 @@ def test_a_direction_may_be_shown_by_another_view_than_its_owner() -> None:
 
 
 def test_some_views_can_cover_a_part_of_the_sphere() -> None:
-    flat = grid_of(((0, 1),), part=Cap(48))
+    flat = grid_of(((0, 1),), area=SphereArea(-49, 49, -35, 35))
     assert (flat.num_images, flat.is_overlapping) == (1, True)
     with pytest.raises(SettingError, match="expected views that cover the area"):
-        grid_of(((0, 1),), part=Cap(52))
+        grid_of(((0, 1),), area=SphereArea(-49, 49, -39, 39))
     front = grid_of(STANDARD).subset([0, 8, 13])
-    check_coverage(front, Cap(45), by_owners=True)
-    assert overlaps(front, Cap(45))
+    check_coverage(front, SphereArea(-20, 20, -80, 80), by_owners=True)
+    assert overlaps(front, SphereArea(-20, 20, -80, 80))
     np.testing.assert_array_equal(front.directions(), grid_of(STANDARD).directions([0, 8, 13]))
     assert front != grid_of(STANDARD).subset([0, 8, 12])
     assert front.with_rotation(ROTATION) == grid_of(STANDARD, rotation=ROTATION).subset([0, 8, 13])

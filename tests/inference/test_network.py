@@ -110,14 +110,14 @@ PART: dict[str, object] = {
     "CroppedAreaTopPixels": 8, "CroppedAreaImageWidthPixels": 50,
     "CroppedAreaImageHeightPixels": 20,
 }  # fmt: skip
-CROP = [-108, 72, -10.8, 61.2]
+AREA = [-108, 72, -10.8, 61.2]
 POSE: dict[str, object] = {"PosePitchDegrees": 30, "PoseRollDegrees": -20}
 
 
 @pytest.mark.parametrize(
     ("tags", "shown", "typed", "settings"),
     [
-        ({}, np.s_[8:28, 20:70], [f"crop={CROP}"], {"crop": CROP}),
+        ({}, np.s_[8:28, 20:70], [f"area={AREA}"], {"area": AREA}),
         (PART, np.s_[8:28, 20:70], [], {}),
         (PART, np.s_[8:28, 20:70], ["mask=-5"], {"mask": -5}),
         (POSE, np.s_[:], ["upright=pose"], {"upright": "pose"}),
@@ -264,7 +264,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*fov=.*crop="),
+        (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*fov=.*area="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB from 0 to 255"),
@@ -294,11 +294,11 @@ def test_photos_have_no_rotations(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"fov": 60, "crop": [0, 90, 0, 45]}, "crop: found one, with fov=; expected None"),
+        ({"fov": 60, "area": [0, 90, 0, 45]}, "area: found one, with fov=; expected None"),
         ({"fov": 60, "upright": "auto"}, "upright: found one, with fov=; expected None"),
         ({"fov": 60, "mask": -30}, "mask: found one, with fov=; expected None"),
-        ({"crop": [0, 90, 0]}, r"crop: found \[0, 90, 0\]"),
-        ({"crop": [0, 90, 0, 90]}, "crop: found .*square"),
+        ({"area": [0, 90, 0]}, r"area: found \[0, 90, 0\]"),
+        ({"area": [0, 90, 0, 90]}, "area: found .*square"),
         ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
         ({"upright": "pose"}, "upright: found pose, of ndarray .* Give the path"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
 
+from tangent_train.results.published import facts
 from tangent_train.results.record import Record
 from tangent_train.setting_rules import flat_settings
 from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")
 BANDS = ((45.0, 90.0), (-90.0, 45.0))
+PROTOCOL = facts("paper_512")
 SETTINGS = {
     "name": "mine",
     "seed": 0,
@@ -35,6 +37,7 @@ def made_record(
     scores: Sequence[float | None],
     names: Sequence[str] = NAMES,
     bands: Sequence[float] = (),
+    protocol: Mapping[str, str] = {},
     **settings: Any,
 ) -> Record:
     """Make a record with one value for all scores of a class, and the means of these.
@@ -43,6 +46,7 @@ def made_record(
         scores: Score of each class.
         names: Name of each class.
         bands: Score of each band.
+        protocol: Facts of the protocol, e.g. `PROTOCOL`.
         settings: Changes of `SETTINGS`, two underscores for a point.
     """
     config = OmegaConf.create(SETTINGS)
@@ -65,6 +69,7 @@ def made_record(
             {"latitude_deg": list(band), "miou": value, "macc": value}
             for band, value in zip(BANDS, bands, strict=False)
         ],
+        protocol=protocol,
         settings=flat,
         folder=Path(f"/runs/{flat['data.fold']}_{flat['seed']}"),
     )

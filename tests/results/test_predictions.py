@@ -10,7 +10,7 @@ import pytest
 
 from datamodules.folder.classes import read_classes
 from datamodules.folder.reader import class_masks
-from datamodules.images.gpano import area_of_crop, whole_area
+from datamodules.images.gpano import area_of_angles, whole_area
 from datamodules.images.image_files import short_names
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import camera_matrix_from_fov
@@ -56,7 +56,7 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
     labels[:30] = 1  # 60° to 90°: 2π (1 − sin 60°) of 4π
     labels[60:] = 0  # below 30°: half of it
     cap = (1 - math.sin(math.pi / 3)) / 2
-    area = area_of_crop((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
+    area = area_of_angles((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
     shares = class_shares(LabeledImage(image, labels, area), NAMES)
     assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})
 

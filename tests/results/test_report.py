@@ -11,13 +11,14 @@ import pytest
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.results.chart import report_png
-from tangent_train.results.comparisons import published, runs_report, transfer_report
+from tangent_train.results.comparisons import runs_report, transfer_report
+from tangent_train.results.published import Comparison, facts, published_lines
 from tangent_train.results.record import Record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
 from tangent_train.tasks import ClassificationTask
 from tests.decoded import decoded
-from tests.results.made_records import made_record, without_solid_angle
+from tests.results.made_records import PROTOCOL, made_record, without_solid_angle
 
 REAL = CLASSES
 
@@ -34,8 +35,9 @@ def _cells(report: Report, table: int = 0) -> dict[str, dict[str, str]]:
 
 def _paper(**settings: Any) -> dict[str, Row]:
     """The paper's transfer by stage, as it stands beside one of that level."""
-    record = made_record([0.5] * 13, REAL, **{"level": 8, **settings})
-    rows = transfer_report({"P": [record], "S": [record]}).rows
+    record = made_record([0.5] * 13, REAL, **{"level": 8, "protocol": PROTOCOL, **settings})
+    photos = replace(record, protocol=facts("paper_photos"))
+    rows = transfer_report({"P": [photos], "S": [record]}).rows
     return {row.label.removesuffix(" (paper)"): row for row in rows if row.published}
 
 
@@ -75,8 +77,8 @@ def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     assert explained not in _runs_report(*several).tables()[0].note
 
 
-def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
-    report = _runs_report(made_record([0.5] * 13, REAL))
+def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
+    report = _runs_report(made_record([0.5] * 13, REAL, protocol=PROTOCOL))
     cells = _cells(report)
     assert set(cells) == {
         "tangent images (paper)", "Tateno et al. (paper)", "Lee et al. (paper)", "mine",
@@ -86,6 +88,58 @@ def test_the_papers_rows_stand_beside_the_same_data_and_resolution() -> None:
     assert cells["Lee et al. (paper)"]["mIoU %"] == "–"
     per_class = _cells(report, 1)["tangent images (paper)"]
     assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
+    source = "Published scores of the same protocol: https://arxiv.org/abs/1912.09390."
+    assert source in report.all_notes()
+
+
+@pytest.mark.parametrize("name", PROTOCOL.keys() - {"data"} | {"another"})
+def test_a_single_differing_fact_is_named_and_nothing_stands_beside(name: str) -> None:
+    record = made_record([0.5] * 13, REAL, protocol=PROTOCOL | {name: "changed"})
+    published = Comparison.of([record])
+    assert published.rows == []
+    assert published.tables(record) == []
+    first, *others = published.notes
+    was = PROTOCOL.get(name, "–")
+    assert first == (
+        "Not comparable: Tateno et al. 34.6 and 2 more (paper_512). "
+        f"{name}: published {was}, this run changed."
+    )
+    assert 1 <= len(others) <= 2
+
+
+def test_a_fold_without_a_published_score_is_named() -> None:
+    protocol = facts("stanford2d3ds_trans4pass")
+    record = made_record([0.5] * 13, REAL, protocol=protocol, data__fold=2)
+    (row,) = Comparison.of([record]).rows
+    assert row.label == "Trans4PASS+ (S) (paper)"
+    assert row.score("miou").mean == pytest.approx(0.54)
+    assert row.of_fold(2).score("miou").mean == pytest.approx(0.477)
+    transfer = Comparison.of([record], transfer=True)
+    assert transfer.rows == []
+    assert "fold: published 1, this run 2." in transfer.notes[0]
+    transfer = Comparison.of([replace(record, settings={"data.fold": 1})], transfer=True)
+    assert {row.label for row in transfer.rows} >= {
+        "Trans4PASS+ (S), trained on photos of Stanford2D3DS (paper)"
+    }
+
+
+def test_facts_in_which_runs_differ_are_columns_of_all_rows() -> None:
+    other = made_record([0.5] * 13, REAL, protocol=PROTOCOL | {"mask": "-60"}, data__mask=-60)
+    report = _runs_report(made_record([0.5] * 13, REAL, protocol=PROTOCOL), other)
+    assert {label: row["mask"] for label, row in _cells(report).items()} == {
+        "mine (data.mask=None)": "none",
+        "mine (data.mask=-60)": "-60",
+        **dict.fromkeys(
+            ("tangent images (paper)", "Tateno et al. (paper)", "Lee et al. (paper)"), "none"
+        ),
+    }
+
+
+def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> None:
+    for line in published_lines():
+        assert facts(line["protocol"])["data"] == line["data"]
+        assert line["source"].startswith("https://")
+        assert 0 < float(line["mean"] or 50) < 100
 
 
 def test_rows_are_in_the_order_of_their_levels() -> None:
@@ -94,14 +148,11 @@ def test_rows_are_in_the_order_of_their_levels() -> None:
 
 
 @pytest.mark.parametrize(
-    "changes",
-    [{"data___target_": "datamodules.SynthRooms"}, {"data__test_rotation": "so3"}, {"level": 6}],
+    "changes", [{"protocol": {"data": "SynthRooms"}}, {"protocol": {}}, {"level": 6}]
 )
 def test_nothing_published_stands_beside_other_data(changes: dict[str, Any]) -> None:
-    assert published([made_record([0.5] * 13, REAL, **changes)]) == []
-    assert published([made_record([0.5] * 12, REAL[:12])]) == []
     assert _paper()
-    assert not _paper(**changes)
+    assert not {name for name in _paper(**changes) if name[0] == "S"}
 
 
 @pytest.mark.parametrize(("name", "macc", "miou"), [("P", 61.8, 45.7), ("S-FT-10", 64.0, 49.6)])
@@ -142,7 +193,10 @@ def test_reports_of_shapes_name_their_rotations() -> None:
     means = {"accuracy": 0.8, "class_accuracy": 0.7}
     headings = ClassificationTask.headings
     record = Record("shapes", 120, headings, means, classes, settings=settings)
-    cells = _cells(_runs_report(record))
+    aligned = replace(record, protocol=facts("paper_modelnet40"))
+    rotated = replace(record, protocol={**aligned.protocol, "test_rotation": "so3"})
+    assert Comparison.of([rotated]).rows == []
+    cells = _cells(_runs_report(aligned))
     assert cells["shapes"]["rotated in training / test"] == "z / SO3"
     assert cells["shapes"]["accuracy %"] == "80.0"
     assert cells["shapes"]["mean over classes %"] == "70.0"

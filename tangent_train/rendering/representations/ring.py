@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import RingGrid, TangentGrid
+from tangent_train.geometry import RingGrid, SphereArea, TangentGrid
 from tangent_train.geometry.ring import checked_rings, half_extents
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend
@@ -35,6 +35,8 @@ class RingRepresentation(PinholeRepresentation):
         erp_height: Rows of the panorama, default `equirect_shape(level)`.
         rotations: Number of rotations about the vertical to average over. They divide the step
             between neighbors of the ring with most views: 2 rotations are half a step apart.
+        area: West, east, south and north in degrees of the area that the views must cover; the
+            sphere by default.
 
     Raises:
         SettingError: A setting is invalid, or the views miss a direction.
@@ -54,12 +56,14 @@ class RingRepresentation(PinholeRepresentation):
         blend: Blend = "feather",
         erp_height: int | None = None,
         rotations: int = 1,
+        area: Sequence[float] | None = None,
     ) -> None:
         across, *rest = [fov] if isinstance(fov, int | float) else fov
         fov_deg = (across, rest[0] if rest else across)
         self.symmetry_deg = 360 / max(ring.views for ring in checked_rings(rings))
         size = ring_size(level, fov_deg, dim)
-        grid = RingGrid(rings, fov_deg, size, by_owners=blend == "nearest")
+        covered = None if area is None else SphereArea.of(area, "representation.area")
+        grid = RingGrid(rings, fov_deg, size, None, covered, by_owners=blend == "nearest")
         super().__init__(
             grid,
             [grid],

@@ -54,7 +54,7 @@ def test_image_depth_labels_and_up_rotate_together(
     rotation: float | Literal["so3"], up: NDArray[np.float64] | None
 ) -> None:
     rotated = RotatedPanoramas(rotation, seed=5, known=True)
-    rgb, depth, labels, found = rotated(_heights()._replace(up=up), 0)
+    rgb, depth, labels, found, _ = rotated(_heights()._replace(up=up), 0)
     R = rotated.rotation(0)
     # The output direction d shows the input at Rᵀd, whose height is the third row of Rᵀ times d.
     expected = 100 + 100 * equirect_directions((32, 64)) @ R[:, 2]

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from datamodules.images.gpano import PanoramaArea, area_of_crop, read_area, read_up, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_angles, read_area, read_up, whole_area
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_to_lonlat
 from tangent_train.rendering.upright.gravity import up_from_pose
@@ -289,7 +289,7 @@ def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, widt
 
 @pytest.mark.parametrize("size", [(10, 18), (10, 22), (1, 1)])
 def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
-    message = rf"a\.jpg: found {size[1]} × {size[0]} .*crop=.*GPano.*projection=perspective"
+    message = rf"a\.jpg: found {size[1]} × {size[0]} .*area=.*GPano.*projection=perspective"
     with pytest.raises(DataError, match=message):
         whole_area(tmp_path / "a.jpg", size)
 
@@ -298,7 +298,7 @@ def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_edges_are_at_the_angles_of_the_crop(seed: int) -> None:
+def test_edges_are_at_the_angles(seed: int) -> None:
     rng = np.random.default_rng(seed)
     across, down = rng.uniform(20, 350), rng.uniform(10, 170)
     west = rng.uniform(-180, 180)
@@ -306,7 +306,7 @@ def test_edges_are_at_the_angles_of_the_crop(seed: int) -> None:
     south = rng.uniform(-90, 90 - down)
     width = int(rng.integers(300, 900))
     size = (round(width * down / across), width)
-    area = area_of_crop(size, (west, east, south, south + down))
+    area = area_of_angles(size, (west, east, south, south + down))
     pixel_deg = 180 / area.full_shape[0]
     left, top = _angles_deg(area, (area.columns[0], area.rows[0]))
     assert abs((left - west + 180) % 360 - 180) <= pixel_deg
@@ -321,7 +321,7 @@ def test_edges_are_at_the_angles_of_the_crop(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("crop", "message"),
+    ("angles", "message"),
     [
         ((-180, 180, -90), r"found \[-180, 180, -90\]; expected \[west,east,south,north\]"),
         ((0, 181, -90, 90), "expected .*−180 to 180"),
@@ -330,9 +330,9 @@ def test_edges_are_at_the_angles_of_the_crop(seed: int) -> None:
         ((0, 40, 0, 10), r"pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square"),
     ],
 )
-def test_impossible_crops_are_refused(crop: tuple[float, ...], message: str) -> None:
-    with pytest.raises(SettingError, match=f"crop: found .*{message}|{message}"):
-        area_of_crop((100, 100), crop)
+def test_impossible_areas_are_refused(angles: tuple[float, ...], message: str) -> None:
+    with pytest.raises(SettingError, match=f"area: found .*{message}|{message}"):
+        area_of_angles((100, 100), angles)
 
 
 # Pose

@@ -11,7 +11,7 @@ from PIL import Image
 
 from datamodules import FolderPanoramas
 from datamodules.core.transforms import RotatedPanoramas
-from datamodules.images.gpano import PanoramaArea, area_of_crop, whole_area
+from datamodules.images.gpano import PanoramaArea, area_of_angles, whole_area
 from datamodules.images.masks import Masks
 from datamodules.images.pixel_files import write_pixels
 from tangent_train.errors import DataError, SettingError
@@ -54,20 +54,20 @@ def test_every_panorama_has_its_own(tmp_path: Path) -> None:
         write_pixels(tmp_path / f"{name}.png", spotted(32, seed))
     masks = Masks(tmp_path)
     for seed, name in enumerate(("a", "kitchen/a")):
-        masks.check(name)
+        masks.check(name, WHOLE)
         found = masks.read(name, WHOLE)
         np.testing.assert_array_equal(found, np.where(spotted(32, seed), 255, 0))
     write_pixels(tmp_path / "square.png", np.ones((20, 20), np.uint8))
-    for use in (masks.check, lambda name: masks.read(name, WHOLE)):
+    for use in (masks.check, masks.read):
         with pytest.raises(DataError, match=r"square\.png: found 20 × 20 .*twice as wide as high"):
-            use("square")
+            use("square", WHOLE)
 
 
 def test_parts_of_panoramas_across_the_seam_with_masks_of_the_part_or_the_whole(
     tmp_path: Path,
 ) -> None:
     """Ninety degrees around ±180°, from 45° up to the nadir."""
-    area = area_of_crop((24, 16), (135, -135, -90, 45))
+    area = area_of_angles((24, 16), (135, -135, -90, 45))
     assert area == PanoramaArea((32, 64), (8, 32), (56, 72), (24, 16))
     shown = np.zeros((32, 64), bool)
     shown[8:, 56:], shown[8:, :8] = True, True

@@ -1,0 +1,1 @@
+"""Cityscapes (Cordts et al. 2016)."""

@@ -1,0 +1,71 @@
+"""Decoder of releases whose label images hold a number for every class."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.panoramas import ImageFiles, ImageReader, resize_nearest
+from datamodules.images.pixel_files import read_image_size, read_pixels, read_rgb
+from datamodules.images.png import check_png
+from tangent_train.errors import DataError
+
+_STRANGE = 255
+"""Label of numbers that a data set does not have."""
+
+
+def number_table(classes: Sequence[int], unknown: Iterable[int]) -> NDArray[np.uint8]:
+    """Return the label of every number in a label image, ``(256,)``.
+
+    Args:
+        classes: Number of each class, in the order of the labels.
+        unknown: Numbers of pixels without a class. Others are errors.
+
+    >>> number_table([7, 9], [0, 255])[[0, 7, 8, 9, 255]].tolist()
+    [0, 1, 255, 2, 0]
+    """
+    table = np.full(256, _STRANGE, np.uint8)
+    table[list(unknown)] = 0
+    table[list(classes)] = np.arange(1, len(classes) + 1)
+    return table
+
+
+@dataclass(frozen=True, eq=False)
+class NumberedReader(ImageReader):
+    """Decoder of color images and of 8-bit label images, gray or with a palette.
+
+    Attributes:
+        table: Label of every number in a label image, see `number_table`.
+    """
+
+    table: NDArray[np.uint8]
+
+    def size(self, part: str, path: Path) -> tuple[int, int]:
+        """See `ImageReader`."""
+        if part == "rgb":
+            return read_image_size(path)
+        header = check_png(path, 8, ("gray", "palette"))
+        return header.height, header.width
+
+    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Return the colors without alpha."""
+        return read_rgb(files.rgb)
+
+    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+        """See `ImageReader`; a palette is ignored."""
+        numbers = read_pixels(files.labels, indices=True)
+        labels = self.table[numbers]
+        strange = np.unique(numbers[labels == _STRANGE])
+        if strange.size:
+            known = np.flatnonzero(self.table != _STRANGE)
+            raise DataError(
+                files.labels,
+                found=f"numbers {', '.join(map(str, strange[:5]))}",
+                expected=f"{', '.join(map(str, known))}",
+                remedy="Use the label images as released; do not convert them.",
+            )
+        return labels if shape is None else resize_nearest(labels, shape)

@@ -1,0 +1,1 @@
+"""SynPASS (Zhang et al. 2022)."""

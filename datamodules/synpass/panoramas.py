@@ -1,0 +1,181 @@
+"""SynPASS (Zhang et al. 2022): 9,080 panoramas of virtual streets in four weathers, 22 classes.
+
+Features: 1024×2048 RGB of eight maps of the simulator CARLA, by day and by night.
+
+On disk, as released::
+
+    root/
+      img/<weather>/<split>/MAP_1_point2/000000.jpg                 8 bit, 10 per point
+      semantic/<weather>/<split>/MAP_1_point2/000000_trainID.png    8 bit, 0 to 22, 255 = unknown
+      all_map_day_val.txt  all_map_night_val.txt                    names of points, if wanted
+
+Weathers are cloud, fog, rain and sun; splits are train, val and test.
+
+License: free for academic research, https://github.com/jamycheung/Trans4PASS.
+
+Citation: J. Zhang, K. Yang, H. Shi, S. Reiß, K. Peng, C. Ma, H. Fu, P. H. S. Torr, K. Wang,
+R. Stiefelhagen: "Behind Every Domain There is a Shift: Adapting Distortion-aware Vision
+Transformers for Panoramic Semantic Segmentation", arXiv:2207.11860, 2022.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from datamodules.cityscapes.classes import THIRTEEN
+from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.index import SPLITS, Split, draw_groups
+from datamodules.core.inputs import Input
+from datamodules.core.labels import ClassSet, class_sets
+from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.panoramas import ImageFiles
+from datamodules.core.problems import Problems
+from tangent_train.errors import DataError
+from tangent_train.registry import registered
+
+CLASSES: tuple[str, ...] = (
+    "building",
+    "fence",
+    "other",
+    "pedestrian",
+    "pole",
+    "road line",
+    "road",
+    "sidewalk",
+    "vegetation",
+    "vehicles",
+    "wall",
+    "traffic sign",
+    "sky",
+    "ground",
+    "bridge",
+    "rail track",
+    "ground rail",
+    "traffic light",
+    "static",
+    "dynamic",
+    "water",
+    "terrain",
+)
+"""The 22 classes as labels 1 to 22, which are also the numbers in the files."""
+
+WEATHERS: tuple[str, ...] = ("cloud", "fog", "rain", "sun")
+"""Folders of the release."""
+
+_MERGED = {"pedestrian": "person", "vehicles": "car", "road line": "road"}
+_GET_IT = (
+    "Get SynPASS as https://github.com/jamycheung/Trans4PASS describes and point data.root at the "
+    "folder with img and semantic."
+)
+_PUBLISHED = (
+    {"train": 5700, "val": 1690, "test": 1690},
+    {"train": 5700, "val": 2180, "test": 1200},
+)
+"""Images in the description of the release, and in the lists of its code."""
+
+_POINT = re.compile(r"MAP_\d+_point\d+")
+_TABLE = number_table(range(1, 1 + len(CLASSES)), [0, 255])
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class SynPASS(PanoramaDataModule):
+    """SynPASS, 22 or 13 classes, with the splits of its folders.
+
+    Args:
+        weather: One or several of `WEATHERS`, or `all`.
+        time: `all`; `day` or `night` keeps the test panoramas that a list of the release names.
+        test_split: Folder of the test panoramas. With `val`, validation uses points drawn from
+            the training folder, so that nothing is selected on the test panoramas.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_sets = class_sets(CLASSES, {"13": ClassSet(THIRTEEN, CLASSES, _MERGED)})
+
+    inputs: Sequence[Input] = ("rgb",)
+    weather: str | Sequence[str] = "all"
+    time: Literal["all", "day", "night"] = "all"
+    test_split: Literal["val", "test"] = "test"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require("inputs", "depth" not in self.inputs, "no depth: SynPASS has no depth images")
+        given = [self.weather] if isinstance(self.weather, str) else list(self.weather)
+        self._times: dict[str, set[str]] = {}
+        self._weathers = WEATHERS if given == ["all"] else tuple(given)
+        fine = bool(self._weathers) and set(self._weathers) <= set(WEATHERS)
+        self.require("weather", fine, f"all, or some of {', '.join(WEATHERS)}")
+        self.require("time", self.time in ("all", "day", "night"), "all, day or night")
+        self.require("test_split", self.test_split in ("val", "test"), "val or test")
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[NumberedReader, dict[Split, list[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        splits = {split: self._list_images(split, problems) for split in SPLITS}
+        if not any(splits.values()):
+            expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
+            raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
+        if self._weathers == WEATHERS:
+            counts = {str(split): len(images) for split, images in splits.items()}
+            problems.compare_counts(counts, _PUBLISHED)
+        if self.test_split == "val":
+            splits["test"] = splits["val"]
+            held: set[str] = set()
+            point_of = {files.name: files.rgb.parent.name for files in splits["train"]}
+            if self.validation_fraction:
+                held = draw_groups(point_of.values(), self.validation_fraction, self.seed)
+            splits["val"] = [f for f in splits["train"] if point_of[f.name] in held]
+            splits["train"] = [f for f in splits["train"] if point_of[f.name] not in held]
+        elif not self.validation_fraction:
+            splits["val"] = []
+        self._times = {time: self._read_list(time) for time in ("day", "night")}
+        known = {files.rgb.parent.name for images in splits.values() for files in images}
+        for time, points in self._times.items():
+            problems.note_absent(f"all_map_{time}_val.txt", points - known)
+        if self.time != "all":
+            named = self._times[self.time]
+            splits["test"] = [f for f in splits["test"] if f.rgb.parent.name in named]
+            if not splits["test"]:
+                raise DataError(
+                    self.root / f"all_map_{self.time}_val.txt",
+                    found=f"no point of {self.test_split}",
+                    expected="names of test points, e.g. MAP_6_point10",
+                    remedy="The lists of the release name points of val: data.test_split=val.",
+                )
+        return NumberedReader(_TABLE), splits
+
+    def groups(self, files: ImageFiles) -> list[str]:
+        """See `ImageDataModule`: weather, and day or night where a list names the point."""
+        point, weather = files.rgb.parent.name, files.name.partition("/")[0]
+        return [weather, *(time for time in self._times if point in self._times[time])]
+
+    def _list_images(self, split: Split, problems: Problems) -> list[ImageFiles]:
+        """Return the images of a folder, each with the label image of its name."""
+        found: list[ImageFiles] = []
+        labels: list[Path] = []
+        for weather in self._weathers:
+            place = Path(weather, split)
+            labels += (self.root / "semantic" / place).glob("*/*_trainID.png")
+            for rgb in sorted((self.root / "img" / place).glob("*/*.jpg")):
+                name = (place / rgb.parent.name / rgb.stem).as_posix()
+                found.append(ImageFiles(name, rgb, self.root / "semantic" / f"{name}_trainID.png"))
+        problems.note_strays(labels, found)
+        return found
+
+    def _read_list(self, time: str) -> set[str]:
+        """Return the points in a list; none if the list is missing and no setting needs it."""
+        path = self.root / f"all_map_{time}_val.txt"
+        if self.time == "all" and not path.exists():
+            return set()
+        try:
+            return set(_POINT.findall(path.read_text("utf-8")))
+        except (OSError, UnicodeDecodeError) as error:
+            expected = "names of points, e.g. MAP_6_point10"
+            raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error

@@ -1,0 +1,192 @@
+"""Data sets of partial panoramas: files of a part of the sphere, placed on all of it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from datamodules import FolderPanoramas
+from datamodules.images.gpano import Fill, PanoramaArea
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import SphereArea, equirect_directions
+from tangent_train.rendering import EquirectRepresentation
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, read_png, write_png
+from tests.datamodules.folder.folder_format import blocks, save, write_classes
+
+AREA = (-180, 180, -35.15, 35.15)
+
+
+def write_strips(root: Path, size: tuple[int, int], count: int = 4, *, depth: bool = False) -> Path:
+    """Partial panoramas of rows and columns, whose red channel holds the label values."""
+    write_classes(root)
+    for number in range(count):
+        values = blocks(number, max(size))[: size[0], : size[1]]
+        green = np.random.default_rng(number).integers(1, 256, size, np.uint8)
+        save(root / "images" / f"{number}.png", np.stack([values, green, green], axis=-1))
+        save(root / "labels" / f"{number}.png", values)
+        if depth:
+            write_png(root / "depth" / f"{number}.png", values.astype(np.uint16) + 300)
+    return root
+
+
+@pytest.mark.parametrize("level", [7, 6])
+def test_native_pixels_are_placed_unchanged(tmp_path: Path, level: int) -> None:
+    """At the level of the files; below it they are averaged, as whole panoramas are."""
+    root = write_strips(tmp_path, (100, 512), depth=True)
+    erp = EquirectRepresentation(level)
+    data = FolderPanoramas(root, erp, inputs=["rgb", "depth"], area=AREA, fill="edge")
+    source = data.source("test")
+    panorama, name = source.read(0), source.name(0)
+    rows = 2 ** (level + 1)
+    top, height = round(78 * rows / 256), 100 * rows // 256
+    assert panorama.labels.shape == (rows, 2 * rows)
+    stored = {part: read_png(root / part / f"{name}.png") for part in ("images", "labels", "depth")}
+    step = 256 // rows
+    inside = slice(top, top + height)
+    if step == 1:
+        np.testing.assert_array_equal(panorama.rgb[inside], stored["images"][..., ::-1])
+        assert panorama.depth is not None
+        np.testing.assert_allclose(panorama.depth[inside], stored["depth"] * 0.512, atol=0.51)
+    mean = stored["images"].reshape(height, step, 2 * rows, step, 3).mean(axis=(1, 3))
+    assert np.abs(panorama.rgb[inside] - mean[..., ::-1]).max() <= 0.51
+    assert (panorama.labels[inside] > 0).any()
+    for outside in (slice(0, top), slice(top + height, None)):
+        assert not panorama.labels[outside].any()
+        assert panorama.depth is not None
+        assert not panorama.depth[outside].any()
+        assert panorama.rgb[outside].any()
+
+
+def _canvas(angles: tuple[float, ...], fill: Fill) -> Any:
+    canvas = PanoramaArea.on_canvas(SphereArea.of(angles), 16)
+    image = np.random.default_rng(0).integers(1, 256, (*canvas.image_shape, 3), np.uint8)
+    return image, canvas, canvas.filled(canvas.place(image), fill)
+
+
+@pytest.mark.parametrize(
+    "angles", [(-180, 180, -45, 60), (135, -135, -45, 45), (-45, 90, -90, 22.5), (0, 90, 0, 45)]
+)
+@pytest.mark.parametrize("fill", ["black", "mean", "edge", "reflect"])
+def test_fill_is_that_of_a_slow_loop(angles: tuple[float, ...], fill: Fill) -> None:
+    image, canvas, filled = _canvas(angles, fill)
+    height, width = image.shape[:2]
+    np.testing.assert_array_equal(canvas.cut(filled), image)
+    mirrored = np.concatenate([image, image[::-1]] * 8)
+    mirrored = np.concatenate([mirrored, mirrored[:, ::-1]] * 32, axis=1)
+    for row, column in np.ndindex(16, 32):
+        down = row - canvas.rows[0]
+        right = (column - canvas.columns[0]) % 32
+        left = right - 32
+        across = right if right < width or right - width + 1 <= -left else left
+        expected = {
+            "black": (0, 0, 0),
+            "mean": image.reshape(-1, 3).mean(axis=0).round(),
+            "edge": image[min(max(down, 0), height - 1), min(max(across, 0), width - 1)],
+            "reflect": mirrored[down, across],
+        }[fill]
+        if 0 <= down < height and right < width:
+            expected = image[down, right]
+        np.testing.assert_array_equal(filled[row, column], expected)
+
+
+@pytest.mark.parametrize("angles", [(135, -135, -45, 60), (-180, 180, 10, 80)])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_area_rotates_with_the_panorama(
+    angles: tuple[float, ...], seed: int, tmp_path: Path
+) -> None:
+    area = SphereArea.of(angles)
+    size = PanoramaArea.on_canvas(area, 64).image_shape
+    root = write_strips(tmp_path, size)
+    for path in (root / "labels").iterdir():
+        save(path, np.ones(size, np.uint8))
+    erp = EquirectRepresentation(5)
+    data = FolderPanoramas(root, erp, area=angles, test_rotation="so3", seed=seed)
+    panorama = data.source("test").read(0)
+    assert panorama.area is not None
+    inside = panorama.area.contains(equirect_directions((64, 128)))
+    assert (inside == (panorama.labels > 0)).mean() > 0.99
+
+
+def test_a_store_holds_the_pixels_of_the_area_and_memory_the_same_panoramas(tmp_path: Path) -> None:
+    root = write_strips(tmp_path / "data", (100, 512))
+    settings: Any = {"area": AREA, "fill": "reflect", "test_rotation": 20}
+    erp = EquirectRepresentation(7)
+    plain, stored, kept = (
+        FolderPanoramas(root, erp, **settings, **how)
+        for how in ({}, {"store": tmp_path / "store"}, {"in_memory": True})
+    )
+    stored.prepare_data()
+    file = next((tmp_path / "store").rglob("*.npy"))
+    assert np.load(file)["rgb"].shape == (100, 512, 3)
+    assert file.stat().st_size < 1.05 * 100 * 512 * 4
+    for split in ("train", "test"):
+        expected = plain.source(split).read(0)
+        for data in (stored, kept):
+            found = data.source(split).read(0)
+            np.testing.assert_array_equal(found.rgb, expected.rgb)
+            np.testing.assert_array_equal(found.labels, expected.labels)
+            assert found.area is not None
+            assert expected.area is not None
+            np.testing.assert_array_equal(found.area.rotation, expected.area.rotation)
+
+
+@pytest.mark.parametrize("size", [(50, 256), (100, 512), (128, 256)])
+def test_a_mask_is_of_the_part_or_of_the_whole_sphere(
+    size: tuple[int, int], tmp_path: Path
+) -> None:
+    mask = np.random.default_rng(0).integers(0, 2, (size[0] // 2, size[1] // 2), np.uint8)
+    mask = mask.repeat(2, axis=0).repeat(2, axis=1)
+    save(tmp_path / "mask.png", 255 * mask)
+    root = write_strips(tmp_path, (100, 512))
+    erp = EquirectRepresentation(6)
+    plain, masked = (
+        FolderPanoramas(root, erp, area=AREA, mask=m) for m in (None, tmp_path / "mask.png")
+    )
+    before, after = (data.source("train").read(0).labels for data in (plain, masked))
+    counts = mask[:: size[1] // 256, :: size[1] // 256]
+    if size[0] == 128:
+        counts = counts[39:89]
+    np.testing.assert_array_equal(after[39:89], before[39:89] * counts)
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "message"),
+    [
+        ({}, DataError, r"\.png: found 256 × 50 .*twice as wide as high\. If all .* data\.area="),
+        ({"area": (-180, 180, -45, 45)}, DataError, r"found 256 × 50 .*expected 256 × 64 .*square"),
+        ({"area": AREA, "level": 7}, SettingError, r"erp_height: found 256; expected at most 128"),
+        ({"area": (-180, 180, 35, -35)}, SettingError, r"data\.area: found .*south below north"),
+        ({"area": AREA, "fill": "white"}, SettingError, r"data\.fill: found white; .*reflect"),
+    ],
+)
+def test_files_and_settings_that_do_not_fit_are_refused(
+    settings: dict[str, Any], error: type[Exception], message: str, tmp_path: Path
+) -> None:
+    root = write_strips(tmp_path, (50, 256))
+    erp = EquirectRepresentation(settings.pop("level", 6))
+    with pytest.raises(error, match=message):
+        FolderPanoramas(root, erp, **settings).source("train")
+
+
+def test_tags_of_another_area_are_refused(tmp_path: Path) -> None:
+    """They name −80 to −20 and 20 to 60 degrees."""
+    root = write_strips(tmp_path, (40, 60))
+    for path in (root / "images").glob("*.png"):
+        with Image.open(path) as image:
+            image.convert("RGB").save(path.with_suffix(".webp"), xmp=gpano_xmp(GPANO_TAGS))
+        path.unlink()
+    erp = EquirectRepresentation(5)
+    data = FolderPanoramas(root, erp, area=(-80, -20, 20, 60))
+    assert len(data.source("test")) == 1
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
+        ({"area": (-180, -120, 20, 60)}, re.escape("data.area=(-180, -120, 20, 60)")),
+        ({}, "twice as wide as high"),
+    )
+    for settings, expected in cases:
+        with pytest.raises(DataError, match=expected):
+            FolderPanoramas(root, erp, **settings).source("train")

@@ -1,0 +1,53 @@
+"""Sets of classes, against the keys of published readers (classes from 0, −1 ignored)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.core.image_module import ImageDataModule
+from tangent_train.errors import SettingError
+from tests.conftest import fabricate
+
+PUBLISHED: list[tuple[type[ImageDataModule], str, list[int]]] = [
+    (Stanford2D3DS, "8", [-1, -1, -1, 0, 1, -1, -1, 2, 3, 4, 5, 6, 7]),
+]
+
+
+@pytest.mark.parametrize(("data", "name", "key"), PUBLISHED)
+def test_a_set_is_the_published_one(data: type[ImageDataModule], name: str, key: list[int]) -> None:
+    sets = data.class_sets
+    every = next(iter(sets.values()))
+    labels = np.arange(len(key) + 1, dtype=np.uint8)[None]
+    np.testing.assert_array_equal(every.relabel(labels), labels)
+    np.testing.assert_array_equal(sets[name].relabel(labels)[0], [0, *np.add(key, 1)])
+    assert len(sets[name].names) == max(key) + 1
+    assert (sets[name].relabel(labels + len(key) + 1) == 255).all(), "not of the data set"
+
+
+def test_panoramas_and_photos_are_read_in_a_set(tmp_path: Path, erp: Any) -> None:
+    root = fabricate(tmp_path / "data", photos=1)
+    store = tmp_path / "store"
+    for kind, representation in ((Stanford2D3DS, erp), (Stanford2D3DSPerspective, None)):
+        given: Any = {"representation": representation, "inputs": ["rgb"], "store": store}
+        every, eight = kind(root, **given, level=None), kind(root, **given, classes=8)
+        for data in (every, eight):
+            data.prepare_data()
+        assert (every.num_classes, eight.num_classes) == (13, 8)
+        before, after = (data.source("test").read(1).labels for data in (every, eight))
+        for label, class_name in enumerate(every.class_names):
+            known = class_name in eight.class_names
+            expected = eight.class_names.index(class_name) if known else 0
+            assert (after[before == label] == expected).all()
+        assert len(np.unique(after)) > 4
+    assert len(list(store.iterdir())) == 4, "a store for each set"
+
+
+def test_other_sets_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=re.escape("data.classes: found 9; expected 13 or 8")):
+        Stanford2D3DS(tmp_path, classes=9)

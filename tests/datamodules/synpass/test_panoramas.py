@@ -1,0 +1,116 @@
+"""SynPASS: decoding, pairs, splits, weather, day and night."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datamodules import SynPASS
+from datamodules.core.index import SPLITS
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import EquirectRepresentation
+from tests.datamodules.cityscapes import street_format as streets
+from tests.datamodules.data_files import names_of, write_png
+
+KEY = [-1, 2, 4, -1, 11, 5, 0, 0, 1, 8, 12, 3, 7, 10, -1, -1, -1, -1, 6, -1, -1, -1, 9]
+"""Published 13 classes by number, from 0; -1 is ignored."""
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two panoramas of each point; not to be changed."""
+    return streets.write_synpass(tmp_path_factory.mktemp("synpass"))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    return streets.write_synpass(tmp_path)
+
+
+def panoramas(root: Path, **settings: Any) -> SynPASS:
+    return SynPASS(root, EquirectRepresentation(4), **settings)
+
+
+@pytest.mark.parametrize("index", [0, 1], ids=["gray", "palette"])
+def test_every_number_has_its_class(shared: Path, index: int) -> None:
+    stored = streets.numbers(streets.SYNPASS_NUMBERS, (32, 64), index)
+    every, thirteen = (panoramas(shared, classes=k).source("test").read(index) for k in (22, 13))
+    np.testing.assert_array_equal(every.labels, np.where(stored == 255, 0, stored))
+    key = np.array([*KEY, *[-1] * 233]) + 1
+    np.testing.assert_array_equal(thirteen.labels, key[stored])
+    assert set(np.unique(stored)) == {*range(23), 255}
+    error = np.abs(every.rgb.astype(int) - streets.colors(stored)[..., ::-1])
+    assert error.mean() < 40, "JPEG of the same image"
+
+
+def test_splits_are_those_of_the_folders(shared: Path) -> None:
+    names = {split: names_of(panoramas(shared), split) for split in SPLITS}
+    assert names["test"] == ["sun/test/MAP_8_point1/000000", "sun/test/MAP_8_point1/000001"]
+    assert [len(names[split]) for split in SPLITS] == [6, 4, 2]
+    assert not names_of(panoramas(shared, validation_fraction=0), "val")
+
+
+def test_a_test_on_val_takes_whole_training_points_for_validation(shared: Path) -> None:
+    data = panoramas(shared, test_split="val", validation_fraction=0.4)
+    assert {name.split("/")[1] for name in names_of(data, "test")} == {"val"}
+    points = {s: {name.split("/")[2] for name in names_of(data, s)} for s in ("train", "val")}
+    assert not points["train"] & points["val"]
+    assert [len(names_of(data, split)) for split in SPLITS] == [4, 2, 4]
+
+
+def test_weather_and_time_are_settings_and_groups(shared: Path) -> None:
+    data = panoramas(shared, test_split="val")
+    files = data.index().splits["test"]
+    assert [data.groups(f) for f in files] == [["fog", "day"]] * 2 + [["sun", "night"]] * 2
+    sun = panoramas(shared, weather=["sun"], test_split="val", validation_fraction=0)
+    assert {name.split("/")[0] for s in SPLITS for name in names_of(sun, s)} == {"sun"}
+    night = names_of(panoramas(shared, time="night", test_split="val"), "test")
+    assert {name.split("/")[2] for name in night} == {"MAP_6_point11"}
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"weather": "snow"}, {"weather": []}, {"time": "dawn"}, {"test_split": "train"}]
+)
+def test_other_settings_are_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
+    with pytest.raises(SettingError, match=rf"data\.{next(iter(wrong))}"):
+        panoramas(tmp_path, **wrong)
+
+
+def test_a_check_names_what_lists_and_files_disagree_on(root: Path) -> None:
+    missing = root / "semantic/cloud/train/MAP_1_point1/000000_trainID.png"
+    missing.unlink()
+    stray = root / "semantic/fog/val/MAP_6_point10/000007_trainID.png"
+    write_png(stray, np.ones((32, 64), np.uint8))
+    problems, count = panoramas(root).check()
+    assert count == 11
+    assert [problem.file for problem in problems.listed()] == [str(missing)]
+    assert sorted(problems.warnings) == [
+        "all_map_night_val.txt: 1 without an image, e.g. MAP_7_point99",
+        "found 6 train, 4 val, 2 test; published are 5700 train, 1690 val, 1690 test or "
+        "5700 train, 2180 val, 1200 test",
+        f"label images: 1 without an image, e.g. {stray}",
+    ]
+
+
+def test_lists_that_cannot_be_used_are_refused(root: Path) -> None:
+    with pytest.raises(DataError, match=r"all_map_day_val\.txt: found no point of test"):
+        panoramas(root, time="day").setup()
+    (root / "all_map_day_val.txt").write_text("")
+    with pytest.raises(DataError, match="found no point of val"):
+        panoramas(root, time="day", test_split="val").setup()
+    (root / "all_map_day_val.txt").unlink()
+    with pytest.raises(DataError, match="No such file"):
+        panoramas(root, time="day", test_split="val").setup()
+    assert len(names_of(panoramas(root), "train")) == 6
+
+
+def test_other_numbers_and_an_empty_folder_are_refused(root: Path) -> None:
+    path = root / "semantic/cloud/train/MAP_1_point1/000000_trainID.png"
+    write_png(path, np.full((32, 64), 23, np.uint8))
+    (problem,) = panoramas(root).check()[0].listed()
+    assert "found numbers 23; expected 0, 1" in str(problem.error)
+    with pytest.raises(DataError, match=r"img: found no panoramas.*Trans4PASS"):
+        panoramas(root / "img").setup()

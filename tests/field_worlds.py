@@ -1,0 +1,27 @@
+"""Small data sets in the formats of the field's benchmarks, for tests of their experiments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from tests.conftest import fabricate
+
+
+class World(NamedTuple):
+    """A small data set.
+
+    Attributes:
+        write: Writes the files into a new folder and returns it.
+        small: Settings that let a run take a second, with which the files fit.
+    """
+
+    write: Callable[[Path], Path]
+    small: tuple[str, ...] = ("level=4", "representation.erp_height=32")
+
+
+WORLDS: Mapping[str, World] = {
+    "Stanford2D3DS": World(fabricate),
+}
+"""By the class of the data set, the last part of ``data._target_``."""
