@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build, build_data
+from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World
