@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
+from tests.datamodules.matterport360.matterport_format import write_matterport
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
 
 
 class World(NamedTuple):
@@ -22,6 +24,8 @@ class World(NamedTuple):
 
 
 WORLDS: Mapping[str, World] = {
+    "Matterport360": World(write_matterport),
     "Stanford2D3DS": World(fabricate),
+    "Structured3D": World(write_structured3d),
 }
 """By the class of the data set, the last part of ``data._target_``."""
