@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
+from tests.datamodules.cityscapes.street_format import write_synpass
 
 
 class World(NamedTuple):
@@ -23,5 +24,6 @@ class World(NamedTuple):
 
 WORLDS: Mapping[str, World] = {
     "Stanford2D3DS": World(fabricate),
+    "SynPASS": World(write_synpass),
 }
 """By the class of the data set, the last part of ``data._target_``."""
