@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -43,5 +44,7 @@ def test_results_of_processes_are_in_this_order(
         monkeypatch.setattr(
             "datamodules.core.loading.this_process", lambda rank=rank: (rank, processes)
         )
-        order += list(share_of_process(range(length)))  # type: ignore[arg-type]
+        samples: Any = range(length)
+        share: Any = share_of_process(samples)
+        order += list(share)
     assert gathered_order(length, processes) == order
