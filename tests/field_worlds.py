@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
+from tests.datamodules.cityscapes.street_format import (
+    write_cityscapes,
+    write_densepass,
+    write_synpass,
+)
 
 
 class World(NamedTuple):
@@ -29,5 +33,6 @@ WORLDS: Mapping[str, World] = {
         partial(write_densepass, names=(1,)), ("level=6", "photos.representation.dim=[16,32]")
     ),
     "Stanford2D3DS": World(fabricate),
+    "SynPASS": World(write_synpass),
 }
 """By the class of the data set, the last part of ``data._target_``."""
