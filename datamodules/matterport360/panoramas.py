@@ -112,6 +112,8 @@ class Matterport360(PanoramaDataModule):
         "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
     }
 
+    fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
+
     inputs: Sequence[Input] = ("rgb",)
     release: Literal["360fv", "sfss"] = "360fv"
     test_split: Literal["test", "val"] = "test"

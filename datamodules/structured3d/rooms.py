@@ -108,6 +108,10 @@ class Structured3DRooms(ImageDataModule):
     place: ClassVar[str]
     configurations: ClassVar[tuple[str, ...]] = ("full", "simple", "empty")
 
+    fact_settings: ClassVar[tuple[str, ...]] = (
+        *("configuration", "lighting", "invalid_scenes", "test_split"),
+    )
+
     inputs: Sequence[Input] = ("rgb",)
     configuration: Literal["full", "simple", "empty"] = "full"
     lighting: Literal["rawlight", "warmlight", "coldlight"] = "rawlight"
