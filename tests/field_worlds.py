@@ -8,7 +8,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
+from tests.datamodules.cityscapes.street_format import (
+    write_cityscapes,
+    write_densepass,
+    write_synpass,
+)
 from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.structured3d.structured3d_format import write_structured3d
 
@@ -33,5 +37,6 @@ WORLDS: Mapping[str, World] = {
     "Matterport360": World(write_matterport),
     "Stanford2D3DS": World(fabricate),
     "Structured3D": World(write_structured3d),
+    "SynPASS": World(write_synpass),
 }
 """By the class of the data set, the last part of ``data._target_``."""
