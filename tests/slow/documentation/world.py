@@ -25,6 +25,11 @@ from PIL import ExifTags, Image
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
+from tests.datamodules.cityscapes.street_format import (
+    write_cityscapes,
+    write_densepass,
+    write_synpass,
+)
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
@@ -46,6 +51,9 @@ def build_world(folder: Path) -> Path:
     """Write all files that the pages name; the folder can be copied anywhere."""
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
+    write_cityscapes(folder / "data" / "cityscapes", ROWS)
+    write_densepass(folder / "data" / "densepass", names=(1, 2))
+    write_synpass(folder / "data" / "synpass", ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
@@ -74,6 +82,7 @@ def build_world(folder: Path) -> Path:
     shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
+    shutil.copyfile(folder / "segformer.ckpt", folder / "cityscapes.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
