@@ -27,7 +27,9 @@ from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
+from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
 from tests.inference.photo_networks import huggingface_networks as networks
@@ -46,6 +48,8 @@ def build_world(folder: Path) -> Path:
     """Write all files that the pages name; the folder can be copied anywhere."""
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
+    write_structured3d(folder / "data" / "structured3d", height=ROWS, photos=True)
+    write_matterport(folder / "data" / "matterport360", height=ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
