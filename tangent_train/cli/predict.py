@@ -50,8 +50,8 @@ from tangent_train.results.predictions import (
 )
 
 _DECISIVE = (
-    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "levels",
-    "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
+    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
+    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
     "min_confidence", "min_share", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
@@ -346,10 +346,12 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
-    kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
-    views = kind(trained, settings.levels, settings.base_level, settings.blend, settings.rotations)
-    if isinstance(views, PanoramaViews):
+    how = settings.levels, settings.base_level, settings.blend, settings.rotations
+    if settings.projection == "equirectangular":
+        views: PanoramaViews | PhotoViews = PanoramaViews(trained, *how, settings.views)
         print_text(f"A panorama is labeled in {views}.")
+    else:
+        views = PhotoViews(trained, *how)
     device, count = settings.device, settings.images_per_forward
     # With `min_share`, a threshold of each class replaces it.
     least = 0.0 if settings.min_share else settings.min_confidence
@@ -370,7 +372,7 @@ def _check_confidence(settings: PredictSettings) -> None:
 def _check_projection(settings: PredictSettings) -> None:
     """Refuse settings of photos for panoramas, and of panoramas for photos."""
     is_photo = settings.projection == "perspective"
-    others = ("area", "upright", "mask") if is_photo else ("fov",)
+    others = ("area", "upright", "mask", "views") if is_photo else ("fov",)
     for name in others:
         if (found := getattr(settings, name)) is not None:
             expected = "null for photos" if is_photo else "null without projection=perspective"

@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder, literal_paths, path_text, quoted
+from tangent_train.cli.compose import literal_paths, path_text, quoted
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import config_folder
 from tests.running import composed
 
 EXPERIMENTS = sorted(
@@ -30,7 +31,8 @@ GROUPS = (
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes(experiment: str) -> None:
-    transfers = "transfer" in experiment or experiment.startswith("field/cityscapes_densepass")
+    pairs = "field/cityscapes_densepass", "field/stanford2d3ds_span8"
+    transfers = "transfer" in experiment or experiment.startswith(pairs)
     command = "transfer" if transfers else "train"
     config = composed(command, f"experiment={experiment}")
     OmegaConf.resolve(config)

@@ -32,7 +32,9 @@ from tests.datamodules.cityscapes.street_format import (
 )
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
+from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
 from tests.inference.photo_networks import huggingface_networks as networks
@@ -54,6 +56,8 @@ def build_world(folder: Path) -> Path:
     write_cityscapes(folder / "data" / "cityscapes", ROWS)
     write_densepass(folder / "data" / "densepass", names=(1, 2))
     write_synpass(folder / "data" / "synpass", ROWS)
+    write_structured3d(folder / "data" / "structured3d", height=ROWS, photos=True)
+    write_matterport(folder / "data" / "matterport360", height=ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
