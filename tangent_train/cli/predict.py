@@ -217,13 +217,13 @@ class _Labeler:
                 if not job.error:
                     image, area = self.read(job)
                     _, scores = self._scores(image, area)
-                    maps = self._trained.labels(scores.labels()), scores.confidences()
-                    labels, confidences = maps if area is None else map(area.cut, maps)
-                    counts = counts + count_confidences(labels, confidences, num_classes)
+                    maps = [self._trained.labels(scores.labels()), scores.confidences()]
+                    shown: Any = maps if area is None else map(area.cut, maps)
+                    counts = counts + count_confidences(*shown, num_classes)
         self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
         least = zip(self._trained.class_names[1:], self._thresholds[1:], strict=True)
-        shown = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
-        print_text(f"Smallest confidence of each class: {shown}.")
+        listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
+        print_text(f"Smallest confidence of each class: {listed}.")
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; return it with the area of a panorama, or with None for a photo."""
