@@ -217,9 +217,9 @@ class _Labeler:
                 if not job.error:
                     image, area = self.read(job)
                     _, scores = self._scores(image, area)
-                    maps = [self._trained.labels(scores.labels()), scores.confidences()]
-                    shown: Any = maps if area is None else map(area.cut, maps)
-                    counts = counts + count_confidences(*shown, num_classes)
+                    maps: list[Any] = [self._trained.labels(scores.labels()), scores.confidences()]
+                    labels, confidences = maps if area is None else [area.cut(m) for m in maps]
+                    counts = counts + count_confidences(labels, confidences, num_classes)
         self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
         least = zip(self._trained.class_names[1:], self._thresholds[1:], strict=True)
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
