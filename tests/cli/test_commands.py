@@ -267,8 +267,8 @@ def test_level_views_are_trained_evaluated_and_predicted(
 ) -> None:
     """With attention between views; rows unlike columns; evaluated with and without the whole."""
     network = ("network=unet_small_context", "network.network.network.widths=[4,8,8,8,8]")
-    views = (f"representation={option}", "representation.dim=[32,48]", "representation.mirror=true")
-    views += ("representation.faces_per_panorama=4", "representation.random_rotation=yaw")
+    views = [f"representation={option}", "representation.dim=[32,48]", "representation.mirror=true"]
+    views += ["representation.faces_per_panorama=4", "representation.random_rotation=yaw"]
     small = (
         *SMALL_ROOMS,
         "data=synthrooms",
