@@ -34,7 +34,7 @@ def test_facts_are_the_settings_as_they_are(stanford_root: Path, erp: Any, tmp_p
         ({"classes": 8, "unknown": "all_black"}, {"classes": "8", "unknown": "all_black"}),
         ({"areas": ["1", "5a"]}, {"areas": "1, 5a"}),
     ):
-        assert Stanford2D3DS(stanford_root, erp, **changes).facts == facts | changed  # type: ignore[arg-type]
+        assert Stanford2D3DS(stanford_root, erp, **changes).facts == facts | changed
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
