@@ -291,7 +291,7 @@ class LabeledData(ABC, Generic[_Item]):
         """
         problems = Problems()
         index = self._find_checked(problems)
-        for warning in problems.warnings:
+        for warning in problems.warnings if self._index is None else ():  # once
             print_on_rank_zero(f"Warning: {warning}")
         if not self.skip_broken:
             if sample and self.store is None:
