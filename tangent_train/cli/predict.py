@@ -48,7 +48,7 @@ from tangent_train.results.predictions import (
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "levels",
-    "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
+    "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
@@ -300,10 +300,13 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
-    kind = PanoramaViews if settings.projection == "equirectangular" else PhotoViews
-    views = kind(trained, settings.levels, settings.base_level, settings.blend, settings.rotations)
-    if isinstance(views, PanoramaViews):
-        print_text(f"A panorama is labeled in {views}.")
+    how = settings.levels, settings.base_level, settings.blend, settings.rotations
+    views: PanoramaViews | PhotoViews
+    if settings.projection == "equirectangular":
+        views = PanoramaViews(trained, *how, settings.fill)
+        print_text(f"A panorama is labeled in {views.described(settings.area)}.")
+    else:
+        views = PhotoViews(trained, *how)
     device, count = settings.device, settings.images_per_forward
     return Predictor(trained, views, device, count, settings.min_confidence)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.core.image_module import Upright
 from datamodules.core.panoramas import meters_to_steps
-from datamodules.images.gpano import PanoramaArea
+from datamodules.images.gpano import Fill, PanoramaArea
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -50,6 +50,7 @@ def load(
     base_level: int | None = None,
     blend: Blend = "feather",
     rotations: int = 1,
+    fill: Fill = "black",
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
@@ -70,6 +71,8 @@ def load(
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over; 1 for photos.
+        fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
+            color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``).
         images_per_forward: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
         min_confidence: Pixels with a lower confidence get the label 0.
@@ -80,13 +83,14 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
+    check_choice("fill", fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
     views = trained, levels, base_level, blend, rotations
     how = device, images_per_forward, min_confidence
-    panoramas = Predictor(trained, PanoramaViews(*views), *how)
+    panoramas = Predictor(trained, PanoramaViews(*views, fill), *how)
     return Network(
         trained,
         panoramas,

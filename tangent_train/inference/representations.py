@@ -24,6 +24,9 @@ from tangent_train.rendering.representations.pinhole import PinholeRepresentatio
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.images.gpano import Fill
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
@@ -51,12 +54,14 @@ class SourceViews(NamedTuple):
     Attributes:
         image: The panorama or photo.
         shape: Rows and columns to which it is resized first.
-        sets: Sets of views, each of which covers the whole image.
+        sets: Sets of views, each of which covers the whole image, or the area of a panorama.
+        rotation: ``(3, 3)`` rotation that aligns views of a panorama with gravity, or None.
     """
 
     image: InputImage
     shape: tuple[int, int]
     sets: Sequence[Views]
+    rotation: NDArray[np.float64] | None = None
 
 
 class PanoramaViews:
@@ -71,6 +76,7 @@ class PanoramaViews:
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
         rotations: Number of rotations about the vertical to average over.
+        fill: Colors outside the area of a partial panorama, in views that leave it.
 
     Attributes:
         representation: Representation of upright panoramas.
@@ -86,6 +92,7 @@ class PanoramaViews:
         base_level: int | None = None,
         blend: Blend = "feather",
         rotations: int = 1,
+        fill: Fill = "black",
     ) -> None:
         settings = panorama_settings(trained, levels, base_level)
         settings["rotations"] = rotations
@@ -94,6 +101,7 @@ class PanoramaViews:
         self.representation = _built(trained, settings)
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
+        self._fill = fill
 
     def __str__(self) -> str:
         """Number and size of the views; of tangent images also angle and resolution by level."""
@@ -115,13 +123,18 @@ class PanoramaViews:
         return f"{text} at base level {base_level} ({'; '.join(parts)})"
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Return the sets of views of one panorama."""
+        """Return the sets of views of one panorama, of its area if it is partial."""
         representation: Representation = self.representation
+        rotation, area = None, image.area
+        if area is not None:
+            representation = representation.limited_to(area.sphere)
+            image = replace(image, rgb=area.filled(image.rgb, self._fill))
         if image.up is not None:
-            representation = representation.with_rotation(upright_rotation(image.up))
+            rotation = upright_rotation(image.up)
+            representation = representation.with_rotation(rotation)
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
-        return [SourceViews(image, shape, representation.view_sets())]
+        return [SourceViews(image, shape, representation.view_sets(), rotation)]
 
 
 class PhotoViews:

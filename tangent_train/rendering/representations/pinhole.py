@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import ClassVar, Self, TypeVar
 
 import numpy as np
@@ -14,13 +15,15 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
+    SphereArea,
     TangentGrid,
     equirect_shape,
     random_rotation,
     rotation_about,
 )
+from tangent_train.geometry.area_views import best_views, views_of_area
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import Blend, check_choice
+from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
 _Grid = TypeVar("_Grid", bound=PinholeGrid)
@@ -73,6 +76,7 @@ class PinholeRepresentation:
         self.faces_per_panorama = faces_per_panorama
         self._grids = grids
         self._rotations = vertical_rotations(rotations, self.symmetry_deg)
+        self._area: SphereArea | None = None
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -87,6 +91,17 @@ class PinholeRepresentation:
         rotated._grids = [grid.with_rotation(rotation_or_none) for grid in self._grids]
         return rotated
 
+    def limited_to(self, area: SphereArea | None) -> Self:
+        """Return the same representation with only the images that an area needs.
+
+        Evaluation renders those of `views_of_area`. A training sample contains as many images as
+        the unrotated area needs, so that samples of one batch have equal numbers: those of
+        `views_of_area`, or under rotation those that see most.
+        """
+        limited = copy.copy(self)
+        limited._area = None if area is None or area.is_whole else area
+        return limited
+
     def sample(self, rng: np.random.Generator) -> PinholeViews:
         """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
         grid = self.grid
@@ -95,14 +110,30 @@ class PinholeRepresentation:
             angle = rng.uniform(0, 2 * math.pi)
             rotation = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
             grid = _rotated(grid, rotation)
-        faces = None
+        faces = None if self._area is None else self._trained_faces(grid, self._area)
         if self.faces_per_panorama is not None:
-            faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
+            available = grid.num_images if faces is None else faces
+            most = grid.num_images if faces is None else len(faces)
+            faces = rng.choice(available, min(self.faces_per_panorama, most), replace=False)
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
+
+    def _trained_faces(self, grid: PinholeGrid, area: SphereArea) -> NDArray[np.int64]:
+        """Return the images of a training sample, see `limited_to`."""
+        resting = replace(area, rotation=None)
+        faces = self._needed(grid.with_rotation(None), resting)
+        is_resting = grid.rotation is None and area.rotation is None
+        return faces if is_resting else best_views(grid, area, len(faces))
+
+    def _needed(self, grid: PinholeGrid, area: SphereArea) -> NDArray[np.int64]:
+        blend = blend_of(self.blend, is_overlapping=grid.is_overlapping)
+        return views_of_area(grid, area, by_owners=blend == "nearest")
 
     def view_sets(self) -> list[PinholeViews]:
         """Return all images of every level in every rotation."""
-        return [PinholeViews(_rotated(grid, r)) for grid in self._grids for r in self._rotations]
+        grids = [_rotated(grid, r) for grid in self._grids for r in self._rotations]
+        if self._area is not None:
+            grids = [grid.subset(self._needed(grid, self._area)) for grid in grids]
+        return [PinholeViews(grid) for grid in grids]
 
 
 @registered

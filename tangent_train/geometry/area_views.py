@@ -1,0 +1,127 @@
+"""The images of a grid that see an area of the sphere."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.geometry.area import SphereArea
+from tangent_train.geometry.pinhole_grid import PinholeGrid
+
+_LEAST_SHARE = 0.5
+"""Images with a smaller share of their pixels inside the area are left out, where possible."""
+
+_STEP_DEG = 1.0
+_COARSE_DEG = 3.0
+_LINES = 16
+"""Number of lattice lines across the shorter side of an area, at least."""
+
+_AT_ONCE = 2**23
+_ROUNDING = 1e-6
+
+
+def views_of_area(grid: PinholeGrid, area: SphereArea, *, by_owners: bool) -> NDArray[np.int64]:
+    """Return the images of a grid that are needed for an area.
+
+    Images with less than half of their pixels inside the area are left out, those that see least of
+    it first, as long as the others cover what they cover.
+
+    Args:
+        grid: Images that cover the area.
+        area: The area, in the same frame.
+        by_owners: True if every direction of the area must lie in the image with the nearest
+            center; False if it may lie in any image.
+
+    Returns:
+        ``(n,)`` indices of images.
+    """
+    if grid.rotation is None and area.rotation is None:
+        return np.array(_kept(grid, area.angles, by_owners))
+    return _needed(grid, area, by_owners)
+
+
+def best_views(grid: PinholeGrid, area: SphereArea, count: int) -> NDArray[np.int64]:
+    """Return the indices of the images that see most of an area.
+
+    Args:
+        grid: The images.
+        area: The area, in the same frame.
+        count: Number of images.
+    """
+    directions, steradians = area.lattice(_step(area, _COARSE_DEG))
+    shares = _shares(grid, directions, steradians, _insets(grid, directions))
+    return np.sort(np.argsort(-shares, kind="stable")[:count])
+
+
+@lru_cache(maxsize=64)
+def _kept(grid: PinholeGrid, angles: tuple[float, ...], by_owners: bool) -> tuple[int, ...]:
+    return tuple(_needed(grid, SphereArea.of(angles), by_owners).tolist())
+
+
+def _needed(grid: PinholeGrid, area: SphereArea, by_owners: bool) -> NDArray[np.int64]:
+    """See `views_of_area`."""
+    step = _step(area, _STEP_DEG)
+    directions, steradians = area.lattice(step)
+    insets = _insets(grid, directions)
+    shares = _shares(grid, directions, steradians, insets)
+    # Directions between those of the lattice are covered too: images are convex, and the margin is
+    # more than half of the diagonal of its cells.
+    inner = insets >= (-_ROUNDING if by_owners else math.sin(math.radians(0.75 * step)))
+    nearness = (grid.centers_xyz @ directions.T).astype(np.float32)
+    owner = nearness.argmax(axis=0)
+    kept = np.ones(grid.num_images, np.bool_)
+    for image in np.argsort(shares, kind="stable"):
+        if shares[image] >= _LEAST_SHARE:
+            break
+        kept[image] = False
+        affected = np.flatnonzero(owner == image if by_owners else insets[image] >= 0)
+        of_others = np.where(kept[:, None], nearness[:, affected], -2.0).argmax(axis=0)
+        covered = inner[np.ix_(kept, affected)].any(axis=0)
+        if by_owners:
+            covered = kept[of_others] & inner[of_others, affected]
+        kept[image] = not covered.all()
+        if not kept[image] and by_owners:
+            owner[affected] = of_others
+    return np.flatnonzero(kept)
+
+
+def _step(area: SphereArea, most_deg: float) -> float:
+    return min(most_deg, area.width_deg / _LINES, (area.north - area.south) / _LINES)
+
+
+def _insets(grid: PinholeGrid, directions: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return ``(N, n)`` sines of the angles of directions from the nearest edges of the images.
+
+    They are negative outside an image.
+    """
+    across, down = grid.half_size
+    insets = np.empty((grid.num_images, len(directions)), np.float32)
+    step = max(1, _AT_ONCE // len(directions))
+    for start in range(0, grid.num_images, step):
+        axes = grid.world_from_camera[start : start + step]
+        x, y, z = np.moveaxis(directions @ axes, -1, 0)
+        beside = (across * z - np.abs(x)) / math.hypot(1, across)
+        insets[start : start + step] = np.minimum(
+            beside, (down * z - np.abs(y)) / math.hypot(1, down)
+        )
+    return insets
+
+
+def _shares(
+    grid: PinholeGrid,
+    directions: NDArray[np.float64],
+    steradians: NDArray[np.float64],
+    insets: NDArray[np.float32],
+) -> NDArray[np.float64]:
+    """Return ``(N,)`` shares of the pixels of the images that are inside the area."""
+    shares = np.empty(len(insets))
+    across, down = grid.half_size
+    for image, (center, inset) in enumerate(zip(grid.centers_xyz, insets, strict=True)):
+        seen = inset >= 0
+        # A solid angle at an angle t from the center covers 1 / cos³ t as much of the image plane.
+        plane = steradians[seen] @ (directions[seen] @ center) ** -3.0
+        shares[image] = plane / (4 * across * down)
+    return shares
