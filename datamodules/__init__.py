@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from datamodules.cityscapes.photos import Cityscapes as Cityscapes
     from datamodules.core.panorama_pairs import ImagePairs as ImagePairs
+    from datamodules.densepass.panoramas import DensePASS as DensePASS
     from datamodules.folder.labeled import FolderPanoramas as FolderPanoramas
     from datamodules.folder.labeled import FolderPhotos as FolderPhotos
     from datamodules.modelnet40.datamodule import ModelNet40 as ModelNet40
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 _CLASSES = {
     "cityscapes.photos": ("Cityscapes",),
     "core.panorama_pairs": ("ImagePairs",),
+    "densepass.panoramas": ("DensePASS",),
     "folder.labeled": ("FolderPanoramas", "FolderPhotos"),
     "modelnet40.datamodule": ("ModelNet40",),
     "stanford2d3ds.pairs": ("StanfordPairs",),

@@ -85,6 +85,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     )
 
     class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+    fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
 
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
@@ -106,12 +107,6 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         given = self.normalization or self.normalizations[with_depth]
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
-
-    @property
-    def protocol(self) -> dict[str, str]:
-        """See `LabeledData`; also the set of classes and unknown pixels."""
-        classes = {} if self.classes is None else {"classes": str(self.classes)}
-        return super().protocol | {**classes, "unknown": self.unknown}
 
     @abstractmethod
     def find_images(
@@ -209,6 +204,7 @@ class PanoramaDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "panoramas"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size", "area", "mask", "test_rotation")
 
     panoramas_per_step: int = 4
     area: Sequence[float] | None = None
@@ -239,15 +235,9 @@ class PanoramaDataModule(ImageDataModule):
             self._masks.read("", self.canvas)
 
     @property
-    def protocol(self) -> dict[str, str]:
-        """See `ImageDataModule`; also size, area, mask and rotation of the panoramas."""
-        mask, area = self.mask, getattr(self, "area", None)
-        return super().protocol | {
-            "size": f"{2 * self.erp_height} × {self.erp_height}",
-            "area": "sphere" if area is None else ", ".join(f"{degrees:g}" for degrees in area),
-            "mask": "none" if mask is None else Path(str(mask)).name,
-            "rotation": str(self.test_rotation or "none"),
-        }
+    def size(self) -> str:
+        """Width and height of the panoramas whose pixels are scored."""
+        return f"{2 * self.erp_height} × {self.erp_height}"
 
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 7."""
@@ -334,6 +324,7 @@ class PhotoDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "photos"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     photos_per_step: int = 16
 
@@ -349,13 +340,11 @@ class PhotoDataModule(ImageDataModule):
         )
 
     @property
-    def protocol(self) -> dict[str, str]:
-        """See `ImageDataModule`; also the crops, which cover all pixels of a photo."""
+    def size(self) -> str:
+        """Size of the crops that are scored, which cover all pixels of a photo."""
         representation: Any = self.representation
         height, width = representation.image_size
-        return super().protocol | {
-            "size": f"crops of {representation.fov_deg:g}° in {width} × {height}"
-        }
+        return f"crops of {representation.fov_deg:g}° in {width} × {height}"
 
     def default_representation(self) -> PerspectiveRepresentation:
         """Crops of 45° at the resolution of level 7."""

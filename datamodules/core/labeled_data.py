@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
 
@@ -58,6 +59,7 @@ class LabeledData(ABC, Generic[_Item]):
 
     Attributes:
         class_names: Name of every label; for pixel labels the first is unknown, not a class.
+        fact_settings: Settings of the class that scores on the test split depend on, see `facts`.
         labels: Kind of labels of the items, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
         label_counts: After `check`, ``(K+1,)`` pixels of each label in the files, by split.
@@ -80,6 +82,7 @@ class LabeledData(ABC, Generic[_Item]):
     in_memory: bool = False
     skip_broken: bool = False
     class_names: tuple[str, ...] = field(init=False)
+    fact_settings: ClassVar[tuple[str, ...]] = ()
 
     def __post_init__(self) -> None:
         super().__init__()
@@ -300,15 +303,18 @@ class LabeledData(ABC, Generic[_Item]):
     # --- reading -------------------------------------------------------------------------------
 
     @property
-    def protocol(self) -> dict[str, str]:
-        """Facts that scores on the test split depend on; see `tangent_train.results.published`.
+    def facts(self) -> dict[str, str]:
+        """Facts that scores on the test split depend on, see `tangent_train.results.published`.
 
-        A data set adds its settings that change the tested images, their labels or their classes.
+        They are the data set, the number or set of classes, and the `fact_settings` of all classes.
         """
         kind = type(self)
         is_here = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
         name = kind.__name__ if is_here else f"{kind.__module__}.{kind.__name__}"
-        return {"data": name, "split": "test", "classes": str(self.num_classes)}
+        settings = chain.from_iterable(vars(k).get("fact_settings", ()) for k in kind.__mro__[::-1])
+        classes = str(getattr(self, "classes", None) or self.num_classes)
+        of_settings = {setting: _fact(getattr(self, setting)) for setting in settings}
+        return {"data": name, "classes": classes, **of_settings}
 
     @property
     def num_classes(self) -> int:
@@ -342,6 +348,15 @@ class LabeledData(ABC, Generic[_Item]):
             for doubt in label_doubts("train", counts, self.class_names):
                 print_on_rank_zero(f"Warning: {doubt}")
         return class_weights(counts[1:], kind)
+
+
+def _fact(value: Any) -> str:
+    """Return a setting as text: a path without its folder, a whole number without a point."""
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_fact, value))
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float) else Path(str(value)).name
 
 
 @rank_zero_only

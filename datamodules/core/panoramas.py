@@ -355,8 +355,8 @@ class _Reading:
     @property
     def settings(self) -> Mapping[str, str]:
         """See `ImageReader`; also classes and black pixels."""
-        own = {"classes": repr(self.class_set), "unknown": self.unknown}
-        return {**self.reader.settings, **own}
+        further = {"classes": repr(self.class_set), "unknown": self.unknown}
+        return {**self.reader.settings, **further}
 
     @property
     def layout(self) -> Layout:

@@ -21,7 +21,7 @@ from datamodules.core.loading import (
     this_process,
 )
 from datamodules.core.problems import Problems
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 
 _Item = TypeVar("_Item", bound=Item)
 
@@ -81,6 +81,13 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
         if self._index is None or not self.skip_broken:
             self._index = self._find_usable(sample=stage == TrainerFn.FITTING, whole=whole)
         index = self._index
+        if stage == TrainerFn.FITTING and not index.splits["train"]:
+            raise DataError(
+                self.root,
+                found=f"no {self.noun} for training",
+                expected="one or more",
+                remedy="Train on other data; these are for tangent-evaluate and tangent-transfer.",
+            )
         if self.try_step is not None and self.trainer is not None and stage == TrainerFn.FITTING:
             count = len(index.splits["train"]) // self.trainer.world_size
             for size in {min(self.per_step, count), count % self.per_step} - {0}:

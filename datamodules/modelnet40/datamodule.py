@@ -66,6 +66,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     noun: ClassVar[str] = "shapes"
     labels: ClassVar[str] = IMAGE_CLASS
+    fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
     shapes_per_step: int = 16
     test_rotation: TestRotation = None
@@ -80,11 +81,6 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         self.class_names = self.find_classes()
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
-
-    @property
-    def protocol(self) -> dict[str, str]:
-        """See `LabeledData`."""
-        return super().protocol | {"rotation": self.test_rotation or "none"}
 
     def default_representation(self) -> TangentRepresentation:
         """Tangent images of base level 0, at level 5."""

@@ -65,6 +65,8 @@ class StanfordAreas(ImageDataModule):
     class_sets = CLASS_SETS
     group: ClassVar[Literal["pano", "data"]]
 
+    fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
+
     fold: int = 1
     areas: Sequence[str] = AREAS
     label_table: Path | None = None
@@ -80,14 +82,6 @@ class StanfordAreas(ImageDataModule):
             f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
             f"{', '.join(FOLDS[self.fold])}) and for training (others)",
         )
-
-    @property
-    def protocol(self) -> dict[str, str]:
-        """See `LabeledData`: the fold itself is not part of it."""
-        all_areas = set(self.areas) == set(AREAS)
-        return super().protocol | {
-            "split": "folds" if all_areas else f"folds of areas {', '.join(self.areas)}"
-        }
 
     def find_images(
         self, problems: Problems

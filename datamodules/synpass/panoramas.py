@@ -24,7 +24,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import ClassVar, Literal
 
 from datamodules.cityscapes.classes import THIRTEEN
 from datamodules.core.image_module import PanoramaDataModule
@@ -97,6 +97,7 @@ class SynPASS(PanoramaDataModule):
     """
 
     class_sets = class_sets(CLASSES, {"13": ClassSet(THIRTEEN, CLASSES, _MERGED)})
+    fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
     weather: str | Sequence[str] = "all"

@@ -63,6 +63,8 @@ class SynthiaSequences(ImageDataModule):
     formats: ClassVar[reader.Formats]
     remedy: ClassVar[str] = reader.GET_IT
 
+    fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
+
     inputs: Sequence[Input] = ("rgb",)
     train_sequences: Sequence[str] = TRAIN
     test_sequences: Sequence[str] = TEST
@@ -82,11 +84,6 @@ class SynthiaSequences(ImageDataModule):
     def sequences(self) -> tuple[str, ...]:
         """Training sequences, then test sequences."""
         return (*self.train_sequences, *self.test_sequences)
-
-    @property
-    def protocol(self) -> dict[str, str]:
-        """See `LabeledData`."""
-        return super().protocol | {"split": f"sequences {', '.join(self.test_sequences)}"}
 
     @abstractmethod
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:

@@ -53,18 +53,17 @@ protocols differ. Different data sets are not compared.
 | fact | meaning |
 | --- | --- |
 | `data` | class of the data set |
-| `split` | images that are scored; the fold is compared separately |
 | `size` | width × height of the panorama whose pixels are scored; of photos, the crops |
-| `area` | part of the sphere: west, east, south and north in degrees |
+| `area` | part of the sphere: west, east, south and north in degrees; none is the whole sphere |
 | `unknown` | black pixels that are unknown too, see `data.unknown` |
 | `mask` | further ignored pixels, see `data.mask` |
-| `rotation` | rotation of the test images, see `data.test_rotation` |
+| `test_rotation` | rotation of the test images, see `data.test_rotation` |
 | `classes` | set of classes: their number, or a name, see `data.classes` |
 | `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
 | `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
 
-Further facts belong to single data sets. "Not stated" is a fact that the source does not state:
-such scores stand beside no result. Reasons are on the page
+Further facts are settings of single data sets. Folds are compared separately. "Not stated" is a
+fact that the source does not state: such scores stand beside no result. Reasons are on the page
 [Comparison](../explanation/comparison.md#published-scores), commands on the page
 [Benchmarks of the field](../how-to/field_benchmarks.md).
 

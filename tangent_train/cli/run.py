@@ -176,7 +176,7 @@ class Run:
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         record = replace(
             record,
-            protocol={**self.data.protocol, **self.task.protocol},
+            protocol={**self.data.facts, **self.task.facts},
             checkpoint=name,
             class_map=self.settings.get("class_map"),
             settings=dict(flat_settings(self.settings)),

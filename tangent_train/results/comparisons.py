@@ -45,7 +45,7 @@ def _differing_facts(records: Sequence[Record]) -> list[str]:
     return [
         name
         for name in names
-        if name not in ("data", "classes", "rotation")
+        if name not in ("data", "classes", "test_rotation")
         and len({record.protocol.get(name) for record in records}) > 1
     ]
 

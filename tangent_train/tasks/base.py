@@ -198,8 +198,8 @@ class Task(lightning.LightningModule, ABC):
         return Record(noun, self.evaluated, self.headings, means)
 
     @property
-    def protocol(self) -> dict[str, str]:
-        """Facts that the scores depend on besides those of the data, see `LabeledData.protocol`."""
+    def facts(self) -> dict[str, str]:
+        """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
         return {}
 
     def targets(self, batch: Any) -> Tensor:

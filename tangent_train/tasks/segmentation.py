@@ -326,7 +326,7 @@ class SegmentationTask(Task):
         )
 
     @property
-    def protocol(self) -> dict[str, str]:
+    def facts(self) -> dict[str, str]:
         """See `Task`: the scores count pixels of all images together, then average classes."""
         return {"absent_class": self.absent_class, "weighting": "pixels"}
 

@@ -55,12 +55,12 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     world, root = worlds[_data_set(settings)]
     settings["data"]["root"] = root
     data, task = build(settings)
-    assert {**data.protocol, **task.protocol} == protocol
+    assert {**data.facts, **task.facts} == protocol
     run("train", *arguments, f"data.root={root}", *SMALL, *world.small)
     (folder,) = (tmp_path / "runs").glob("field/*/*")
     found = results(folder)["protocol"]
     assert found.pop("size") != protocol.pop("size")
     assert found == protocol
     settings["data"] |= {"mask": -60, "test_rotation": "so3"}
-    changed = {"mask": "-60", "rotation": "so3"}
-    assert build_data(settings).protocol == data.protocol | changed, "as it is, not as it is named"
+    changed = {"mask": "-60", "test_rotation": "so3"}
+    assert build_data(settings).facts == data.facts | changed, "as it is, not as it is named"

@@ -15,7 +15,11 @@ from torch import nn
 from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
+import datamodules
+from datamodules.cityscapes.classes import CLASSES as CITYSCAPES
+from datamodules.cityscapes.classes import THIRTEEN
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
+from datamodules.synpass.panoramas import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.scores import Groups
@@ -28,6 +32,7 @@ from tests.inference.trained import TANGENT, trained_network
 PUBLISHED: dict[str, list[str]] = {
     **json.loads(Path(__file__).with_name("published_classes.json").read_text()),
     "Cityscapes": [c.name for c in Cityscapes.classes if not c.ignore_in_eval],
+    "SynPASS": list(SYNPASS),
     "Pascal VOC": DeepLabV3_ResNet50_Weights.DEFAULT.meta["categories"],
 }
 SHIPPED = {
@@ -36,6 +41,9 @@ SHIPPED = {
     "coco_stuff_to_stanford2d3ds": ("COCO-Stuff", 182, STANFORD),
     "cityscapes_to_synthia": ("Cityscapes", 19, SYNTHIA),
     "voc_to_stanford2d3ds": ("Pascal VOC", 21, STANFORD),
+    "ade20k_to_cityscapes": ("ADE20K", 150, CITYSCAPES),
+    "cityscapes_to_densepass13": ("Cityscapes", 19, THIRTEEN),
+    "synpass_to_densepass13": ("SynPASS", 22, THIRTEEN),
 }
 
 
@@ -62,6 +70,16 @@ def test_a_map_names_published_classes(name: str) -> None:
         firsts = {text.split(",")[0].strip() for text in mapped.classes[target]}
         assert firsts <= set(names)
     assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
+
+
+@pytest.mark.parametrize("data", [datamodules.Cityscapes, datamodules.SynPASS])
+def test_a_map_to_13_classes_maps_a_network_as_the_labels(data: Any) -> None:
+    labels = data.class_sets["13"]
+    names = f"{data.__name__.lower()}_to_densepass13"
+    mapped = map_classes(_trained(labels.of), load_class_map(names))
+    key = labels.key[1 : 1 + len(labels.of)].tolist()
+    groups = [[k for k, to in enumerate(key) if to == label] for label in (*range(1, 14), 0)]
+    assert mapped.trained.groups == groups
 
 
 def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:

@@ -194,7 +194,7 @@ def test_reports_of_shapes_name_their_rotations() -> None:
     headings = ClassificationTask.headings
     record = Record("shapes", 120, headings, means, classes, settings=settings)
     aligned = replace(record, protocol=facts("paper_modelnet40"))
-    rotated = replace(record, protocol={**aligned.protocol, "rotation": "so3"})
+    rotated = replace(record, protocol={**aligned.protocol, "test_rotation": "so3"})
     assert Comparison.of([rotated]).rows == []
     cells = _cells(_runs_report(aligned))
     assert cells["shapes"]["rotated in training / test"] == "z / SO3"

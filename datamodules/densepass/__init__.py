@@ -1,0 +1,1 @@
+"""DensePASS (Ma et al. 2021)."""

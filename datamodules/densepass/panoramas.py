@@ -1,0 +1,89 @@
+"""DensePASS (Ma et al. 2021): 100 labeled and 2,000 unlabeled panoramas of streets, 19 classes.
+
+Features: 400×2048 RGB, all around and about 70° high, with the classes of Cityscapes.
+
+On disk, as released::
+
+    root/
+      leftImg8bit/val/cs/1_.png  or  1.png          8 bit
+      gtFine/val/cs/1_labelTrainIds.png             8 bit, 0 to 18, 255 = unknown
+      leftImg8bit/train/<city>/1.png                unlabeled, for adaptation: not read here
+
+Pixels are square in angle: 400 rows span 400 / 2048 · 360° = 70.3°. The row of the horizon is not
+published. The default is the middle, so that the panoramas reach from -35.15° to 35.15°.
+
+License: free for academic research, https://github.com/chma1024/DensePASS.
+
+Citation: C. Ma, J. Zhang, K. Yang, A. Roitberg, R. Stiefelhagen: "DensePASS: Dense Panoramic
+Semantic Segmentation via Unsupervised Domain Adaptation with Attention-Augmented Context Exchange",
+ITSC 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from datamodules.cityscapes.classes import CLASS_SETS, CLASSES
+from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.index import Split
+from datamodules.core.inputs import Input
+from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.panoramas import ImageFiles
+from datamodules.core.problems import Problems
+from tangent_train.errors import DataError
+from tangent_train.registry import registered
+
+_GET_IT = (
+    "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
+    "with leftImg8bit and gtFine."
+)
+_PUBLISHED = ({"test": 100},)
+_TABLE = number_table(range(len(CLASSES)), [255])
+_HEIGHT, _WIDTH = 400, 2048
+_LABELS = "_labelTrainIds.png"
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class DensePASS(PanoramaDataModule):
+    """DensePASS, 19 or 13 classes.
+
+    All labeled panoramas are for the test; training and validation are empty.
+
+    Args:
+        horizon_row: Rows above the horizon, 0 to 400, which define `area`.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_sets = CLASS_SETS
+
+    inputs: Sequence[Input] = ("rgb",)
+    horizon_row: float = _HEIGHT / 2
+
+    def __post_init__(self) -> None:
+        self.require("horizon_row", 0 <= self.horizon_row <= _HEIGHT, f"0 to {_HEIGHT}")
+        self.require("area", self.area is None, "null: horizon_row defines it")
+        south, north = self.horizon_row - _HEIGHT, self.horizon_row
+        self.area = (-180, 180, south * 360 / _WIDTH, north * 360 / _WIDTH)
+        super().__post_init__()
+        self.require(
+            "inputs", "depth" not in self.inputs, "no depth: DensePASS has no depth images"
+        )
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[NumberedReader, dict[Split, list[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
+        # Two spellings are in circulation: 1_.png and 1.png.
+        paths = {path.stem.removesuffix("_"): path for path in images.glob("*.png")}
+        if not paths:
+            expected = "1_.png or 1.png, and others"
+            raise DataError(images, found="no panoramas", expected=expected, remedy=_GET_IT)
+        test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
+        problems.compare_counts({"test": len(test)}, _PUBLISHED)
+        problems.note_strays(labels.glob(f"*{_LABELS}"), test)
+        return NumberedReader(_TABLE), {"train": [], "val": [], "test": test}
