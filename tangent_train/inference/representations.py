@@ -12,7 +12,7 @@ import numpy as np
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from tangent_train.errors import SettingError, width_height
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import SphereArea, TangentGrid
 from tangent_train.inference.images import InputImage
 from tangent_train.registry import build_from_config
 from tangent_train.rendering import (
@@ -105,9 +105,14 @@ class PanoramaViews:
 
     def __str__(self) -> str:
         """Number and size of the views; of tangent images also angle and resolution by level."""
+        return self.described()
+
+    def described(self, area: Sequence[float] | None = None) -> str:
+        """Return the text of `__str__` for panoramas of an area, see `SphereArea.of`."""
         sets: Sequence[Any] = self.representation.view_sets()
-        rows, columns = self.image_size
-        text = f"{sum(map(len, sets))} views of {columns} × {rows}"
+        limited = self.representation.limited_to(SphereArea.of(area))
+        rows, columns = limited.image_size
+        text = f"{sum(map(len, limited.view_sets()))} views of {columns} × {rows}"
         grids = [getattr(views, "grid", None) for views in sets]
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
