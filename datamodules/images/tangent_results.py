@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -154,8 +155,9 @@ class TangentResults:
             raise SettingError("output", found=path.name, expected=expected)
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
         pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
-        size = self.arrays[0].shape[0]
-        grid = self.grid if size == self.grid.dim else self.grid.resized(size)
+        height, width = self.arrays[0].shape[:2]
+        same = (height, width) == self.grid.size
+        grid = self.grid if same else self.grid.resized((height, width))
         arrays = self.arrays
         if z_depth:
             arrays = [_distances(array, grid, path) for array in arrays]
@@ -183,7 +185,7 @@ class TangentResults:
             out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, interpolation="nearest")
             return
         channels = out.shape[2:]
-        step = max(1, _GROUP_BYTES // (4 * grid.num_images * grid.dim**2))
+        step = max(1, _GROUP_BYTES // (4 * grid.num_images * math.prod(grid.size)))
         for start in range(0, channels[0], step) if channels else (0,):
             part = (..., slice(start, start + step)) if channels else ...
             group = np.stack([array[part] for array in arrays])

@@ -37,6 +37,7 @@ from tangent_train.geometry.grid import TangentGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
 from tangent_train.geometry.panorama_pose import PanoramaPose
 from tangent_train.geometry.pinhole_grid import PinholeGrid
+from tangent_train.geometry.ring import RingGrid
 from tangent_train.geometry.sphere import (
     FLIP_Y,
     checked_rotation,
@@ -52,6 +53,7 @@ __all__ = [
     "Icosphere",
     "PanoramaPose",
     "PinholeGrid",
+    "RingGrid",
     "SphereArea",
     "TangentGrid",
     "camera_matrix_from_fov",

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import at_least
-from tangent_train.geometry.pinhole_grid import PinholeGrid
+from tangent_train.geometry.pinhole_grid import SquareGrid
 
 _X, _Y, _Z = np.eye(3)
 
@@ -28,7 +27,7 @@ _NEIGHBORS.setflags(write=False)
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class CubeGrid(PinholeGrid):
+class CubeGrid(SquareGrid):
     """The six faces of a cube around the center, pinhole images of 90°, or more with a margin.
 
     The faces are in this order: front (+x, the middle of the panorama), right (+y), back (−x),
@@ -57,23 +56,18 @@ class CubeGrid(PinholeGrid):
     (6, 0.0625, 0.96875)
     """
 
-    dim: int
+    size: tuple[int, int]
     rotation: NDArray[np.float64] | None
 
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
         margin = at_least("margin", margin, 0)
         dim = at_least("dim", dim, 2 + 2 * margin)
-        self._set(rotation, dim=dim, pitch=2 / (dim - 2 * margin))
+        self._set(rotation, size=(dim, dim), pitch=2 / (dim - 2 * margin))
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
         """``(6, 4)`` faces that share an edge with each face: all but itself and its opposite."""
         return _NEIGHBORS
-
-    @property
-    def owned_dim(self) -> int:
-        """Pixels that span 90°."""
-        return math.ceil(2 / self.pitch - 1e-9)
 
     @property
     def is_overlapping(self) -> bool:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
-from tangent_train.geometry.pinhole_grid import PinholeGrid
+from tangent_train.geometry.pinhole_grid import SquareGrid
 
 _MAX_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take too long to compute
 
@@ -81,7 +81,7 @@ def _face_table(base_level: int) -> _FaceTable:
 
 
 @dataclass(frozen=True, eq=False, init=False)
-class TangentGrid(PinholeGrid):
+class TangentGrid(SquareGrid):
     """N = 20·4^b pinhole images tangent to the faces of a level-b icosahedron.
 
     Pixel (row i, column j) of an image sits on its tangent plane at ``x = (j − (d−1)/2)·p`` to the
@@ -107,7 +107,7 @@ class TangentGrid(PinholeGrid):
 
     base_level: int
     level: int
-    dim: int
+    size: tuple[int, int]
     rotation: NDArray[np.float64] | None
 
     def __init__(
@@ -125,7 +125,7 @@ class TangentGrid(PinholeGrid):
         if dim > 2**_MAX_LEVEL:
             raise SettingError("dim", found=dim, expected=f"at most {2**_MAX_LEVEL}")
         pitch = _pitch(base_level, level)
-        self._set(rotation, base_level=base_level, level=level, dim=dim, pitch=pitch)
+        self._set(rotation, base_level=base_level, level=level, size=(dim, dim), pitch=pitch)
         least = self.least_dim(base_level, level)
         if dim < least:
             raise SettingError(
@@ -138,12 +138,8 @@ class TangentGrid(PinholeGrid):
     @staticmethod
     def least_dim(base_level: int, level: int) -> int:
         """Return the smallest `dim` whose images cover every owned cell."""
-        return _owned_dim(base_level, _pitch(base_level, level))
-
-    @property
-    def owned_dim(self) -> int:
-        """See `PinholeGrid`."""
-        return _owned_dim(self.base_level, self.pitch)
+        extent = _face_table(base_level).owned_extent
+        return math.ceil(2 * extent / _pitch(base_level, level) - 1e-9) + 1
 
     @property
     def neighbors(self) -> NDArray[np.int32]:
@@ -157,10 +153,6 @@ class TangentGrid(PinholeGrid):
 
     def _resting_axes(self) -> NDArray[np.float64]:
         return _face_table(self.base_level).world_from_camera
-
-
-def _owned_dim(base_level: int, pitch: float) -> int:
-    return math.ceil(2 * _face_table(base_level).owned_extent / pitch - 1e-9) + 1
 
 
 def _pitch(base_level: int, level: int) -> float:

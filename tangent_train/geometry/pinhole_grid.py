@@ -1,9 +1,8 @@
-"""Square pinhole images around a common center: the base of tangent images and cube faces."""
+"""Pinhole images around a common center: the base of tangent images, cube faces and level views."""
 
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 from typing import Any, Self
@@ -11,52 +10,74 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
+from tangent_train.geometry.cells import cell_neighbors
 from tangent_train.geometry.sphere import checked_rotation
 
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
 
+_ROUNDING = 1e-9
+"""Tolerance at the edges of images, in focal lengths."""
 
-class PinholeGrid(ABC):
-    """N square pinhole images of the same pitch, which together cover all directions.
+
+class PinholeGrid:
+    """N pinhole images of the same size and pitch around a common center.
 
     Pixel (row i, column j) of an image sits on the plane at distance 1 in front of the camera, at
-    ``(j − (d−1)/2)·p`` to the right and ``(i − (d−1)/2)·p`` down. Every direction is *owned* by the
-    image with the nearest center. It lies at most half a pixel outside the outermost pixel centers
-    of that image.
+    ``(j − (w−1)/2)·p`` to the right and ``(i − (h−1)/2)·p`` down. Every direction is *owned* by the
+    image with the nearest center. Where the owners show all directions that they own, a direction
+    lies at most half a pixel outside the outermost pixel centers of its owner.
 
-    Attributes:
-        dim: Side d in pixels.
+    Args:
+        axes: ``(N, 3, 3)`` camera axes before the rotation, as `world_from_camera`; all images have
+            different centers.
+        size: Rows h and columns w of the images.
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
+        is_overlapping: See the property.
+
+    Raises:
+        SettingError: The rotation is not a rotation.
     """
 
-    dim: int
+    size: tuple[int, int]
     pitch: float
     rotation: NDArray[np.float64] | None
 
+    def __init__(
+        self,
+        axes: NDArray[np.float64],
+        size: tuple[int, int],
+        pitch: float,
+        rotation: ArrayLike | None = None,
+        *,
+        is_overlapping: bool = True,
+    ) -> None:
+        self._set(rotation, size=size, pitch=pitch, _axes=axes, _is_overlapping=is_overlapping)
+
     @property
-    @abstractmethod
     def neighbors(self) -> NDArray[np.int32]:
         """``(N, k)`` neighbors of every image, padded with the image itself.
 
         Stepping repeatedly to the neighbor with the nearest center ends at the owner.
         """
+        return self._cell_neighbors
+
+    @cached_property
+    def _cell_neighbors(self) -> NDArray[np.int32]:
+        return cell_neighbors(self._resting_axes()[..., 2])
 
     @property
-    @abstractmethod
-    def owned_dim(self) -> int:
-        """Side in pixels of the part of an image that contains every direction it owns."""
-
-    @property
-    @abstractmethod
     def is_overlapping(self) -> bool:
         """True if every direction is inside an image, not only on its outer edge."""
+        overlapping: bool = vars(self)["_is_overlapping"]
+        return overlapping
 
-    @abstractmethod
     def _resting_axes(self) -> NDArray[np.float64]:
         """Return ``(N, 3, 3)`` camera axes before the rotation."""
+        axes: NDArray[np.float64] = vars(self)["_axes"]
+        return axes
 
     def _set(self, rotation: ArrayLike | None, **values: Any) -> None:
         """Set the attributes of a new grid."""
@@ -78,22 +99,37 @@ class PinholeGrid(ABC):
 
     def widened(self, margin: int) -> Self:
         """Return the same images with more pixels on every side, at the same pitch."""
-        return self._changed(self.rotation, dim=self.dim + 2 * margin)
+        rows, columns = self.size
+        return self._changed(self.rotation, size=(rows + 2 * margin, columns + 2 * margin))
 
-    def resized(self, dim: int) -> Self:
+    def resized(self, size: tuple[int, int]) -> Self:
         """Return the same images at another resolution: their outer edges agree.
 
-        Use it for the output of a network that downsamples or upsamples tangent images.
+        Use it for the output of a network that downsamples or upsamples images.
 
         Args:
-            dim: Side d' in pixels; the pitch becomes p·d/d'.
+            size: Rows h' and columns w', with w'/h' = w/h; the pitch becomes p·w/w'.
 
         Raises:
-            SettingError: The side is less than 2 pixels.
+            SettingError: A side is less than 2 pixels, or their ratio is another one.
         """
-        if dim < 2:
-            raise SettingError("dim", found=dim, expected="2 or more")
-        return self._changed(self.rotation, dim=dim, pitch=self.pitch * self.dim / dim)
+        (rows, columns), (height, width) = self.size, size
+        if min(size) < 2 or height * columns != width * rows:
+            expected = f"2 pixels or more, in the ratio of {width_height(self.size)}"
+            raise SettingError("size", found=width_height(size), expected=expected)
+        return self._changed(self.rotation, size=size, pitch=self.pitch * columns / width)
+
+    def subset(self, faces: Faces) -> PinholeGrid:
+        """Return some of the images; the nearest among them owns a direction.
+
+        Args:
+            faces: Indices of one or more different images.
+
+        Raises:
+            SettingError: A face is out of range.
+        """
+        axes, overlapping = self._resting_axes()[self.face_indices(faces)], self.is_overlapping
+        return PinholeGrid(axes, self.size, self.pitch, self.rotation, is_overlapping=overlapping)
 
     def _changed(self, rotation: ArrayLike | None, **values: Any) -> Self:
         """Return this grid with other values, without its cached properties."""
@@ -107,25 +143,21 @@ class PinholeGrid(ABC):
         return other
 
     @property
-    def half_extent(self) -> float:
-        """Half extent h = (d−1)/2·p: position of the outermost pixel centers on the image plane."""
-        return (self.dim - 1) / 2 * self.pitch
+    def half_size(self) -> tuple[float, float]:
+        """Positions x and y of the outer pixel edges on the image plane."""
+        rows, columns = self.size
+        return columns * self.pitch / 2, rows * self.pitch / 2
 
     @property
     def width_deg(self) -> float:
         """Angle across the middle of an image, between its outer pixel edges, in degrees."""
-        return math.degrees(2 * math.atan(self.dim * self.pitch / 2))
-
-    @property
-    def fov_deg(self) -> float:
-        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
-        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))
+        return math.degrees(2 * math.atan(self.half_size[0]))
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
-        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, center (d−1)/2."""
-        center = (self.dim - 1) / 2
-        return np.array([[1 / self.pitch, 0, center], [0, 1 / self.pitch, center], [0, 0, 1]])
+        """``(3, 3)`` pinhole matrix of every image: focal length 1/p, center (w−1)/2, (h−1)/2."""
+        y, x = ((side - 1) / 2 for side in self.size)
+        return np.array([[1 / self.pitch, 0, x], [0, 1 / self.pitch, y], [0, 0, 1]])
 
     @cached_property
     def centers_xyz(self) -> NDArray[np.float64]:
@@ -153,13 +185,13 @@ class PinholeGrid(ABC):
             faces: Images to return, by default all.
 
         Returns:
-            ``(n, d, d, 3)`` unit vectors.
+            ``(n, h, w, 3)`` unit vectors.
 
         Raises:
             SettingError: A face is out of range.
         """
-        line = (np.arange(self.dim) - (self.dim - 1) / 2) * self.pitch
-        x, y = np.meshgrid(line, line)
+        down, right = ((np.arange(side) - (side - 1) / 2) * self.pitch for side in self.size)
+        x, y = np.meshgrid(right, down)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         axes = self.world_from_camera[self.face_indices(faces)]
@@ -213,15 +245,52 @@ class PinholeGrid(ABC):
             np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes), -1, 0
         )
         depth = np.where(z > 0, z, np.nan)
-        return np.stack([x / depth, y / depth], axis=-1) / self.pitch + (self.dim - 1) / 2
+        plane = np.stack([x / depth, y / depth], axis=-1)
+        return plane / self.pitch + self.camera_matrix[:2, 2]
+
+    def shown(self, directions_xyz: ArrayLike, *, on_edge: bool = True) -> NDArray[np.bool_]:
+        """Return the images that show directions, between their outer pixel edges.
+
+        Args:
+            directions_xyz: ``(n, 3)`` vectors of any length.
+            on_edge: True to include directions on the edges.
+
+        Returns:
+            ``(n, N)`` mask.
+        """
+        x, y, z = np.moveaxis(np.asarray(directions_xyz) @ self.world_from_camera, -1, 0)
+        (across, down), beyond = self.half_size, _ROUNDING if on_edge else -_ROUNDING
+        inside = np.maximum(np.abs(x) - across * z, np.abs(y) - down * z) < beyond * z
+        return np.asarray(inside & (z > 0)).T
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
         rotation = None if self.rotation is None else self.rotation.tobytes()
-        return type(self), self.num_images, self.dim, self.pitch, rotation
+        axes = vars(self).get("_axes")
+        fixed = None if axes is None else axes.tobytes()
+        return type(self), self.num_images, self.size, self.pitch, rotation, fixed
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PinholeGrid) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
+
+
+class SquareGrid(PinholeGrid):
+    """Square images with sides of d pixels."""
+
+    @property
+    def dim(self) -> int:
+        """Side d in pixels."""
+        return self.size[0]
+
+    @property
+    def half_extent(self) -> float:
+        """Half extent h = (d−1)/2·p: position of the outermost pixel centers on the image plane."""
+        return (self.dim - 1) / 2 * self.pitch
+
+    @property
+    def fov_deg(self) -> float:
+        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
+        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))

@@ -77,7 +77,7 @@ class NetworkJudge:
         network: Any = self.trained.network
         upright, rays = self._views, None
         views = replace(upright, grid=upright.grid.with_rotation(upright_rotation(up)))
-        per_forward = views_per_forward((views.grid.dim, views.grid.dim))
+        per_forward = views_per_forward(views.grid.size)
         if sees_rays(network):
             network = partial(network, images_per_chunk=per_forward)
             rays = torch.from_numpy(upright.rays()).to(self.device)

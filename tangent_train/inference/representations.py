@@ -294,7 +294,7 @@ def _photo_representation(
         seen = _built(trained, panorama_settings(trained, level, base_level))
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
-        size, half_extent = seen.image_size, seen.grid.dim / 2 * seen.grid.pitch
+        size, half_extent = seen.image_size, seen.grid.half_size[0]
     check_size(trained, size)
     return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
 

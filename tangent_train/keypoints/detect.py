@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -117,7 +118,7 @@ def detect_on_tangent_images(
 
     def search(face: int) -> SphericalKeypoints:
         found = detect(equirect_to_tangent(gray, wide, [face])[0])
-        plane = (found.points_xy - (wide.dim - 1) / 2) * wide.pitch
+        plane = (found.points_xy - wide.camera_matrix[:2, 2]) * wide.pitch
         rays = np.column_stack([plane, np.ones(len(plane))])
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         directions = rays @ wide.world_from_camera[face].T
@@ -125,7 +126,7 @@ def detect_on_tangent_images(
         keypoints = _on_sphere(found, directions, jacobian, face)
         return keypoints.select(wide.owners(directions) == face)
 
-    threads = min(torch.get_num_threads(), max(1, _PIXELS_AT_ONCE // wide.dim**2))
+    threads = min(torch.get_num_threads(), max(1, _PIXELS_AT_ONCE // math.prod(wide.size)))
     with ThreadPoolExecutor(threads) as pool:
         parts = list(pool.map(search, range(wide.num_images)))
     keypoints = SphericalKeypoints.concatenated(parts)

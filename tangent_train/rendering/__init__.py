@@ -1,4 +1,4 @@
-"""Render equirectangular panoramas to tangent images or cube faces, and back.
+"""Render equirectangular panoramas to tangent images, level views or cube faces, and back.
 
 NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on any device, labels
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
@@ -23,6 +23,7 @@ from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
     TangentRepresentation,
 )
+from tangent_train.rendering.representations.ring import RingRepresentation
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.rendering.tables import set_table_cache_limit
 
@@ -35,6 +36,7 @@ __all__ = [
     "PerspectiveRepresentation",
     "Representation",
     "RigFile",
+    "RingRepresentation",
     "TangentRepresentation",
     "apply",
     "equirect_to_tangent",

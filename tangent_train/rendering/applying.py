@@ -47,8 +47,8 @@ def apply(
 
     Args:
         function: Maps some images of the panorama's kind and dtype to a result of as many pixels:
-            arrays ``(n, d, d[, C])`` to ``(n, d, d[, K])``, or tensors ``(n, C, d, d)`` to
-            ``(n, d, d)`` or ``(n, K, d, d)``. Called with all images of the grid, in its order.
+            arrays ``(n, h, w[, C])`` to ``(n, h, w[, K])``, or tensors ``(n, C, h, w)`` to
+            ``(n, h, w)`` or ``(n, K, h, w)``. Called with all images of the grid, in its order.
         panorama: An array ``(H, W[, C])``, or a floating-point tensor ``(C, H, W)``.
         grid: The images.
         blend: Blending of results that are floats, as in `tangent_to_equirect`. Whole numbers and
@@ -77,7 +77,7 @@ def apply(
             expected="(C, H, W)",
             remedy="Call apply for each panorama of a batch.",
         )
-    step = max(1, _PIXELS_PER_CALL // grid.dim**2)
+    step = max(1, _PIXELS_PER_CALL // math.prod(grid.size))
     if images_per_call is not None:
         step = at_least("images_per_call", images_per_call, 1)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
@@ -147,9 +147,9 @@ def _mean(
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
-    """Return the function's result for some images as an array ``(n, d, d[, K])``."""
+    """Return the function's result for some images as an array ``(n, h, w[, K])``."""
     kind = Tensor if isinstance(images, Tensor) else np.ndarray
-    count, side = len(images), images.shape[-1] if kind is Tensor else images.shape[1]
+    count, (rows, columns) = len(images), images.shape[-2:] if kind is Tensor else images.shape[1:3]
     found = f"a {type(returned).__name__}"
     if isinstance(returned, kind):
         found = f"shape {tuple(returned.shape)} of {returned.dtype}"
@@ -157,15 +157,15 @@ def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
         if isinstance(returned, Tensor):
             array = (returned.float() if returned.is_floating_point() else returned).cpu().numpy()
             array = array if returned.ndim < 4 else np.moveaxis(array, 1, -1)
-        fits = array.ndim in (3, 4) and array.shape[:3] == (count, side, side)
+        fits = array.ndim in (3, 4) and array.shape[:3] == (count, rows, columns)
         if fits and array.dtype.kind in "buif":
             return array
-    layout = "({0}[, K], {1}, {1})" if kind is Tensor else "({0}, {1}, {1}[, K])"
+    layout = "({}[, K], {}, {})" if kind is Tensor else "({}, {}, {}[, K])"
     raise SettingError(
         "result of the function",
         found=found,
-        expected=f"a {kind.__name__} of numbers {layout.format(count, side)} "
-        f"for {count} images of {side}×{side} pixels",
+        expected=f"a {kind.__name__} of numbers {layout.format(count, rows, columns)} "
+        f"for {count} images of {columns}×{rows} pixels",
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
@@ -45,8 +46,8 @@ def tangent_to_equirect(
     """Render tangent images back to a panorama.
 
     Args:
-        images: All images of the grid: a floating-point tensor ``(..., N, C, d, d)`` on any
-            device, differentiable; or an array ``(N, d, d[, C])`` of numbers.
+        images: All images of the grid: a floating-point tensor ``(..., N, C, h, w)`` on any
+            device, differentiable; or an array ``(N, h, w[, C])`` of numbers.
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
         blend: ``nearest``: every direction is taken from its owner. ``feather``: the average of
@@ -67,16 +68,18 @@ def tangent_to_equirect(
     check_images("tangent images", images, grid, interpolation)
     if isinstance(images, np.ndarray):
         return _from_arrays(images, grid, shape, blend, interpolation)
-    flat = images.movedim(-4, -3).reshape(-1, grid.num_images * grid.dim**2)
+    flat = images.movedim(-4, -3).reshape(-1, grid.num_images * math.prod(grid.size))
     # For the nearest pixel all dtypes use float32 positions, so that all take the same pixel.
     dtype = map_dtype(images.dtype == torch.float64, interpolation)
     bands = []
     for face, u, v, weight in _bands(images.device, grid, shape, blend, dtype):
         if interpolation == "nearest":
-            index = nearest_image_index(face[0], u[0], v[0], grid.dim)
+            index = nearest_image_index(face[0], u[0], v[0], grid.size)
             bands.append(flat.gather(1, index.expand(len(flat), -1)))
         else:
-            bands.append(sample(flat, image_taps(face, u, v, grid.dim, weight, grid.dim**2)))
+            bands.append(
+                sample(flat, image_taps(face, u, v, grid.size, weight, math.prod(grid.size)))
+            )
     return torch.cat(bands, dim=1).reshape(*images.shape[:-4], images.shape[-3], *shape)
 
 
@@ -90,7 +93,7 @@ def tangent_to_labels(
     rendered by torch.
 
     Args:
-        logits: ``(..., N, K, d, d)`` floating-point scores of all images of the grid.
+        logits: ``(..., N, K, h, w)`` floating-point scores of all images of the grid.
         grid: The images' geometry.
         shape: ``(H, W)`` of the panorama.
         blend: ``nearest``: the owner's scores. ``feather``: the average of all images that cover a
@@ -137,11 +140,11 @@ def _from_arrays(
     blend: Blend,
     interpolation: Interpolation,
 ) -> NDArray[Any]:
-    """Run `tangent_to_equirect` on arrays ``(N, d, d[, C])``; integer results are rounded."""
+    """Run `tangent_to_equirect` on arrays ``(N, h, w[, C])``; integer results are rounded."""
     if interpolation == "nearest":
         pixels = images.reshape(-1, *images.shape[3:])
         bands = _bands(torch.device("cpu"), grid, shape, blend, np.dtype(np.float32))
-        parts = (nearest_image_index(f[0], u[0], v[0], grid.dim).numpy() for f, u, v, _ in bands)
+        parts = (nearest_image_index(f[0], u[0], v[0], grid.size).numpy() for f, u, v, _ in bands)
         return np.concatenate([pixels[index] for index in parts]).reshape(*shape, *images.shape[3:])
     exact = (images.dtype.kind in "ui" and images.dtype.itemsize > 2) or images.dtype == np.float64
     stack = _tensor(images.astype(np.float64 if exact else np.float32, copy=False))
@@ -158,7 +161,7 @@ def _from_arrays(
 def _feathered(
     images: NDArray[np.float32], grid: PinholeGrid, shape: tuple[int, int]
 ) -> NDArray[np.float32]:
-    """Feather ``(N, C, d, d)`` images to ``(H, W, C)``; a channel of ones sums the weights."""
+    """Feather ``(N, C, h, w)`` images to ``(H, W, C)``; a channel of ones sums the weights."""
     channels, step = images.shape[1], max(1, _BAND // shape[1])
     with_ones = np.ascontiguousarray(np.concatenate([images, np.ones_like(images[:, :1])], axis=1))
     panorama = np.empty((*shape, channels), np.float32)
@@ -194,13 +197,13 @@ def _bands(
 def _torch_labels(
     scores: Tensor, grid: PinholeGrid, shape: tuple[int, int], blend: Blend, labels: Tensor
 ) -> None:
-    """Write labels ``(H W,)`` of ``(N, K, d, d)`` scores of any device and dtype, by class."""
-    num_classes, size = scores.shape[1], grid.dim**2
+    """Write labels ``(H W,)`` of ``(N, K, h, w)`` scores of any device and dtype, by class."""
+    num_classes, size = scores.shape[1], math.prod(grid.size)
     flat = scores.reshape(1, -1)
     dtype = map_dtype(scores.dtype == torch.float64, "bilinear")
     start = 0
     for face, u, v, weight in _bands(scores.device, grid, shape, blend, dtype):
-        taps = image_taps(face, u, v, grid.dim, weight, num_classes * size)
+        taps = image_taps(face, u, v, grid.size, weight, num_classes * size)
         label = taps.source.new_zeros((1, taps.source.shape[-1]))
         best = torch.full_like(label, -torch.inf, dtype=scores.dtype)
         for k in range(num_classes):

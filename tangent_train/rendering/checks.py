@@ -110,11 +110,11 @@ def check_images(
 
     Args:
         name: Name of the images in the message.
-        images: Tensor ``(..., N, C, d, d)`` or array ``(N, d, d[, C])``.
+        images: Tensor ``(..., N, C, h, w)`` or array ``(N, h, w[, C])``.
         grid: Geometry of the images.
         interpolation: Interpolation that will be used to sample them.
     """
-    shape, sides = tuple(images.shape), (grid.num_images, grid.dim, grid.dim)
+    shape, sides = tuple(images.shape), (grid.num_images, *grid.size)
     if isinstance(images, np.ndarray):
         fits, expected = len(shape) in (3, 4) and shape[:3] == sides, "({}, {}, {}[, channels])"
     else:

@@ -50,7 +50,7 @@ def tangent_figure(panorama: NDArray[np.generic], grid: TangentGrid) -> _Image:
     shown = cv2.resize(image, shape[::-1], interpolation=cv2.INTER_AREA)
     above = _with_borders(shown, grid.owners(equirect_directions(shape)))
     below = np.full((grid.num_images // columns * step + _GAP, _WIDTH, 3), 255, np.uint8)
-    small = grid.resized(step - _GAP)
+    small = grid.resized((step - _GAP, step - _GAP))
     rows = min(image.shape[0], round(np.pi / small.pitch))
     source = cv2.resize(image, (2 * rows, rows), interpolation=cv2.INTER_AREA)
     centers = lonlat_to_equirect(xyz_to_lonlat(grid.centers_xyz), shape)

@@ -57,7 +57,7 @@ def equirect_to_tangent(
         interpolation: ``bilinear``, or ``nearest`` for labels and masks of any dtype.
 
     Returns:
-        A tensor ``(..., n, C, d, d)`` or an array ``(n, d, d[, C])``, of the dtype of the image.
+        A tensor ``(..., n, C, h, w)`` or an array ``(n, h, w[, C])``, of the dtype of the image.
 
     Raises:
         SettingError: The panorama, a face or the interpolation cannot be used.
@@ -67,18 +67,19 @@ def equirect_to_tangent(
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
     together = faces is None or grid.rotation is not None
     pixels = _CHUNK if isinstance(image, Tensor) else _TOGETHER
-    step = max(1, pixels // max(grid.dim**2, 4 * grid.dim)) if together else 1
+    rows, columns = grid.size
+    step = max(1, pixels // max(rows * columns, 4 * rows)) if together else 1
     if isinstance(image, Tensor):
         return _render_tensor(image, grid, indices, step, interpolation)
     image = np.ascontiguousarray(image)
     shape = image.shape[0], image.shape[1]
-    out = np.empty((len(indices) * grid.dim, grid.dim, *image.shape[2:]), image.dtype)
+    out = np.empty((len(indices) * rows, columns, *image.shape[2:]), image.dtype)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
     for start in range(0, len(indices), step):
         table = forward_map(grid, shape, indices[start : start + step], dtype)
-        part = out[start * grid.dim : (start + step) * grid.dim]
+        part = out[start * rows : (start + step) * rows]
         sample_map(table, image, interpolation, part)
-    return out.reshape(len(indices), grid.dim, *out.shape[1:])
+    return out.reshape(len(indices), rows, *out.shape[1:])
 
 
 def _render_tensor(
@@ -91,7 +92,7 @@ def _render_tensor(
     *batch, channels, height, width = image.shape
     source = image.reshape(-1, height * width)
     dtype = map_dtype(image.dtype == torch.float64, interpolation)
-    chunks = [image.new_empty((*batch, 0, channels, grid.dim, grid.dim))]
+    chunks = [image.new_empty((*batch, 0, channels, *grid.size))]
     for start in range(0, len(indices), step):
         faces = tuple(indices[start : start + step].tolist())
         # On the CPU the map itself is already cached.
@@ -99,7 +100,7 @@ def _render_tensor(
         build = partial(forward_positions, grid, (height, width), faces, dtype)
         u, v = tensors_on(image.device, grid, key, build)
         values = _sampled(source, u, v, (height, width), interpolation)
-        images = values.reshape(*batch, channels, len(faces), grid.dim, grid.dim)
+        images = values.reshape(*batch, channels, len(faces), *grid.size)
         chunks.append(images.movedim(-3, -4))
     return torch.cat(chunks, dim=-4)
 

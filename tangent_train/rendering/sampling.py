@@ -309,7 +309,12 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
 
 
 def image_taps(
-    face: Tensor, u: Tensor, v: Tensor, dim: int, weight: Tensor, image_size: int
+    face: Tensor,
+    u: Tensor,
+    v: Tensor,
+    size: tuple[int, int],
+    weight: Tensor,
+    values: int,
 ) -> Taps:
     """Return bilinear taps in tangent images, clamped to the outermost pixel centers.
 
@@ -317,37 +322,40 @@ def image_taps(
         face: ``(R, P)`` indices of images, any integer dtype.
         u: ``(R, P)`` columns in the images.
         v: ``(R, P)`` rows in the images.
-        dim: Side d of the images.
+        size: Rows and columns of the images.
         weight: ``(R, P)`` weights of the images.
-        image_size: Number of values from one image to the next in the flat source.
+        values: Number of values from one image to the next in the flat source.
 
     Returns:
         4 R taps per position, weights of the dtype of `u`.
     """
-    left = u.floor().clamp(0, dim - 2)
-    top = v.floor().clamp(0, dim - 2)
+    rows, columns = size
+    left = u.floor().clamp(0, columns - 2)
+    top = v.floor().clamp(0, rows - 2)
     right, below = (u - left).clamp(0, 1), (v - top).clamp(0, 1)
-    first = face.long() * image_size + top.long() * dim + left.long()
-    index = torch.cat([first, first + 1, first + dim, first + dim + 1])
+    first = face.long() * values + top.long() * columns + left.long()
+    index = torch.cat([first, first + 1, first + columns, first + columns + 1])
     above, before = 1 - below, 1 - right
     weights = [above * before, above * right, below * before, below * right]
     return Taps(index, torch.cat([part * weight for part in weights]))
 
 
-def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, dim: int) -> Tensor:
+def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, size: tuple[int, int]) -> Tensor:
     """Return the nearest pixel at positions in images; half-way between two, the even one.
 
     Args:
         face: ``(P,)`` indices of images, any integer dtype.
         u: ``(P,)`` columns in the images.
         v: ``(P,)`` rows in the images.
-        dim: Side d of the images.
+        size: Rows and columns of the images.
 
     Returns:
-        ``(P,)`` int64 flat indices into ``(N, d, d)``.
+        ``(P,)`` int64 flat indices into ``(N, h, w)``.
     """
-    row, column = (line.round().long().clamp(0, dim - 1) for line in (v, u))
-    return (face.long() * dim + row) * dim + column
+    row, column = (
+        line.round().long().clamp(0, side - 1) for line, side in zip((v, u), size, strict=True)
+    )
+    return (face.long() * size[0] + row) * size[1] + column
 
 
 def sample(source: Tensor, taps: Taps) -> Tensor:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import PinholeGrid
+from tangent_train.geometry import PinholeGrid, xyz_to_lonlat
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import njit_exact, over_rows
 from tangent_train.rendering.sampling import (
@@ -132,7 +132,7 @@ def forward_map(
 
     def build() -> EquirectMap:
         world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
-        rays = plane_rays((grid.dim, grid.dim))
+        rays = plane_rays(grid.size)
         return equirect_map(world_from_pixel[..., [0, 2, 1]], rays, shape, dtype)
 
     return _cached(grid, ("forward", shape, chosen, dtype), build)
@@ -165,7 +165,7 @@ def _inner_cosine(grid: PinholeGrid) -> float:
     centers, around = grid.centers_xyz, grid.neighbors
     cosines = np.einsum("nkc,nc->nk", centers[around], centers)
     others = around != np.arange(grid.num_images)[:, None]
-    return float(np.cos(np.arccos(cosines[others].max()) / 2))
+    return float(np.cos(np.arccos(cosines[others].max(initial=-1.0)) / 2))
 
 
 @njit_exact
@@ -206,6 +206,52 @@ def find_owners(
             face[i, j] = nearest
 
 
+def find_owned_spans(
+    grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.int32]:
+    """Return ``(n, H, 2)`` spans that contain the owned pixels, see `kernels.CanvasGeometry`.
+
+    Args:
+        grid: Geometry of all images.
+        faces: ``(n,)`` indices of the images.
+        shape: ``(H, W)`` of the panorama.
+    """
+
+    def build() -> tuple[NDArray[np.int32]]:
+        longitudes = xyz_to_lonlat(grid.centers_xyz)[:, 0]
+        before = (longitudes / (2 * math.pi) * shape[1]).astype(np.int64)
+        spans = np.zeros((grid.num_images, shape[0], 2), np.int32)
+        over_rows(write_owned_spans, *shape, owners(grid, shape), before, spans)
+        return (spans,)
+
+    return _cached(grid, ("owned spans", shape), build)[0][faces]
+
+
+@njit_exact
+def write_owned_spans(start: int, stop: int, owner: Array, before: Array, spans: Array) -> None:
+    """Find the columns of ERP rows ``start:stop`` that images own.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        owner: ``(H, W)`` owners.
+        before: ``(N,)`` column opposite to the center of each image, modulo W.
+        spans: ``(N, H, 2)`` spans, 0 at first, written.
+    """
+    width = owner.shape[1]
+    for i in range(start, stop):
+        for j in range(width):
+            m = owner[i, j]
+            away = (j - before[m]) % width
+            if spans[m, i, 1] == 0:
+                spans[m, i, 0] = away
+            spans[m, i, 0] = min(spans[m, i, 0], away)
+            spans[m, i, 1] = max(spans[m, i, 1], away + 1)
+        for m in range(len(spans)):
+            spans[m, i, 1] -= spans[m, i, 0]
+            spans[m, i, 0] = (spans[m, i, 0] + before[m]) % width
+
+
 def image_table(
     grid: PinholeGrid,
     shape: tuple[int, int],
@@ -236,7 +282,7 @@ def image_table(
         face = np.zeros((ranks, *size), np.int16 if grid.num_images < 2**15 else np.int32)
         u, v, weight = np.zeros((3, ranks, *size), dtype)
         table = (count, face, u, v, weight)
-        over_rows(kernels.seen_table, *size, (grid.dim, grid.dim), geometry, *table)
+        over_rows(kernels.seen_table, *size, grid.size, geometry, *table)
         return table
 
     count, face, u, v, weight = fill(1 if blend == "nearest" else int(fill(0)[0].max()))
@@ -285,8 +331,8 @@ def find_spans(
         spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)
         matrices = grid.camera_matrix @ grid.world_from_camera[faces].transpose(0, 2, 1)
         u, v, w = matrices[:, None].transpose(2, 0, 1, 3)
-        last = grid.dim - 0.5
-        edges = np.concatenate([u + w / 2, last * w - u, v + w / 2, last * w - v], axis=1)
+        below, right = (side - 0.5 for side in grid.size)
+        edges = np.concatenate([u + w / 2, right * w - u, v + w / 2, below * w - v], axis=1)
         lines = sphere_rays(shape)[1][rows]
         over_rows(write_spans, spans.shape[1], len(faces), edges, lines, shape[1], spans)
         return (spans,)

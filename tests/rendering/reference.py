@@ -1,4 +1,4 @@
-"""A slow float64 reference for tangent images, written from the paper (section 3.2).
+"""A slow float64 reference for tangent images (paper, section 3.2) and level views.
 
 It shares no code with the library, which is tested against it. The mesh comes from trimesh. Instead
 of camera matrices it uses longitude, latitude and the textbook formulas of the gnomonic projection
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 import trimesh
@@ -98,11 +97,11 @@ def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:
 
 
 def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Array) -> Array:
-    """Sample ``(N, d, d, C)`` bilinearly, clamped to the outermost pixel centers."""
-    dim = images.shape[1]
-    row, column = np.clip(row, 0, dim - 1), np.clip(column, 0, dim - 1)
-    top = np.minimum(np.floor(row), dim - 2).astype(int)
-    left = np.minimum(np.floor(column), dim - 2).astype(int)
+    """Sample ``(N, h, w, C)`` bilinearly, clamped to the outermost pixel centers."""
+    height, width = images.shape[1:3]
+    row, column = np.clip(row, 0, height - 1), np.clip(column, 0, width - 1)
+    top = np.minimum(np.floor(row), height - 2).astype(int)
+    left = np.minimum(np.floor(column), width - 2).astype(int)
     down, right = (row - top)[..., None], (column - left)[..., None]
     above = (1 - right) * images[face, top, left] + right * images[face, top, left + 1]
     top = top + 1
@@ -112,23 +111,24 @@ def sample_images(images: Array, face: NDArray[np.int64], row: Array, column: Ar
 
 @dataclass(frozen=True)
 class ReferenceGrid:
-    """All tangent images of a panorama; `rotation` rotates the icosahedron."""
+    """All pinhole images of a panorama, each with north up before `rotation` rotates all."""
 
-    base_level: int
-    level: int
-    dim: int
+    centers_lonlat: Array
+    pitch: float
+    size: tuple[int, int]
     rotation: Array = field(default_factory=lambda: np.eye(3))
 
-    @cached_property
-    def centers_lonlat(self) -> Array:
-        """``(N, 2)`` barycenters of the faces, not rotated."""
-        centers = subdivided_icosahedron(self.base_level).triangles_center
-        return to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
+    @classmethod
+    def tangent(cls, base_level: int, level: int, dim: int, rotation: Array) -> ReferenceGrid:
+        """Images around the barycenters of the faces of the icosahedron.
 
-    @cached_property
-    def pitch(self) -> float:
-        """The paper's half extent (d−1)/(2d)·R_v(b−1) of the default d over its (d−1)/2 pixels."""
-        return vertex_resolution(self.base_level - 1) / 2 ** (self.level - self.base_level)
+        The pitch is the paper's half extent (d−1)/(2d)·R_v(b−1) of the default d over its (d−1)/2
+        pixels.
+        """
+        centers = subdivided_icosahedron(base_level).triangles_center
+        centers = to_lonlat(centers / np.linalg.norm(centers, axis=1, keepdims=True))
+        pitch = vertex_resolution(base_level - 1) / 2 ** (level - base_level)
+        return cls(centers, pitch, (dim, dim), rotation)
 
     def order(self, centers_xyz: ArrayLike) -> NDArray[np.int64]:
         """Return the face of this grid for each center."""
@@ -140,10 +140,10 @@ class ReferenceGrid:
         return order
 
     def lonlat(self, face: int) -> Array:
-        """``(d, d, 2)`` where the pixels of an image are on the sphere: inverse gnomonic."""
+        """``(h, w, 2)`` where the pixels of an image are on the sphere: inverse gnomonic."""
         lon_0, lat_0 = self.centers_lonlat[face]
-        steps = (np.arange(self.dim) - (self.dim - 1) / 2) * self.pitch
-        x, y = np.meshgrid(steps, -steps)
+        down, right = ((np.arange(n) - (n - 1) / 2) * self.pitch for n in self.size)
+        x, y = np.meshgrid(right, -down)
         rho = np.maximum(np.hypot(x, y), 1e-300)
         c = np.arctan(rho)
         lat = np.arcsin(np.cos(c) * np.sin(lat_0) + y * np.sin(c) * np.cos(lat_0) / rho)
@@ -153,7 +153,7 @@ class ReferenceGrid:
         return to_lonlat(to_xyz(np.stack([lon, lat], axis=-1)) @ self.rotation.T)
 
     def forward(self, image: Array, interpolation: str = "bilinear") -> Array:
-        """``(H, W, C)`` -> ``(N, d, d, C)``."""
+        """``(H, W, C)`` -> ``(N, h, w, C)``."""
         faces = range(len(self.centers_lonlat))
         return np.stack([sample_panorama(image, self.lonlat(f), interpolation) for f in faces])
 
@@ -173,18 +173,18 @@ class ReferenceGrid:
         cos_c = np.sin(lat_0) * np.sin(lat) + np.cos(lat_0) * np.cos(lat) * cosine
         x = np.cos(lat) * np.sin(lon - lon_0) / cos_c
         y = (np.cos(lat_0) * np.sin(lat) - np.sin(lat_0) * np.cos(lat) * cosine) / cos_c
-        middle = (self.dim - 1) / 2
-        return middle - y / self.pitch, middle + x / self.pitch
+        row, column = ((n - 1) / 2 for n in self.size)
+        return row - y / self.pitch, column + x / self.pitch
 
     def backward(self, images: Array, shape: tuple[int, int]) -> Array:
-        """``(N, d, d, C)`` -> ``(H, W, C)`` from the image with the nearest center."""
+        """``(N, h, w, C)`` -> ``(H, W, C)`` from the image with the nearest center."""
         owner = self.nearness(shape).argmax(axis=-1)
         return sample_images(images, owner, *self.positions(shape, owner))
 
     def feathered(self, images: Array, shape: tuple[int, int]) -> Array:
         """Mean of all images that see a pixel, weights ((1 − a²)(1 − b²))⁴.
 
-        a and b are the offsets from the middle in half sides d/2, so that the weight falls to 0 at
+        a and b are the offsets from the middle in half sides, so that the weight falls to 0 at
         the outer edges of the outermost pixels.
         """
         total = np.zeros((*shape, images.shape[-1]))
@@ -192,7 +192,10 @@ class ReferenceGrid:
         nearness = self.nearness(shape)
         for face in range(len(images)):
             row, column = self.positions(shape, np.full(shape, face))
-            a, b = ((line - (self.dim - 1) / 2) / (self.dim / 2) for line in (column, row))
+            a, b = (
+                (line - (side - 1) / 2) / (side / 2)
+                for line, side in ((column, self.size[1]), (row, self.size[0]))
+            )
             seen = (nearness[..., face] > 0) & (np.abs(a) < 1) & (np.abs(b) < 1)
             weight = np.sqrt(np.where(seen, (1 - a**2) * (1 - b**2), 0))[..., None]
             total += weight * sample_images(images, np.full(shape, face), row, column)

@@ -15,6 +15,7 @@ from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,
     PerspectiveRepresentation,
+    RingRepresentation,
     TangentRepresentation,
     device_mosaic,
 )
@@ -44,6 +45,20 @@ SETS: dict[str, tuple[Callable[[Blend], Any], tuple[int, int]]] = {
     "cube": (lambda _: CubemapRepresentation(6).view_sets(), (128, 256)),
     "cube with a margin": (
         lambda _: CubemapRepresentation(5, margin=7).with_rotation(TILT).view_sets(),
+        (70, 140),
+    ),
+    "rings": (
+        lambda blend: (
+            RingRepresentation(
+                5,
+                [{"pitch": k, "views": 6} for k in (0, 45, -45)],
+                (90, 80),
+                blend=blend,
+                rotations=2,
+            )
+            .with_rotation(TILT)
+            .view_sets()
+        ),
         (70, 140),
     ),
     "equirectangular": (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tangent_train.geometry import (
     PinholeGrid,
+    RingGrid,
     TangentGrid,
     camera_matrix_from_fov,
     equirect_directions,
@@ -29,18 +30,20 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.views import PinholeViews
 
+RINGS = [{"pitch": pitch, "views": 5} for pitch in (0, 50, -50)]
 GRIDS = [
     (TangentGrid(0, 5), (64, 128)),
     (TangentGrid(1, 6, rotation=random_rotation(np.random.default_rng(1))), (101, 203)),
     (TangentGrid(2, 6, dim=TangentGrid.least_dim(2, 6)), (48, 96)),
     (TangentGrid(1, 5, dim=40), (30, 61)),
     (TangentGrid(0, 4, rotation=rotation_about((1, 0, 0), math.pi / 2)), (32, 64)),
+    (RingGrid(RINGS, (110, 90), (20, 31), random_rotation(np.random.default_rng(2))), (45, 90)),
 ]
 
 
 def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
     generator = torch.Generator().manual_seed(grid.num_images)
-    return 3 * torch.randn(grid.num_images, classes, grid.dim, grid.dim, generator=generator)
+    return 3 * torch.randn(grid.num_images, classes, *grid.size, generator=generator)
 
 
 def _added(result: ScoreMosaic, scores: torch.Tensor, grid: PinholeGrid) -> ScoreMosaic:
@@ -113,7 +116,7 @@ def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() ->
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_infinite_and_nan_scores_have_no_probability(blend: Blend, backend: Any) -> None:
     grid, shape = GRIDS[0]
-    scores = torch.full((20, 300, grid.dim, grid.dim), -torch.inf)
+    scores = torch.full((20, 300, *grid.size), -torch.inf)
     scores[:, 2], scores[:, 1], scores[:, 299] = torch.nan, 0, 0
     result = ScoreMosaic(shape, 300, blend, averaged=True, backend=backend)
     found = _probabilities(_added(result, scores, grid))

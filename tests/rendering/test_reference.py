@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -12,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, rotation_about
+from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid, rotation_about
 from tangent_train.rendering import (
     Blend,
     Interpolation,
@@ -48,6 +49,16 @@ class Case(NamedTuple):
     rotated: bool = False
 
 
+class RingCase(NamedTuple):
+    """A set of level views, by pitch and number, and a panorama size."""
+
+    rings: tuple[tuple[float, int], ...]
+    size: tuple[int, int]
+    fov_deg: tuple[float, float]
+    shape: tuple[int, int]
+    rotated: bool = False
+
+
 CASES = [
     Case(0, 4, None, (50, 100)),  # the paper's extent
     Case(0, 5, 24, (63, 126)),  # cropped to the least; odd rows: one on the equator
@@ -55,28 +66,42 @@ CASES = [
     Case(1, 4, None, (50, 100), rotated=True),
     Case(1, 5, 13, (63, 126)),
     Case(2, 5, None, (32, 64)),
+    RingCase(((0, 8), (40, 5), (-40, 5)), (16, 16), (100, 100), (50, 100)),
+    RingCase(((0, 7), (55, 4), (-55, 4)), (20, 15), (70, 90), (33, 67), rotated=True),
+    RingCase(((90, 1), (25, 5), (-35, 3)), (16, 25), (130, 110), (33, 67)),
 ]
 
 
 class Pair(NamedTuple):
     """A grid, its reference, and the face of the reference for each face of the grid."""
 
-    grid: TangentGrid
+    grid: PinholeGrid
     reference: ReferenceGrid
     order: NDArray[np.int64]
 
 
 @pytest.fixture(params=CASES, ids=str)
-def case(request: pytest.FixtureRequest) -> Case:
-    assert isinstance(request.param, Case)
+def case(request: pytest.FixtureRequest) -> Case | RingCase:
+    assert isinstance(request.param, Case | RingCase)
     return request.param
 
 
 @lru_cache
-def pair_of(case: Case) -> Pair:
-    rotation = ROTATION if case.rotated else np.eye(3)
-    grid = TangentGrid(case.base_level, case.level, case.dim, ROTATION if case.rotated else None)
-    reference = ReferenceGrid(case.base_level, case.level, grid.dim, rotation)
+def pair_of(case: Case | RingCase) -> Pair:
+    rotation, of_grid = (ROTATION, ROTATION) if case.rotated else (np.eye(3), None)
+    grid: PinholeGrid
+    if isinstance(case, RingCase):
+        rings = [{"pitch": pitch, "views": views} for pitch, views in case.rings]
+        grid = RingGrid(rings, case.fov_deg, case.size, of_grid, by_owners=True)
+        across, down = (math.tan(math.radians(angle / 2)) for angle in case.fov_deg)
+        pitch = max(2 * down / case.size[0], 2 * across / case.size[1])
+        centers = [
+            (k * 2 * math.pi / n, math.radians(lat)) for lat, n in case.rings for k in range(n)
+        ]
+        reference = ReferenceGrid(np.array(centers), pitch, case.size, rotation)
+    else:
+        grid = TangentGrid(case.base_level, case.level, case.dim, of_grid)
+        reference = ReferenceGrid.tangent(case.base_level, case.level, grid.dim, rotation)
     return Pair(grid, reference, reference.order(grid.centers_xyz))
 
 
@@ -92,10 +117,12 @@ def waves(shape: tuple[int, int]) -> Array:
     return np.asarray((np.stack(channels, axis=-1) + 1) / 2)
 
 
-def certain_pixels(pair: Pair, case: Case, interpolation: Interpolation) -> NDArray[np.bool_]:
+def certain_pixels(
+    pair: Pair, case: Case | RingCase, interpolation: Interpolation
+) -> NDArray[np.bool_]:
     """Pixels ``(n, d, d)`` of the grid's images that do not depend on rounding."""
     if interpolation == "bilinear":
-        return np.ones((len(pair.order), pair.grid.dim, pair.grid.dim), bool)
+        return np.ones((len(pair.order), *pair.grid.size), bool)
     lonlat = np.stack([pair.reference.lonlat(face) for face in pair.order])
     # Nearest takes a pixel of an image smaller than 2^7: float32 rounds positions to 2^-17.
     certain = certain_nearest(lonlat, case.shape, margin=1e-4)
@@ -104,7 +131,9 @@ def certain_pixels(pair: Pair, case: Case, interpolation: Interpolation) -> NDAr
 
 
 @pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
-def test_tensors_are_rendered_like_the_reference(case: Case, interpolation: Interpolation) -> None:
+def test_tensors_are_rendered_like_the_reference(
+    case: Case | RingCase, interpolation: Interpolation
+) -> None:
     pair = pair_of(case)
     image = noise(*case.shape, 3)
     expected = pair.reference.forward(image, interpolation)[pair.order]
@@ -113,13 +142,15 @@ def test_tensors_are_rendered_like_the_reference(case: Case, interpolation: Inte
         tensor = torch.from_numpy(image).permute(2, 0, 1).to(dtype)
         result = equirect_to_tangent(tensor, pair.grid, interpolation=interpolation)
         assert result.dtype == dtype
-        assert result.shape == (len(pair.order), 3, pair.grid.dim, pair.grid.dim)
+        assert result.shape == (len(pair.order), 3, *pair.grid.size)
         error = np.abs(result.permute(0, 2, 3, 1).double().numpy() - expected)
         assert error[certain].max() < tolerance
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_forward_of_labels_is_the_nearest_label(case: Case, dtype: type[np.integer]) -> None:
+def test_forward_of_labels_is_the_nearest_label(
+    case: Case | RingCase, dtype: type[np.integer]
+) -> None:
     pair = pair_of(case)
     labels = (noise(*case.shape) * np.iinfo(dtype).max).astype(dtype)
     certain = certain_pixels(pair, case, "nearest")
@@ -191,9 +222,9 @@ def clear_pixels(pair: Pair, shape: tuple[int, int], blend: Blend) -> NDArray[np
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_tensors_are_rendered_back_like_the_reference(case: Case, blend: Blend) -> None:
+def test_tensors_are_rendered_back_like_the_reference(case: Case | RingCase, blend: Blend) -> None:
     pair = pair_of(case)
-    images = noise(len(pair.order), pair.grid.dim, pair.grid.dim, 3)
+    images = noise(len(pair.order), *pair.grid.size, 3)
     clear = clear_pixels(pair, case.shape, blend)
     expected = rendered_back(pair, images, case.shape, blend)[clear]
     for dtype, tolerance in ((torch.float64, 1e-9), (torch.float32, 2e-5)):
@@ -206,7 +237,7 @@ def test_tensors_are_rendered_back_like_the_reference(case: Case, blend: Blend) 
     np.testing.assert_allclose(arrays[clear], expected, atol=2e-5)
 
 
-def test_nearest_is_the_nearest_pixel(case: Case) -> None:
+def test_nearest_is_the_nearest_pixel(case: Case | RingCase) -> None:
     grid, reference, order = pair_of(case)
     owner = reference.nearness(case.shape).argmax(axis=-1)
     places = np.stack(reference.positions(case.shape, owner))
@@ -214,8 +245,9 @@ def test_nearest_is_the_nearest_pixel(case: Case) -> None:
     certain = reference.clear(case.shape) & (np.abs(places % 1 - 0.5) > 1e-4).all(axis=0)
     assert certain.mean() > 0.9
     # Every pixel has a value of its own.
-    images = np.arange(grid.num_images * grid.dim**2).reshape(-1, grid.dim, grid.dim)
-    row, column = np.floor(places + 0.5).clip(0, grid.dim - 1).astype(int)
+    images = np.arange(grid.num_images * math.prod(grid.size)).reshape(-1, *grid.size)
+    last = np.array(grid.size)[:, None, None] - 1
+    row, column = np.floor(places + 0.5).clip(0, last).astype(int)
     expected = images[np.argsort(order)[owner], row, column]
     found = tangent_to_equirect(images, grid, case.shape, interpolation="nearest")
     assert found.dtype == images.dtype
@@ -223,9 +255,9 @@ def test_nearest_is_the_nearest_pixel(case: Case) -> None:
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_labels_are_the_best_interpolated_logits(case: Case, blend: Blend) -> None:
+def test_labels_are_the_best_interpolated_logits(case: Case | RingCase, blend: Blend) -> None:
     pair = pair_of(case)
-    logits = noise(len(pair.order), pair.grid.dim, pair.grid.dim, CLASSES)
+    logits = noise(len(pair.order), *pair.grid.size, CLASSES)
     rendered = rendered_back(pair, logits, case.shape, blend)
     clear = clear_pixels(pair, case.shape, blend)
     for dtype, margin in ((torch.float64, 1e-9), (torch.float32, 4e-5)):

@@ -6,7 +6,7 @@ import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import ClassVar, Self, TypeVar
+from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ _Grid = TypeVar("_Grid", bound=PinholeGrid)
 
 
 class PinholeRepresentation:
-    """Pinhole images around the center: base of tangent images and cube maps.
+    """Pinhole images around the center: base of tangent images, level views and cube maps.
 
     Args:
         grid: Images of `level`, not rotated.
@@ -50,7 +50,7 @@ class PinholeRepresentation:
         SettingError: A setting is invalid.
     """
 
-    symmetry_deg: ClassVar[float]
+    symmetry_deg: float
     """Rotation about the vertical after which the images cover the same directions again."""
 
     def __init__(
@@ -68,6 +68,13 @@ class PinholeRepresentation:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
         check_choice("representation.blend", blend, ("nearest", "feather"))
+        count = grid.num_images
+        if faces_per_panorama is not None and not 1 <= faces_per_panorama <= count:
+            raise SettingError(
+                "representation.faces_per_panorama",
+                found=faces_per_panorama,
+                expected=f"1 to {count}, or null for all views",
+            )
         self.grid: PinholeGrid = grid
         self.random_rotation = random_rotation
         self.mirror = mirror
@@ -81,7 +88,7 @@ class PinholeRepresentation:
     @property
     def image_size(self) -> tuple[int, int]:
         """Rows and columns of the images."""
-        return self.grid.dim, self.grid.dim
+        return self.grid.size
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
         """Return the same representation in rotated directions R·d."""
@@ -186,13 +193,6 @@ class TangentRepresentation(PinholeRepresentation):
             least = TangentGrid.least_dim(base_level, level)
             dim = math.ceil(least / crop_multiple) * crop_multiple
         grid = TangentGrid(base_level, level, dim)
-        count = grid.num_images
-        if faces_per_panorama is not None and not 1 <= faces_per_panorama <= count:
-            raise SettingError(
-                "representation.faces_per_panorama",
-                found=faces_per_panorama,
-                expected=f"1 to {count} at base level {base_level}, or null for all",
-            )
         super().__init__(
             grid,
             [TangentGrid(base_level, other, grid.dim) for other in level_list(levels, level)],

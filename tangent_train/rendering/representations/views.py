@@ -21,7 +21,7 @@ from tangent_train.geometry import PinholeGrid, SphereArea
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.tables import canvas_geometry, find_spans, owners
+from tangent_train.rendering.tables import canvas_geometry, find_owned_spans, owners
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
@@ -183,9 +183,9 @@ class PinholeViews(Views):
     def rays(self) -> NDArray[np.float32]:
         """Return camera axes, scaled to the images' edges; see `Views`."""
         grid = self.grid
-        edge = grid.dim / 2 * grid.pitch
+        x, y = grid.half_size
         axes = grid.world_from_camera[self.chosen]
-        return (axes * (-edge if self.mirrored else edge, edge, 1)).astype(np.float32)
+        return (axes * (-x if self.mirrored else x, y, 1)).astype(np.float32)
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
         """See `Views`."""
@@ -199,6 +199,4 @@ class PinholeViews(Views):
 
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """See `Views`."""
-        grid = self.grid
-        beyond = grid.widened(-((grid.dim - grid.owned_dim) // 2))
-        return find_spans(beyond, self.chosen, shape, slice(0, shape[0]))
+        return find_owned_spans(self.grid, self.chosen, shape)

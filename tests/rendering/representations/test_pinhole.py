@@ -10,12 +10,19 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_directions, rotation_about
+from tangent_train.geometry import (
+    PinholeGrid,
+    RingGrid,
+    TangentGrid,
+    equirect_directions,
+    rotation_about,
+)
 from tangent_train.rendering import (
     Blend,
     CubemapRepresentation,
     EquirectRepresentation,
     Representation,
+    RingRepresentation,
     TangentRepresentation,
     equirect_to_tangent,
     rotate_equirect,
@@ -55,7 +62,11 @@ def _rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
+RINGS = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "views": 5}]
+
 REPRESENTATIONS: list[Representation] = [
+    RingRepresentation(5, RINGS, 100),
+    RingRepresentation(5, RINGS, (110, 100), 40, blend="nearest", mirror=True),
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
     TangentRepresentation(0, 5, crop_multiple=8, random_rotation="so3", mirror=True),
@@ -89,6 +100,7 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
         TangentRepresentation(0, 5, faces_per_panorama=5, random_rotation="so3", mirror=True),
         CubemapRepresentation(5, random_rotation="yaw", mirror=True),
         CubemapRepresentation(5, random_rotation="so3"),
+        RingRepresentation(5, RINGS, 100, None, 6, "yaw", mirror=True),
         EquirectRepresentation(5, crop_deg=60, random_rotation="yaw", mirror=True),
         EquirectRepresentation(5, random_rotation="so3"),
     ],
@@ -167,6 +179,14 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (TangentRepresentation, {"random_rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
         (TangentRepresentation, {"blend": "average"}, "'nearest' or 'feather'"),
         (TangentRepresentation, {"rotations": 0}, "rotations: found 0"),
+        (RingRepresentation, {"faces_per_panorama": 19}, "found 19; expected 1 to 18"),
+        (RingRepresentation, {"dim": [32]}, r"dim: found \[32\]"),
+        (RingRepresentation, {"fov": 180}, r"fov: found \[180, 180\]; expected 0 to 170"),
+        (RingRepresentation, {"rings": []}, r"rings: found \[\]; expected one ring"),
+        (RingRepresentation, {"rings": [{"pitch": 91, "views": 8}]}, "pitch: -90 to 90"),
+        (RingRepresentation, {"rings": [{"pitch": 0, "view": 8}]}, "{'pitch': 0, 'view': 8}"),
+        (RingRepresentation, {"rings": [{"pitch": 0, "views": 0}]}, "views of a ring: found 0"),
+        (RingRepresentation, {"rings": [{"pitch": 90, "views": 2}]}, "the same direction"),
         (EquirectRepresentation, {"crop_deg": 0}, "crop_deg: found 0; expected 0 to 360"),
         (EquirectRepresentation, {"crop_deg": 361}, "crop_deg: found 361"),
         (EquirectRepresentation, {"rows": 0}, "rows: found 0"),
@@ -175,9 +195,12 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
     ],
 )
 def test_impossible_settings_are_refused(made: Any, settings: dict[str, Any], message: str) -> None:
-    levels = {"base_level": 0} if made is TangentRepresentation else {}
+    needed: dict[Any, dict[str, Any]] = {
+        TangentRepresentation: {"base_level": 0},
+        RingRepresentation: {"rings": RINGS, "fov": 100},
+    }
     with pytest.raises(SettingError, match=message):
-        made(**levels, level=5, **settings)
+        made(**needed.get(made, {}) | {"level": 5} | settings)
 
 
 @pytest.mark.parametrize("representation", REPRESENTATIONS)
@@ -276,12 +299,13 @@ def test_equirectangular_averages_have_the_highest_mean_probability() -> None:
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_rays_are_the_directions_of_the_pixels(mirrored: bool) -> None:
-    grid = TangentGrid(1, 5, 20, TILT)
-    faces = np.array([3, 77, 12])
+@pytest.mark.parametrize(
+    "grid", [TangentGrid(1, 5, 20, TILT), RingGrid(RINGS, (110, 100), (20, 33), TILT)]
+)
+def test_rays_are_the_directions_of_the_pixels(grid: PinholeGrid, mirrored: bool) -> None:
+    faces = np.array([3, 17, 12])
     views = PinholeViews(grid, faces, mirrored)
-    edges = (2 * np.arange(20) + 1) / 20 - 1
-    x, y = np.meshgrid(edges, edges)
+    y, x = np.meshgrid(*((2 * np.arange(n) + 1) / n - 1 for n in grid.size), indexing="ij")
     seen = unit(np.einsum("nwc,ijc->nijw", views.rays(), np.stack([x, y, 0 * x + 1], axis=-1)))
     expected = grid.directions(faces)
     np.testing.assert_allclose(seen, expected[:, :, ::-1] if mirrored else expected, atol=1e-6)

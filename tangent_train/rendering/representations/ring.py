@@ -1,0 +1,111 @@
+"""Level views in rings as a representation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from tangent_train.errors import SettingError, at_least
+from tangent_train.geometry import RingGrid, SphereArea, TangentGrid
+from tangent_train.geometry.ring import checked_rings, half_extents
+from tangent_train.registry import registered
+from tangent_train.rendering.checks import Blend
+from tangent_train.rendering.representations.pinhole import PinholeRepresentation
+from tangent_train.rendering.representations.views import RotationAugmentation
+
+_STRIDE = 32
+"""Rows are a multiple of this where columns are: the stride of most networks."""
+
+
+@registered
+class RingRepresentation(PinholeRepresentation):
+    """Level views in rings, with a level horizon as in photos.
+
+    Args:
+        level: Level s, which sets the angular resolution of the views.
+        rings: Rings of views: ``pitch`` (latitude of the centers in degrees) and number of
+            ``views`` around the vertical.
+        fov: Horizontal and vertical field of view in degrees, or one number for both.
+        dim: Rows and columns in pixels, or only the columns; see `ring_size` for the default.
+            Pixels are square: rows and columns of another ratio than `fov` show more than it.
+        faces_per_panorama: Number of random views in a training sample; all by default.
+        random_rotation: Rotation of the views as a whole in training.
+        mirror: True to mirror half of the training samples left to right.
+        blend: Blending of overlapping views, see `TangentRepresentation`.
+        erp_height: Rows of the panorama, default `equirect_shape(level)`.
+        rotations: Number of rotations about the vertical to average over. They divide the step
+            between neighbors of the ring with most views: 2 rotations are half a step apart.
+        area: West, east, south and north in degrees of the area that the views must cover; the
+            sphere by default.
+
+    Raises:
+        SettingError: A setting is invalid, or the views miss a direction.
+    """
+
+    grid: RingGrid
+
+    def __init__(
+        self,
+        level: int,
+        rings: Sequence[Mapping[str, float]],
+        fov: float | Sequence[float],
+        dim: int | Sequence[int] | None = None,
+        faces_per_panorama: int | None = None,
+        random_rotation: RotationAugmentation = "none",
+        mirror: bool = False,
+        blend: Blend = "feather",
+        erp_height: int | None = None,
+        rotations: int = 1,
+        area: Sequence[float] | None = None,
+    ) -> None:
+        across, *rest = [fov] if isinstance(fov, int | float) else fov
+        fov_deg = (across, rest[0] if rest else across)
+        self.symmetry_deg = 360 / max(ring.views for ring in checked_rings(rings))
+        size = ring_size(level, fov_deg, dim)
+        covered = None if area is None else SphereArea.of(area, "representation.area")
+        grid = RingGrid(rings, fov_deg, size, None, covered, by_owners=blend == "nearest")
+        super().__init__(
+            grid,
+            [grid],
+            level,
+            random_rotation,
+            mirror,
+            erp_height,
+            blend,
+            rotations,
+            faces_per_panorama,
+        )
+
+
+def ring_size(
+    level: int, fov_deg: tuple[float, float], dim: int | Sequence[int] | None = None
+) -> tuple[int, int]:
+    """Return rows and columns of level views.
+
+    By default, the middle of a view has about as many pixels per degree as the tangent images of
+    base level 0: the columns are rounded to a multiple of 2^(s−2). The rows follow from the field
+    of view, rounded up to a multiple of the largest power of two, up to 32, that divides the
+    columns.
+
+    Args:
+        level: Level s of the panorama.
+        fov_deg: Horizontal and vertical field of view in degrees.
+        dim: Rows and columns, or only the columns; None for the default.
+
+    Raises:
+        SettingError: A setting is invalid.
+
+    >>> ring_size(9, (100, 100)), ring_size(9, (100, 70)), ring_size(9, (60, 60), 640)
+    ((512, 512), (320, 512), (640, 640))
+    """
+    across, down = half_extents(fov_deg)
+    if isinstance(dim, Sequence):
+        if len(dim) != 2:
+            raise SettingError("dim", found=list(dim), expected="null, columns or [rows, columns]")
+        return dim[0], dim[1]
+    if dim is None:
+        step = 2 ** max(0, level - 2)
+        dim = max(1, round(2 * across / TangentGrid(0, level).pitch / step)) * step
+    columns = at_least("dim", dim, 2)
+    multiple = math.gcd(columns, _STRIDE)
+    return math.ceil(columns * down / across / multiple - 1e-9) * multiple, columns
