@@ -127,8 +127,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
         target = torch.tensor(image.target(self.representation))
-        area = (getattr(image, "area", None) or _WHOLE).numbers
-        return EvaluationSample(images, target, *map(torch.from_numpy, (rotation, area)), index)
+        area = torch.from_numpy((getattr(image, "area", None) or _WHOLE).numbers)
+        return EvaluationSample(images, target, torch.from_numpy(rotation), area, index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

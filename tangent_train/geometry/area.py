@@ -78,7 +78,8 @@ class SphereArea:
         """Return the area of `numbers`."""
         rotation = numbers[_ANGLES:].reshape(3, 3)
         is_rotated = not np.array_equal(rotation, np.eye(3))
-        return cls(*numbers[:_ANGLES].tolist(), rotation if is_rotated else None)
+        west, east, south, north = numbers[:_ANGLES].tolist()
+        return cls(west, east, south, north, rotation if is_rotated else None)
 
     @property
     def width_deg(self) -> float:

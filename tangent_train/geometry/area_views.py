@@ -11,9 +11,6 @@ from numpy.typing import NDArray
 from tangent_train.geometry.area import SphereArea
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 
-_LEAST_SHARE = 0.5
-"""Images with a smaller share of their pixels inside the area are left out, where possible."""
-
 _STEP_DEG = 1.0
 _COARSE_DEG = 3.0
 _LINES = 16
@@ -26,8 +23,8 @@ _ROUNDING = 1e-6
 def views_of_area(grid: PinholeGrid, area: SphereArea, *, by_owners: bool) -> NDArray[np.int64]:
     """Return the images of a grid that are needed for an area.
 
-    Images with less than half of their pixels inside the area are left out, those that see least of
-    it first, as long as the others cover what they cover.
+    These are all images whose center lies in the area. Others are left out, those with the smallest
+    share of their pixels in the area first, as long as the rest covers all of it.
 
     Args:
         grid: Images that cover the area.
@@ -72,10 +69,10 @@ def _needed(grid: PinholeGrid, area: SphereArea, by_owners: bool) -> NDArray[np.
     inner = insets >= (-_ROUNDING if by_owners else math.sin(math.radians(0.75 * step)))
     nearness = (grid.centers_xyz @ directions.T).astype(np.float32)
     owner = nearness.argmax(axis=0)
-    kept = np.ones(grid.num_images, np.bool_)
+    kept, central = np.ones(grid.num_images, np.bool_), area.contains(grid.centers_xyz)
     for image in np.argsort(shares, kind="stable"):
-        if shares[image] >= _LEAST_SHARE:
-            break
+        if central[image]:
+            continue
         kept[image] = False
         affected = np.flatnonzero(owner == image if by_owners else insets[image] >= 0)
         of_others = np.where(kept[:, None], nearness[:, affected], -2.0).argmax(axis=0)

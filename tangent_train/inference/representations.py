@@ -101,7 +101,7 @@ class PanoramaViews:
         self.representation = _built(trained, settings)
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
-        self._fill = fill
+        self._trained, self._fill = trained, fill
 
     def __str__(self) -> str:
         """Number and size of the views; of tangent images also angle and resolution by level."""
@@ -132,7 +132,9 @@ class PanoramaViews:
         representation: Representation = self.representation
         rotation, area = None, image.area
         if area is not None:
-            representation = representation.limited_to(area.sphere)
+            limited = representation.limited_to(area.sphere)
+            if _fits(self._trained, limited.image_size):
+                representation = limited
             image = replace(image, rgb=area.filled(image.rgb, self._fill))
         if image.up is not None:
             rotation = upright_rotation(image.up)
@@ -310,8 +312,7 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         SettingError: The network does not support the size.
     """
     fixed, multiple = trained.fixed_size, trained.size_multiple
-    small = fixed is not None and any(n < least for n, least in zip(size, fixed, strict=True))
-    if small or (fixed is None and any(side % multiple for side in size)):
+    if not _fits(trained, size):
         raise SettingError(
             "levels and base_level",
             found=f"images of {width_height(size)}",
@@ -320,6 +321,13 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
             else f"multiples of {multiple}, the network's stride",
             remedy="Choose other levels, or leave both as trained.",
         )
+
+
+def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
+    """Return True if a network supports images of rows and columns."""
+    if trained.fixed_size is not None:
+        return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))
+    return not any(side % trained.size_multiple for side in size)
 
 
 def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:

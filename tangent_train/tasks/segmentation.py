@@ -350,7 +350,7 @@ class SegmentationTask(Task):
         self, name: str, image: Any, target: Tensor, prediction: Tensor
     ) -> EncodedImage:
         """Return the image with its true and predicted labels."""
-        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
+        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation, cut=False)
         classes = len(self.class_names)
         counts = count_image(prediction.cpu(), target.cpu(), classes).pixels
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""

@@ -22,6 +22,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.geometry.area_views import best_views, views_of_area
+from tangent_train.geometry.coverage import check_coverage
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
@@ -42,6 +43,7 @@ class PinholeRepresentation:
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over.
         faces_per_panorama: Number of random images in a training sample; all by default.
+        is_partial: True if the images do not cover the sphere.
 
     Attributes:
         grid: Images of `level`, not rotated.
@@ -64,6 +66,7 @@ class PinholeRepresentation:
         blend: Blend,
         rotations: int,
         faces_per_panorama: int | None = None,
+        is_partial: bool = False,
     ) -> None:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
@@ -84,6 +87,7 @@ class PinholeRepresentation:
         self._grids = grids
         self._rotations = vertical_rotations(rotations, self.symmetry_deg)
         self._area: SphereArea | None = None
+        self._is_partial = is_partial
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -104,9 +108,14 @@ class PinholeRepresentation:
         Evaluation renders those of `views_of_area`. A training sample contains as many images as
         the unrotated area needs, so that samples of one batch have equal numbers: those of
         `views_of_area`, or under rotation those that see most.
+
+        Raises:
+            SettingError: The images of a partial representation do not cover the area.
         """
         limited = copy.copy(self)
         limited._area = None if area is None or area.is_whole else area
+        if self._is_partial:
+            limited.view_sets()
         return limited
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
@@ -138,6 +147,9 @@ class PinholeRepresentation:
     def view_sets(self) -> list[PinholeViews]:
         """Return all images of every level in every rotation."""
         grids = [_rotated(grid, r) for grid in self._grids for r in self._rotations]
+        if self._is_partial:
+            for grid in grids:
+                check_coverage(grid, self._area, by_owners=self.blend == "nearest")
         if self._area is not None:
             grids = [grid.subset(self._needed(grid, self._area)) for grid in grids]
         return [PinholeViews(grid) for grid in grids]

@@ -74,6 +74,7 @@ class RingRepresentation(PinholeRepresentation):
             blend,
             rotations,
             faces_per_panorama,
+            covered is not None,
         )
 
 
