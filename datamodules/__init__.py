@@ -15,12 +15,15 @@ if TYPE_CHECKING:
     from datamodules.densepass.panoramas import DensePASS as DensePASS
     from datamodules.folder.labeled import FolderPanoramas as FolderPanoramas
     from datamodules.folder.labeled import FolderPhotos as FolderPhotos
+    from datamodules.matterport360.panoramas import Matterport360 as Matterport360
     from datamodules.modelnet40.datamodule import ModelNet40 as ModelNet40
     from datamodules.stanford2d3ds.pairs import StanfordPairs as StanfordPairs
     from datamodules.stanford2d3ds.panoramas import Stanford2D3DS as Stanford2D3DS
     from datamodules.stanford2d3ds.panoramas import (
         Stanford2D3DSPerspective as Stanford2D3DSPerspective,
     )
+    from datamodules.structured3d.rooms import Structured3D as Structured3D
+    from datamodules.structured3d.rooms import Structured3DPerspective as Structured3DPerspective
     from datamodules.synpass.panoramas import SynPASS as SynPASS
     from datamodules.synthia.omnisynthia import OmniSynthia as OmniSynthia
     from datamodules.synthia.omnisynthia import SynthiaPerspective as SynthiaPerspective
@@ -36,9 +39,11 @@ _CLASSES = {
     "core.panorama_pairs": ("ImagePairs",),
     "densepass.panoramas": ("DensePASS",),
     "folder.labeled": ("FolderPanoramas", "FolderPhotos"),
+    "matterport360.panoramas": ("Matterport360",),
     "modelnet40.datamodule": ("ModelNet40",),
     "stanford2d3ds.pairs": ("StanfordPairs",),
     "stanford2d3ds.panoramas": ("Stanford2D3DS", "Stanford2D3DSPerspective"),
+    "structured3d.rooms": ("Structured3D", "Structured3DPerspective"),
     "synpass.panoramas": ("SynPASS",),
     "synthia.omnisynthia": ("OmniSynthia", "SynthiaPerspective"),
     "synthrooms.datamodule": ("SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective"),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
+from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
 
 
 class World(NamedTuple):
@@ -14,7 +16,7 @@ class World(NamedTuple):
 
     Attributes:
         write: Writes the files into a new folder and returns it.
-        small: Settings that let a run take a second, with which the files fit.
+        small: Settings of panoramas that let a run take a second, with which the files fit.
     """
 
     write: Callable[[Path], Path]
@@ -22,6 +24,10 @@ class World(NamedTuple):
 
 
 WORLDS: Mapping[str, World] = {
+    "Cityscapes": World(write_cityscapes),
+    "DensePASS": World(
+        partial(write_densepass, names=(1,)), ("level=6", "photos.representation.dim=[16,32]")
+    ),
     "Stanford2D3DS": World(fabricate),
 }
 """By the class of the data set, the last part of ``data._target_``."""

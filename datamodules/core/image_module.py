@@ -100,8 +100,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         self.class_set = None if chosen is None else self.class_sets[chosen]
         if self.class_set is not None:
             self.class_names = ("unknown", *self.class_set.names)
-        known = ("labels", "any_black", "all_black")
-        self.require("unknown", self.unknown in known, "labels, any_black or all_black")
+        self.require_one_of("unknown", "labels", "any_black", "all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         given = self.normalization or self.normalizations[with_depth]

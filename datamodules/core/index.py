@@ -195,3 +195,31 @@ def draw_groups(
     count = min(max(1, round(fraction * len(ordered))), len(ordered) - 1)
     order = np.random.default_rng(seed).permutation(len(ordered))
     return {ordered[place] for place in order[:count]}
+
+
+def published_splits(
+    splits: Mapping[Split, Sequence[_Item]],
+    test_split: Literal["test", "val"],
+    fraction: float,
+    seed: int,
+) -> dict[Split, Sequence[_Item]]:
+    """Return published splits, with one of them for the test.
+
+    If the published validation items are tested, scenes are drawn from the training items for
+    validation, so that nothing is selected on the tested items.
+
+    Args:
+        splits: Items of each published split, named ``<scene>/…``.
+        test_split: Published split to test on.
+        fraction: Share of the training scenes to draw; 0 for no validation in either case.
+        seed: Seed of the draw.
+    """
+    if test_split == "test":
+        return dict(splits) if fraction else {**splits, "val": []}
+    scenes = [item.name.partition("/")[0] for item in splits["train"]]
+    held = draw_groups(scenes, fraction, seed) if fraction else set()
+    train, val = (
+        [item for item, scene in zip(splits["train"], scenes, strict=True) if (scene in held) == of]
+        for of in (False, True)
+    )
+    return {"train": train, "val": val, "test": splits["val"]}

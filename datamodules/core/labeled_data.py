@@ -159,6 +159,14 @@ class LabeledData(ABC, Generic[_Item]):
             found = list(found) if isinstance(found, tuple) else found
             raise SettingError(f"data.{setting}", found=found, expected=expected, remedy=remedy)
 
+    def require_one_of(self, setting: str, *options: str) -> None:
+        """Refuse other values of a setting ``data.<setting>`` than these.
+
+        Raises:
+            SettingError: The value is invalid.
+        """
+        self.require(setting, getattr(self, setting) in options, " or ".join(options))
+
     def require_representation(self, attribute: str, choice: str) -> None:
         """Refuse a representation that is made for another kind of images.
 
@@ -277,6 +285,8 @@ class LabeledData(ABC, Generic[_Item]):
         """
         problems = Problems()
         index = self._find_checked(problems)
+        for warning in problems.warnings:
+            print_on_rank_zero(f"Warning: {warning}")
         if not self.skip_broken:
             if sample and self.store is None:
                 index.read_some(self.seed, problems)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import ImageFiles, ImageReader, resize_nearest
+from datamodules.core.panoramas import ImageFiles, ImageReader, resize_nearest, units_to_steps
 from datamodules.images.pixel_files import read_image_size, read_pixels, read_rgb
 from datamodules.images.png import check_png
 from tangent_train.errors import DataError
@@ -40,15 +40,23 @@ class NumberedReader(ImageReader):
 
     Attributes:
         table: Label of every number in a label image, see `number_table`.
+        units_per_m: Units of 16-bit depth in a meter, 1000 for millimeters; 0 without depth.
     """
 
     table: NDArray[np.uint8]
+    units_per_m: int = field(default=0, kw_only=True)
+
+    @property
+    def settings(self) -> dict[str, str]:
+        """See `ImageReader`: the label of every number."""
+        return {"table": self.table.tobytes().hex()}
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
         """See `ImageReader`."""
         if part == "rgb":
             return read_image_size(path)
-        header = check_png(path, 8, ("gray", "palette"))
+        is_depth = part == "depth"
+        header = check_png(path, 16 if is_depth else 8, ("gray", *["palette"] * (not is_depth)))
         return header.height, header.width
 
     def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
@@ -69,3 +77,7 @@ class NumberedReader(ImageReader):
                 remedy="Use the label images as released; do not convert them.",
             )
         return labels if shape is None else resize_nearest(labels, shape)
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Read depth in steps of 1/512 m."""
+        return units_to_steps(read_pixels(files.parts["depth"], indices=True), self.units_per_m)

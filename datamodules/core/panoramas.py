@@ -268,6 +268,17 @@ def meters_to_steps(depth_m: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.maximum(steps.astype(np.uint16), depth_m > 0)
 
 
+def units_to_steps(stored: NDArray[np.uint16], units_per_m: int) -> NDArray[np.uint16]:
+    """Convert 16-bit depth in integer units to steps of 1/512 m, see `meters_to_steps`.
+
+    >>> units_to_steps(np.array([0, 1, 4000, 65535], np.uint16), 4000).tolist()
+    [0, 1, 512, 8388]
+    """
+    # In integers, because float32 would round some values of 16 bits to the wrong step.
+    steps = (stored.astype(np.int64) * 2 * STEPS_PER_M + units_per_m) // (2 * units_per_m)
+    return np.maximum(np.minimum(steps, _MOST_STEPS).astype(np.uint16), stored > 0)
+
+
 class Photo(NamedTuple):
     """One pinhole image.
 

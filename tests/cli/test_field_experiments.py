@@ -2,65 +2,95 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
 
+from tangent_train.cli import transfer_stages
 from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build, build_data
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World
-from tests.running import composed, composed_settings
+from tests.running import Patch, composed, composed_settings
 
-SMALL = ("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0")
-FIELD = sorted(
-    f"field/{path.stem}" for path in (config_folder() / "experiment" / "field").glob("*.yaml")
-)
+SMALL = ("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0", "panels=0")
+SMALL_PHOTOS = ("photos.data.num_workers=0", "photos.data.photos_per_step=2")
 PROTOCOLS = {
-    entry["experiment"]: name for name, entry in protocols().items() if "experiment" in entry
+    entry["experiment"]: name
+    for name, entry in protocols().items()
+    if entry.get("experiment", "").startswith("field/")
 }
+FILES = {f"field/{path.stem}" for path in (config_folder() / "experiment/field").glob("*.yaml")}
 
-
-def _with_a_small_network(experiment: str) -> list[str]:
-    """Arguments of an experiment with another network and no other settings of a network."""
-    arguments = [f"experiment={experiment}", "network=unet_small"]
-    removed = (
-        composed("train", *arguments).network.keys()
-        - composed("train", arguments[1]).network.keys()
-    )
-    return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in removed)]
-
-
-def _data_set(settings: dict[str, Any]) -> str:
-    return str(settings["data"]["_target_"]).rpartition(".")[2]
+Worlds = dict[str, tuple[World, Path]]
 
 
 @pytest.fixture(scope="session")
-def worlds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[World, Path]]:
+def worlds(tmp_path_factory: pytest.TempPathFactory) -> Worlds:
     """The worlds with their folders; not to be changed."""
     folder = tmp_path_factory.mktemp("field")
     return {name: (world, world.write(folder / name)) for name, world in WORLDS.items()}
 
 
-@pytest.mark.parametrize("experiment", FIELD)
+def _world(worlds: Worlds, section: dict[str, Any]) -> tuple[World, Path]:
+    return worlds[str(section["_target_"]).rpartition(".")[2]]
+
+
+def _with_a_small_network(command: str, experiment: str) -> list[str]:
+    """Arguments of an experiment with another network and no other settings of a network."""
+    arguments = [f"experiment={experiment}", "network=unet_small"]
+    small = composed(command, arguments[1]).network.keys()
+    removed = composed(command, *arguments).network.keys() - small
+    return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in removed)]
+
+
+def test_every_experiment_of_the_field_has_a_protocol() -> None:
+    assert PROTOCOLS.keys() == FILES
+
+
+@pytest.mark.parametrize("experiment", sorted(PROTOCOLS))
 def test_an_experiment_of_the_field_follows_its_protocol(
-    experiment: str, worlds: dict[str, tuple[World, Path]], run: Run, tmp_path: Path
+    experiment: str, worlds: Worlds, run: Run, tmp_path: Path, monkeypatch: Patch
 ) -> None:
     """At its full size by its settings, and in a small run that is trained and evaluated."""
     protocol = facts(PROTOCOLS[experiment])
-    arguments = _with_a_small_network(experiment)
-    settings = composed_settings("train", *arguments)
-    world, root = worlds[_data_set(settings)]
+    composed_transfer = composed_settings("transfer", f"experiment={experiment}")
+    transfers = "_target_" in composed_transfer["photos"]["data"]
+    command = "transfer" if transfers else "train"
+    arguments = _with_a_small_network(command, experiment)
+    settings = composed_settings(command, *arguments)
+    world, root = _world(worlds, settings["data"])
     settings["data"]["root"] = root
     data, task = build(settings)
     assert {**data.facts, **task.facts} == protocol
-    run("train", *arguments, f"data.root={root}", *SMALL, *world.small)
-    (folder,) = (tmp_path / "runs").glob("field/*/*")
-    found = results(folder)["protocol"]
-    assert found.pop("size") != protocol.pop("size")
-    assert found == protocol
     settings["data"] |= {"mask": -60, "test_rotation": "so3"}
     changed = {"mask": "-60", "test_rotation": "so3"}
     assert build_data(settings).facts == data.facts | changed, "as it is, not as it is named"
+    arguments += [f"data.root={root}", *SMALL, *world.small]
+    if transfers:
+        _, photos = _world(worlds, settings["photos"]["data"])
+        arguments += [f"photos.data.root={photos}", *SMALL_PHOTOS]
+        monkeypatch.setattr(transfer_stages, "run_process", _in_this_process(run))
+    run(command, *arguments)
+    (path,) = (tmp_path / "runs").rglob("S/results.json" if transfers else "results.json")
+    found = results(path.parent)["protocol"]
+    assert found.pop("size") != protocol.pop("size")
+    assert found == protocol
+
+
+def _in_this_process(run: Run) -> Any:
+    """Run a stage of a transfer, which is within Hydra, without starting a process."""
+
+    def run_process(line: Sequence[str]) -> int:
+        state = Singleton.get_state()
+        GlobalHydra.instance().clear()
+        run(*line[3:])
+        Singleton.set_state(state)
+        return 0
+
+    return run_process

@@ -18,7 +18,10 @@ from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 import datamodules
 from datamodules.cityscapes.classes import CLASSES as CITYSCAPES
 from datamodules.cityscapes.classes import THIRTEEN
+from datamodules.matterport360.panoramas import CLASSES as MATTERPORT
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
+from datamodules.stanford2d3ds.files import EIGHT
+from datamodules.structured3d.classes import CLASSES as STRUCTURED3D
 from datamodules.synpass.panoramas import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
@@ -33,10 +36,16 @@ PUBLISHED: dict[str, list[str]] = {
     **json.loads(Path(__file__).with_name("published_classes.json").read_text()),
     "Cityscapes": [c.name for c in Cityscapes.classes if not c.ignore_in_eval],
     "SynPASS": list(SYNPASS),
+    "Stanford2D3DS": list(STANFORD),
+    "Structured3D": list(STRUCTURED3D),
     "Pascal VOC": DeepLabV3_ResNet50_Weights.DEFAULT.meta["categories"],
 }
 SHIPPED = {
     "ade20k_to_stanford2d3ds": ("ADE20K", 150, STANFORD),
+    "ade20k_to_structured3d": ("ADE20K", 150, STRUCTURED3D),
+    "ade20k_to_matterport360": ("ADE20K", 150, MATTERPORT),
+    "stanford2d3ds_to_span8": ("Stanford2D3DS", 13, EIGHT),
+    "structured3d_to_span8": ("Structured3D", 40, EIGHT),
     "ade20k_to_zind_layout": ("ADE20K", 150, ZIND),
     "coco_stuff_to_stanford2d3ds": ("COCO-Stuff", 182, STANFORD),
     "cityscapes_to_synthia": ("Cityscapes", 19, SYNTHIA),

@@ -1,0 +1,1 @@
+"""Panoramas of Matterport3D (Chang et al. 2017)."""

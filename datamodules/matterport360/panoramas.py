@@ -1,0 +1,188 @@
+"""Panoramas of Matterport3D (Chang et al. 2017) in the two releases that benchmarks use.
+
+Matterport3D has no panoramas with classes. Two groups made them from its photos and meshes, with
+different classes and scenes: ten scenes for training in `sfss` are for the test in `360fv`.
+
+On disk, as released; 8-bit labels, 16-bit depth, 0 = missing::
+
+    root/                            release=360fv (360FV-Matterport, of 360BEV)
+      <scene>/rgb/<uuid>.png         or .jpg
+      <scene>/semantic/<uuid>.png    0 to 41, see ``classes.csv``
+      <scene>/depth/<uuid>.png       1/4000 m
+    root/                            release=sfss (Matterport3D-1K, of SFSS-MMSI)
+      <scene>/panorama/undistorted_color_images/<uuid>.png
+      <scene>/panorama/segmentation_maps_classes/<uuid>.png    0 to 41, one higher than above
+      <scene>/panorama/undistorted_depth_images/<uuid>.png     taken as 1/4000 m
+      train.txt validation.txt test.txt    only compared: they are known to be incomplete
+
+``scenes.csv`` has the scenes of each split.
+
+License: that of Matterport3D, academic use, on request: https://niessner.github.io/Matterport.
+
+Citation: A. Chang, A. Dai, T. Funkhouser, M. Halber, M. Nießner, M. Savva, S. Song, A. Zeng,
+Y. Zhang: "Matterport3D: Learning from RGB-D Data in Indoor Environments", 3DV 2017.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+import numpy as np
+
+from datamodules.core.image_module import PanoramaDataModule
+from datamodules.core.index import SPLITS, Split, published_splits
+from datamodules.core.inputs import Input
+from datamodules.core.labels import ClassSet
+from datamodules.core.numbered import NumberedReader
+from datamodules.core.panoramas import ImageFiles
+from datamodules.core.problems import Problems
+from tangent_train.errors import DataError
+from tangent_train.registry import registered
+
+_HERE = Path(__file__).parent
+
+
+def read_table(name: str) -> list[dict[str, str]]:
+    """Read ``classes.csv`` or ``scenes.csv``: rows of values by column."""
+    with (_HERE / name).open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in read_table("classes.csv"))
+"""Categories of the numbers 0 to 41 of `360fv`; those of `sfss` are one higher, 0 is the last."""
+
+CLASSES: tuple[str, ...] = (
+    *("wall", "floor", "chair", "door", "table", "picture", "furniture", "objects", "window"),
+    *("sofa", "bed", "sink", "stairs", "ceiling", "toilet", "mirror", "shower", "bathtub"),
+    *("counter", "shelving"),
+)
+"""The 20 classes of `360fv`."""
+
+
+def _merged(column: str) -> ClassSet:
+    """Return the 20 classes by a column of ``classes.csv``."""
+    merged = {row["category"]: row[column] for row in read_table("classes.csv")}
+    return ClassSet(CLASSES, CATEGORIES, merged)
+
+
+_GET_IT = (
+    "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from 360BEV "
+    "(https://github.com/jamycheung/360BEV) or SFSS-MMSI "
+    "(https://github.com/sguttikon/SFSS-MMSI), and point data.root at the folder of the scenes."
+)
+_FOLDERS = {
+    "360fv": ("rgb", "semantic", "depth"),
+    "sfss": tuple(
+        f"panorama/{name}"
+        for name in (
+            "undistorted_color_images",
+            "segmentation_maps_classes",
+            "undistorted_depth_images",
+        )
+    ),
+}
+"""Folders of a scene: color, classes, depth."""
+
+_PUBLISHED: Mapping[str, Mapping[str, int]] = {"360fv": {"train": 7829, "val": 772, "test": 2014}}
+_LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class Matterport360(PanoramaDataModule):
+    """Panoramas of Matterport3D, 20 classes, or 41 with ``release=sfss``.
+
+    Args:
+        release: `360fv` or `sfss`, see above.
+        test_split: Published split of the test panoramas. With `val`, validation uses scenes
+            drawn from the training scenes, so that nothing is selected on the test panoramas.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_sets: ClassVar[Mapping[str, ClassSet]] = {
+        "20": _merged("corrected"),
+        "360bev": _merged("360bev"),
+        "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
+    }
+
+    fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
+
+    inputs: Sequence[Input] = ("rgb",)
+    release: Literal["360fv", "sfss"] = "360fv"
+    test_split: Literal["test", "val"] = "test"
+
+    def __post_init__(self) -> None:
+        self.require_one_of("release", "360fv", "sfss")
+        self.require_one_of("test_split", "test", "val")
+        is_sfss = self.release == "sfss"
+        self.classes = str(self.classes or (41 if is_sfss else 20))
+        self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
+        super().__post_init__()
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
+        rows = read_table("scenes.csv")
+        for split in SPLITS:
+            scenes = [row["scene"] for row in rows if row[self.release] == split]
+            listed = {scene: self._list_images(scene) for scene in scenes}
+            splits[split] = [files for images in listed.values() for files in images]
+            missing = [scene for scene in scenes if not listed[scene]]
+            if missing:
+                problems.warnings.append(
+                    f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "
+                    f"{', '.join(missing[:3])}"
+                )
+        if not any(splits.values()):
+            expected = f"{'/<uuid>.png, <scene>/'.join(_FOLDERS[self.release])}/<uuid>.png"
+            found = f"no panoramas of release={self.release}"
+            raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
+        if self.release in _PUBLISHED:
+            counts: dict[str, int] = {split: len(images) for split, images in splits.items()}
+            problems.compare_counts(counts, [_PUBLISHED[self.release]])
+        else:
+            self._compare_lists(splits, problems)
+        given = self.test_split, self.validation_fraction, self.seed
+        numbers = len(CATEGORIES)
+        table = np.full(256, 255, np.uint8)
+        table[:numbers] = np.arange(numbers) + (self.release == "360fv")
+        return NumberedReader(table, units_per_m=4000), published_splits(splits, *given)
+
+    def _list_images(self, scene: str) -> list[ImageFiles]:
+        rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
+        found = {path.stem: path for path in sorted((*rgb.glob("*.jpg"), *rgb.glob("*.png")))}
+        images = []
+        for stem, path in found.items():
+            labels, depth = (folder / f"{stem}.png" for folder in folders)
+            with_depth = depth if "depth" in self.inputs else None
+            images.append(ImageFiles(f"{scene}/{stem}", path, labels, with_depth))
+        return images
+
+    def _compare_lists(self, splits: dict[Split, list[ImageFiles]], problems: Problems) -> None:
+        """Warn of lists of the release that differ from the files of their scenes."""
+        for split, name in _LISTS.items():
+            path = self.root / name
+            if not path.is_file():
+                continue
+            listed = Counter(
+                "/".join(line.split())
+                for line in path.read_text("utf-8", errors="replace").splitlines()
+                if line.strip()
+            )
+            there = {files.name for files in splits[split]}
+            twice = [entry for entry, count in listed.items() if count > 1]
+            found = [f"{len(listed)} names"]
+            found += [f"{', '.join(twice)} more than once"] if twice else []
+            found += [f"{len(listed.keys() - there)} without a panorama in a scene of {split}"]
+            found += [f"{len(there - listed.keys())} panoramas of these scenes are not in it"]
+            if twice or there != listed.keys():
+                problems.warnings.append(f"{path}: {'; '.join(found)}. Scenes define the splits.")

@@ -1,0 +1,1 @@
+"""Structured3D (Zheng et al. 2020)."""

@@ -1,0 +1,186 @@
+"""Structured3D (Zheng et al. 2020): 21,835 rendered panoramas of rooms, and photos, 40 classes.
+
+Features: 512×1024 RGB in three lightings and three states of furniture, depth and classes; all
+panoramas are upright.
+
+On disk, as released::
+
+    root/scene_00000/2D_rendering/<room>/
+      panorama/<full|simple|empty>/
+        rgb_rawlight.png             8 bit; also rgb_warmlight, rgb_coldlight
+        semantic.png                 8 bit, with a palette: the index is the class, 0 = unknown
+        depth.png                    16 bit, mm, 0 = missing
+      perspective/<full|empty>/<n>/
+        …                            the same files of a photo
+        camera_pose.txt              position, view, up; HALF angles of view, in radians; 1
+
+The documents of the release leave open which depth the files hold. Here it is taken as distance
+from the center in panoramas, and as z-depth in photos, like the point clouds in issue 11 of its
+repository. To check it, compare the points of a floor with a plane.
+
+License: free for research, on request: https://structured3d-dataset.org.
+
+Citation: J. Zheng, J. Zhang, J. Li, R. Tang, S. Gao, Z. Zhou: "Structured3D: A Large
+Photo-realistic Dataset for Structured 3D Modeling", ECCV 2020.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
+from datamodules.core.index import SPLITS, Split, published_splits
+from datamodules.core.inputs import Input
+from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.panoramas import ImageFiles
+from datamodules.core.problems import Problems
+from datamodules.images.pixel_files import read_image_size
+from datamodules.structured3d.classes import CLASS_SETS, CLASSES
+from tangent_train.errors import DataError
+from tangent_train.registry import registered
+
+INVALID = ("01155", "01192", "01714", "01816", "01852", "03398")
+"""Scenes that the errata of the release call invalid; published lists of images hold them."""
+
+_GET_IT = (
+    "Request Structured3D at https://structured3d-dataset.org and point data.root at the folder "
+    "with scene_00000 and the others."
+)
+_PUBLISHED: Sequence[Mapping[str, int]] = ({"train": 18362, "val": 1776, "test": 1697},)
+_FIRST = (0, 3000, 3250)
+"""First scene of each split."""
+
+_TABLE = number_table(range(1, 1 + len(CLASSES)), [0])
+
+
+class Structured3DReader(NumberedReader):
+    """Decoder of the files of Structured3D."""
+
+    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """Read the camera of a photo; its center is in the middle.
+
+        Raises:
+            DataError: The file is missing or broken.
+        """
+        path = files.parts["camera"]
+        try:
+            numbers = [float(word) for word in path.read_text("utf-8").split()]
+            half_x, half_y = numbers[9:11]
+            fine = len(numbers) == 12 and 0 < min(half_x, half_y) <= max(half_x, half_y) < 1.5
+        except (OSError, ValueError):
+            fine = False
+        if not fine:
+            expected = "12 numbers, the 10th and 11th of them half angles of view in radians"
+            raise DataError(path, found="another content", expected=expected, remedy=_GET_IT)
+        height, width = read_image_size(files.rgb)
+        x, y = width / 2, height / 2
+        fx, fy = x / math.tan(half_x), y / math.tan(half_y)
+        return np.array([[fx, 0, x - 0.5], [0, fy, y - 0.5], [0, 0, 1]])
+
+
+@dataclass(kw_only=True, eq=False, repr=False)
+class Structured3DRooms(ImageDataModule):
+    """Images of Structured3D in the splits of its authors.
+
+    Args:
+        configuration: Furniture of the rooms; photos have no `simple`.
+        lighting: Lighting of the rooms.
+        invalid_scenes: `keep` the scenes `INVALID`, as published evaluations do, or `leave_out`.
+        test_split: Published split of the test images. With `val`, validation uses scenes drawn
+            from the training scenes, so that nothing is selected on the test images.
+
+    Attributes:
+        place: Pattern of the color images of a room.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    class_names = ("unknown", *CLASSES)
+    class_sets = CLASS_SETS
+    place: ClassVar[str]
+    configurations: ClassVar[tuple[str, ...]] = ("full", "simple", "empty")
+
+    fact_settings: ClassVar[tuple[str, ...]] = (
+        *("configuration", "lighting", "invalid_scenes", "test_split"),
+    )
+
+    inputs: Sequence[Input] = ("rgb",)
+    configuration: Literal["full", "simple", "empty"] = "full"
+    lighting: Literal["rawlight", "warmlight", "coldlight"] = "rawlight"
+    invalid_scenes: Literal["keep", "leave_out"] = "keep"
+    test_split: Literal["test", "val"] = "test"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.require_one_of("configuration", *self.configurations)
+        self.require_one_of("lighting", "rawlight", "warmlight", "coldlight")
+        self.require_one_of("invalid_scenes", "keep", "leave_out")
+        self.require_one_of("test_split", "test", "val")
+
+    def find_images(
+        self, problems: Problems
+    ) -> tuple[Structured3DReader, dict[Split, Sequence[ImageFiles]]]:
+        """See `ImageDataModule`."""
+        scenes = f"scene_{'[0-9]' * 5}/2D_rendering/*"
+        pattern = f"{scenes}/{self.place.format(self.configuration)}/rgb_{self.lighting}.png"
+        splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
+        invalid = []
+        for rgb in sorted(self.root.glob(pattern)):
+            scene, _, room, _, _, *number, _ = rgb.relative_to(self.root).parts
+            files = ImageFiles(
+                "/".join((scene, room, *number)),
+                rgb,
+                rgb.with_name("semantic.png"),
+                rgb.with_name("depth.png") if "depth" in self.inputs else None,
+                rgb.with_name("camera_pose.txt") if number else None,
+            )
+            scene = scene.removeprefix("scene_")
+            if scene in INVALID:
+                invalid.append(scene)
+            if scene not in INVALID or self.invalid_scenes == "keep":
+                splits[SPLITS[bisect(_FIRST, int(scene)) - 1]].append(files)
+        if not any(splits.values()):
+            found = f"no {self.noun} of {pattern}"
+            raise DataError(self.root, found=found, expected="scene_00000 …", remedy=_GET_IT)
+        if invalid:
+            problems.warnings.append(
+                f"{len(invalid)} {self.noun} of scenes that the errata call invalid: "
+                f"{', '.join(sorted(set(invalid)))} (data.invalid_scenes={self.invalid_scenes})"
+            )
+        if isinstance(self, PanoramaDataModule) and self.invalid_scenes == "keep":
+            problems.compare_counts({s: len(images) for s, images in splits.items()}, _PUBLISHED)
+        given = self.test_split, self.validation_fraction, self.seed
+        return Structured3DReader(_TABLE, units_per_m=1000), published_splits(splits, *given)
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class Structured3D(Structured3DRooms, PanoramaDataModule):
+    """The panoramas of Structured3D, 40 or 8 classes.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    place = "panorama/{}"
+
+
+@registered
+@dataclass(kw_only=True, eq=False, repr=False)
+class Structured3DPerspective(Structured3DRooms, PhotoDataModule):
+    """The photos of Structured3D, 40 or 8 classes.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    place = "perspective/{}/*"
+    configurations = ("full", "empty")

@@ -1,0 +1,148 @@
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from datamodules import Structured3D, Structured3DPerspective
+from datamodules.structured3d.classes import CLASS_SETS, CLASSES
+from tangent_train.errors import DataError, SettingError
+from tangent_train.rendering import PerspectiveRepresentation
+from tests.datamodules.data_files import names_of, read_png, write_png
+from tests.datamodules.structured3d.structured3d_format import (
+    HALF_ANGLES,
+    write_indices,
+    write_structured3d,
+)
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_structured3d(tmp_path_factory.mktemp("structured3d"), photos=True)
+
+
+def test_a_panorama_is_what_the_files_hold(root: Path, erp: Any) -> None:
+    data = Structured3D(root, erp, inputs=["rgb", "depth"], lighting="coldlight")
+    panorama = data.source("test").read(0)
+    reading: Any = data.index().read
+    labels = reading.reader.labels(data.source("test").items[0])
+    np.testing.assert_array_equal(labels[0], np.arange(64) % 41, "indices, not colors")
+    assert (panorama.rgb[10:] == 102).all()
+    assert data.class_names == ("unknown", *CLASSES)
+    assert (CLASSES[0], CLASSES[21], CLASSES[39]) == ("wall", "ceiling", "other prop")
+    depth = reading.reader.depth(data.source("test").items[0])
+    for number in range(41):
+        expected = round(25 * number * 512 / 1000)
+        assert set(depth[:, np.arange(64) % 41 == number].flat) == {expected}
+
+
+def test_splits_are_those_of_the_scenes(root: Path, erp: Any) -> None:
+    data = Structured3D(root, erp)
+    found = {split: [n[6:11] for n in names_of(data, split)] for split in ("train", "val", "test")}
+    assert found == {
+        "train": ["00000", "01155", "02999"],
+        "val": ["03000", "03249"],
+        "test": ["03250", "03398", "03499"],
+    }
+    assert names_of(data, "test")[0] == "scene_03250/3350"
+    tested = Structured3D(root, erp, test_split="val", configuration="empty")
+    assert [n[6:11] for n in names_of(tested, "test")] == found["val"]
+    assert sorted(n[6:11] for s in ("train", "val") for n in names_of(tested, s)) == found["train"]
+    assert names_of(Structured3D(root, erp, validation_fraction=0), "val") == []
+
+
+@pytest.mark.parametrize("invalid_scenes", ["keep", "leave_out"])
+def test_invalid_scenes_and_missing_panoramas_are_reported(
+    root: Path, erp: Any, invalid_scenes: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = Structured3D(root, erp, invalid_scenes=invalid_scenes)
+    problems, count = data.check()
+    first, *counts = problems.warnings
+    assert "2 panoramas of scenes that the errata call invalid: 01155, 03398" in first
+    assert len(counts) == (invalid_scenes == "keep")
+    assert not counts or "18362 train, 1776 val, 1697 test" in counts[0]
+    assert (count, problems.listed()) == (8 if counts else 6, [])
+    data.setup()
+    assert first in capsys.readouterr().out, "in training too"
+
+
+def test_a_photo_has_half_angles_and_z_depth(root: Path) -> None:
+    crops = PerspectiveRepresentation(level=4, fov_deg=40)
+    data = Structured3DPerspective(root, crops, inputs=["rgb", "depth"])
+    photo = data.source("test").read(1)
+    assert names_of(data, "test")[1] == "scene_03250/3350/1"
+    focal = photo.camera_matrix[0, 0], photo.camera_matrix[1, 1]
+    for length, half_angle in zip(focal, HALF_ANGLES, strict=True):
+        assert math.atan(16 / length) == pytest.approx(half_angle)
+    assert photo.camera_matrix[:2, 2].tolist() == [15.5, 15.5]
+    ray = math.hypot(1, (31 - 15.5) / focal[0], (0 - 15.5) / focal[1])
+    assert photo.depth[0, 31] == pytest.approx(0.512 * 25 * 31 * ray, abs=1)
+    np.testing.assert_array_equal(photo.labels[0], np.arange(32))
+
+
+# The published readers of 8 classes replace numbers in place.
+
+KEY = {1: 6, 2: 3, 5: 1, 6: 4, 7: 5, 8: 2, 9: 7, 22: 0}
+
+
+@pytest.mark.parametrize("others", [[], [3], [6], [3, 6], [4, 40]])
+def test_published_8_classes_depend_on_the_other_classes_of_an_image(others: list[int]) -> None:
+    numbers = np.array([[0, 1, 2, 5, 7, 8, 9, 22, *others]], np.uint8)
+    right = [KEY.get(number, -1) + 1 for number in numbers[0].tolist()]
+    np.testing.assert_array_equal(CLASS_SETS["8"].relabel(numbers)[0], right)
+    published = list(right)
+    published[1] = 5 if 6 in others else 7  # wall becomes sofa
+    published[2] = 0 if 3 in others else 4  # floor becomes unknown
+    np.testing.assert_array_equal(CLASS_SETS["published_s3d8"].relabel(numbers)[0], published)
+    # The loop of the readers, number by number.
+    looped = numbers[0].astype(int)
+    for number in sorted(set(looped.tolist())):
+        looped[looped == number] = KEY.get(number, -1)
+    assert (looped + 1).tolist() == published
+
+
+def test_both_sets_are_read(root: Path, erp: Any) -> None:
+    right, published = (Structured3D(root, erp, classes=c) for c in ("8", "published_s3d8"))
+    names = ("unknown", "ceiling", "chair", "door", "floor", "sofa", "table", "wall", "window")
+    assert right.class_names == published.class_names == names
+    before, after = (data.source("test").labels(0) for data in (right, published))
+    assert set(after[before == names.index("wall")]) == {names.index("sofa")}
+    assert set(after[before == names.index("floor")]) == {0}
+    same = (before != names.index("wall")) & (before != names.index("floor"))
+    np.testing.assert_array_equal(after[same], before[same])
+
+
+# Files and settings that are refused.
+
+
+def test_broken_files_are_refused(tmp_path: Path, erp: Any) -> None:
+    with pytest.raises(DataError, match=r"no panoramas of scene_.*Request Structured3D"):
+        Structured3D(tmp_path, erp).setup()
+    root = write_structured3d(tmp_path, scenes=(1, 3001, 3251), photos=True)
+    rooms = sorted(root.glob("scene_*/2D_rendering/*"))
+    write_indices(rooms[0] / "panorama/full/semantic.png", np.full((32, 64), 41, np.uint8))
+    converted = read_png(rooms[1] / "panorama/full/semantic.png")
+    write_png(rooms[1] / "panorama/full/semantic.png", converted)
+    problems, _ = Structured3D(root, erp).check()
+    findings = [problem.finding for problem in problems.listed()]
+    assert "numbers 41; expected 0, 1" in findings[0]
+    assert "8-bit RGB; expected 8-bit gray or palette" in findings[1]
+    (rooms[2] / "perspective/full/1/camera_pose.txt").write_text("0 " * 9 + "34 20 1")
+    photos = Structured3DPerspective(root, PerspectiveRepresentation(level=4, fov_deg=40))
+    with pytest.raises(DataError, match=r"1/camera_pose\.txt.*half angles of view in radians"):
+        photos.setup()
+
+
+@pytest.mark.parametrize(
+    ("setting", "value", "expected"),
+    [("configuration", "simple", "full or empty"), ("lighting", "raw", "rawlight or")],
+)
+def test_other_settings_are_refused(setting: str, value: Any, expected: str) -> None:
+    with pytest.raises(
+        SettingError, match=re.escape(f"data.{setting}: found {value}; expected {expected}")
+    ):
+        Structured3DPerspective(Path(), **{setting: value})
