@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch import Tensor, nn
@@ -43,7 +44,8 @@ def fake_gpu(module: nn.Module | None = None) -> Iterator[list[str]]:
         module: It is moved to the GPU.
     """
     fake = FakeTensorMode(allow_non_fake_inputs=True)
-    with fake, torch.device("cuda"), _Transfers() as transfers:
+    unpinned = patch.object(Tensor, "pin_memory", lambda tensor: tensor)  # not implemented by torch
+    with fake, unpinned, torch.device("cuda"), _Transfers() as transfers:
         for part in () if module is None else module.modules():
             for held in (part._parameters, part._buffers):
                 found: Any = {name: t for name, t in held.items() if t is not None}

@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tests.conftest import fabricate
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
+from tests.datamodules.cityscapes.street_format import (
+    write_cityscapes,
+    write_densepass,
+    write_synpass,
+)
+from tests.datamodules.matterport360.matterport_format import write_matterport
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
 
 
 class World(NamedTuple):
@@ -28,6 +34,9 @@ WORLDS: Mapping[str, World] = {
     "DensePASS": World(
         partial(write_densepass, names=(1,)), ("level=6", "photos.representation.dim=[16,32]")
     ),
+    "Matterport360": World(write_matterport),
     "Stanford2D3DS": World(fabricate),
+    "Structured3D": World(write_structured3d),
+    "SynPASS": World(write_synpass),
 }
 """By the class of the data set, the last part of ``data._target_``."""

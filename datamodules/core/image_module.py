@@ -120,11 +120,6 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
             DataError: The data set as a whole cannot be used.
         """
 
-    def groups(self, files: ImageFiles) -> Sequence[str]:
-        """Return the rows of the results that an image belongs to, such as a weather."""
-        del files
-        return ()
-
     @abstractmethod
     def reading(self, reader: ImageReader) -> PanoramaReading | PhotoReading:
         """Return a function that reads one image as it is stored."""

@@ -134,6 +134,11 @@ class LabeledData(ABC, Generic[_Item]):
             split: Name of the split.
         """
 
+    def groups(self, item: _Item) -> Sequence[str]:
+        """Return the groups of an item that get rows in the results, such as its weather."""
+        del item
+        return ()
+
     @property
     @abstractmethod
     def in_channels(self) -> int:

@@ -132,6 +132,16 @@ def share_of_process(dataset: Dataset[Any]) -> Dataset[Any]:
     return dataset if world_size == 1 else Subset(dataset, range(rank, length, world_size))
 
 
+def gathered_order(length: int, world_size: int) -> list[int]:
+    """Return the indices of samples in the order in which processes contribute them.
+
+    Args:
+        length: Number of samples.
+        world_size: Number of processes, each with its share, see `share_of_process`.
+    """
+    return [index for rank in range(world_size) for index in range(rank, length, world_size)]
+
+
 def _check_length(length: int, world_size: int) -> None:
     if length == 0:
         raise SettingError("data", found="a split without images", expected="one or more")

@@ -111,7 +111,6 @@ class Matterport360(PanoramaDataModule):
         "360bev": _merged("360bev"),
         "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
     }
-
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)

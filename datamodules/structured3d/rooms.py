@@ -98,6 +98,7 @@ class Structured3DRooms(ImageDataModule):
 
     Attributes:
         place: Pattern of the color images of a room.
+        configurations: Allowed values of `configuration`.
 
     Raises:
         SettingError: A setting is invalid.
@@ -107,7 +108,6 @@ class Structured3DRooms(ImageDataModule):
     class_sets = CLASS_SETS
     place: ClassVar[str]
     configurations: ClassVar[tuple[str, ...]] = ("full", "simple", "empty")
-
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),
     )

@@ -152,9 +152,9 @@ class SynPASS(PanoramaDataModule):
                 )
         return NumberedReader(_TABLE), splits
 
-    def groups(self, files: ImageFiles) -> list[str]:
-        """See `ImageDataModule`: weather, and day or night where a list names the point."""
-        point, weather = files.rgb.parent.name, files.name.partition("/")[0]
+    def groups(self, item: ImageFiles) -> list[str]:
+        """See `LabeledData`: weather, and day or night where a list names the point."""
+        point, weather = item.rgb.parent.name, item.name.partition("/")[0]
         return [weather, *(time for time in self._times if point in self._times[time])]
 
     def _list_images(self, split: Split, problems: Problems) -> list[ImageFiles]:

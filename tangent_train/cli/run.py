@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -16,7 +17,7 @@ from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
 from datamodules.core.labels import PIXEL_CLASSES
-from datamodules.core.loading import explained
+from datamodules.core.loading import explained, gathered_order
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
@@ -37,6 +38,7 @@ from tangent_train.registry import SettingsFile, build_from_config, named_argume
 from tangent_train.results.evaluation import (
     confusion_table,
     headline,
+    plain_scores,
     result_tables,
     write_results,
 )
@@ -132,6 +134,7 @@ class Run:
         record = self.task.record(self.task.result, noun) if tested else None
         images = record.images if record else 0
         if record and images == total:
+            record = replace(record, groups=self._groups(trainer.world_size))
             self._report(record, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
             return
         if not getattr(trainer, "fast_dev_run", False) and str(trainer.limit_test_batches) == "1.0":
@@ -140,6 +143,18 @@ class Run:
             f"{images} of {total} test {noun} were evaluated because of trainer.limit_test_batches "
             "or trainer.fast_dev_run: no results are written."
         )
+
+    def _groups(self, world_size: int) -> list[dict[str, Any]]:
+        """Return the scores of each group of test images, see `LabeledData.groups`."""
+        items, places = self.data.index().splits["test"], defaultdict(list)
+        for place, index in enumerate(gathered_order(len(items), world_size)):
+            for group in self.data.groups(items[index]):
+                places[group].append(place)
+        return [
+            {"group": group, "images": len(some)}
+            | plain_scores(self.task.scores_of(self.task.result, some))
+            for group, some in sorted(places.items())
+        ]
 
     def _as_trained(self) -> TrainedNetwork:
         """Return the network of the run with its inputs, classes and representation."""

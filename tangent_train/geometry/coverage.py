@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,14 +36,23 @@ def check_coverage(grid: PinholeGrid, area: SphereArea | None = None, *, by_owne
     found = _uncovered(grid, area, by_owners)
     if found is None:
         return
-    longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(found))
-    raise SettingError(
-        "views",
-        found=f"{grid.num_images} views that miss longitude {longitude}, latitude {latitude}",
-        expected=f"views that cover {'the sphere' if area is None else 'the area'}"
-        + ", each direction by the view with the nearest center (blend=nearest)" * by_owners,
-        remedy="Use a larger fov or more views, or limit the views to an area.",
-    )
+    by_nearest = ", each direction by the view with the nearest center (blend=nearest)" * by_owners
+    raise _gap(grid.num_images, found, area, by_nearest)
+
+
+def check_joint_coverage(grids: Sequence[PinholeGrid], area: SphereArea | None = None) -> None:
+    """Refuse several grids whose images together do not cover the sphere, or an area.
+
+    Args:
+        grids: The grids.
+        area: Area to cover; None for the sphere.
+
+    Raises:
+        SettingError: A direction is in none of the images.
+    """
+    missed = _tested(grids, area, by_owners=False, on_edge=True)
+    if missed is not None:
+        raise _gap(sum(grid.num_images for grid in grids), missed, area)
 
 
 def overlaps(grid: PinholeGrid, area: SphereArea | None = None) -> bool:
@@ -56,7 +66,19 @@ def overlaps(grid: PinholeGrid, area: SphereArea | None = None) -> bool:
     if area is None and borders is not None and _uncovered(grid, None, by_owners=True) is None:
         cells, _, middles = borders
         return bool(grid.shown(middles, on_edge=False)[np.arange(len(cells)), cells].all())
-    return _tested(grid, area, by_owners=False, on_edge=False) is None
+    return _tested([grid], area, by_owners=False, on_edge=False) is None
+
+
+def _gap(
+    count: int, missed: NDArray[np.float64], area: SphereArea | None, condition: str = ""
+) -> SettingError:
+    longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
+    return SettingError(
+        "views",
+        found=f"{count} views that miss longitude {longitude}, latitude {latitude}",
+        expected=f"views that cover {'the sphere' if area is None else 'the area'}{condition}",
+        remedy="Use a larger fov or more views, or limit the views to an area.",
+    )
 
 
 def _uncovered(
@@ -72,18 +94,18 @@ def _uncovered(
             return None
         if by_owners:
             return np.asarray(corners[missed.argmax()])
-    return _tested(grid, area, by_owners, on_edge=True)
+    return _tested([grid], area, by_owners, on_edge=True)
 
 
 def _tested(
-    grid: PinholeGrid, area: SphereArea | None, by_owners: bool, on_edge: bool
+    grids: Sequence[PinholeGrid], area: SphereArea | None, by_owners: bool, on_edge: bool
 ) -> NDArray[np.float64] | None:
     """Return a missed direction of a dense set; None if the images show all."""
     directions = (SphereArea.of(None) if area is None else area).lattice(_STEP_DEG)[0]
     for tested in np.split(directions, range(_TOGETHER, len(directions), _TOGETHER)):
-        shown = grid.shown(tested, on_edge=on_edge)
+        shown = np.concatenate([grid.shown(tested, on_edge=on_edge) for grid in grids], axis=1)
         if by_owners:
-            shown = np.take_along_axis(shown, grid.owners(tested)[:, None], axis=1)
+            shown = np.take_along_axis(shown, grids[0].owners(tested)[:, None], axis=1)
         missed = ~shown.any(axis=1)
         if missed.any():
             # The middle of the missed ones lies well inside the gap.

@@ -47,6 +47,7 @@ class RingGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         area: Area that the images must cover; None for the sphere.
         by_owners: See `check_coverage`.
+        is_complete: False for images that cover the area together with those of other grids.
 
     Raises:
         SettingError: A ring, a field of view or the size is invalid; two views have the same
@@ -71,6 +72,7 @@ class RingGrid(PinholeGrid):
         area: SphereArea | None = None,
         *,
         by_owners: bool = False,
+        is_complete: bool = True,
     ) -> None:
         checked = checked_rings(rings)
         rows, columns = (at_least("dim", side, 2) for side in size)
@@ -86,8 +88,9 @@ class RingGrid(PinholeGrid):
                 remedy="Give each pitch once, with one view at 90 and -90.",
             )
         self._set(None, rings=checked, size=(rows, columns), pitch=pitch, _axes=axes)
-        check_coverage(self, area, by_owners=by_owners)
-        self._set(rotation, _is_overlapping=overlaps(self, area))
+        if is_complete:
+            check_coverage(self, area, by_owners=by_owners)
+        self._set(rotation, _is_overlapping=not is_complete or overlaps(self, area))
         for cached in ("world_from_camera", "centers_xyz"):
             vars(self).pop(cached, None)
 

@@ -106,6 +106,14 @@ def _mean_of_classes(scores: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(count > 0, total / np.maximum(count, 1), np.nan)
 
 
+def mean_scores(
+    sums: Float[np.ndarray, "*some 3 classes"], absent_class: AbsentClass = "skip"
+) -> dict[str, Any]:
+    """Return mIoU and mAcc, given labeled area, predicted area and hits of each class."""
+    scores = zip(("miou", "macc"), _class_scores(sums, absent_class), strict=True)
+    return {name: _mean_of_classes(of_classes) for name, of_classes in scores}
+
+
 def bootstrap_intervals(
     of_images: Float[np.ndarray, "images 3 classes"],
     absent_class: AbsentClass = "skip",
@@ -140,8 +148,7 @@ def bootstrap_intervals(
         drawn.append(times.astype(np.float64) @ flat)
     sums = np.concatenate(drawn).reshape(draws, *of_images.shape[1:])
     intervals = {}
-    for name, scores in zip(("miou", "macc"), _class_scores(sums, absent_class), strict=True):
-        means = _mean_of_classes(scores)
+    for name, means in mean_scores(sums, absent_class).items():
         if not np.isnan(means).all():
             low, high = np.nanquantile(means, (0.025, 0.975))
             intervals[name] = (float(low), float(high))

@@ -74,7 +74,7 @@ def headline(record: Record) -> str:
 
 
 def result_tables(record: Record) -> list[Table]:
-    """Return a table of scores per class, or over all images, and one per latitude band.
+    """Return a table of scores per class, or over all images, by latitude, and by group.
 
     A class is omitted if it occurs in neither labels nor predictions and its score is undefined.
 
@@ -83,17 +83,19 @@ def result_tables(record: Record) -> list[Table]:
     """
     headings = record.headings
     tables = [_per_class(record) if record.classes else _over_all(record)]
-    if record.latitude_bands:
-        names = [name for name in record.latitude_bands[0] if name in headings]
+    bands = [["{}° … {}°".format(*band["latitude_deg"])] for band in record.latitude_bands]
+    groups = [[group["group"], str(group["images"])] for group in record.groups]
+    for title, firsts, entries, header in (
+        ("By latitude", bands, record.latitude_bands, ["latitude"]),
+        ("By group", groups, record.groups, ["group", "images"]),
+    ):
+        names = [name for name in (entries[0] if entries else ()) if name in headings]
         rows = [
-            [
-                "{}° … {}°".format(*band["latitude_deg"]),
-                *(score_text(band[name], headings[name].unit) for name in names),
-            ]
-            for band in record.latitude_bands
+            [*first, *(score_text(entry[name], headings[name].unit) for name in names)]
+            for first, entry in zip(firsts, entries, strict=True)
         ]
-        header = ["latitude", *(headings[name].column for name in names)]
-        tables.append(Table("By latitude", header, rows))
+        columns = [*header, *(headings[name].column for name in names)]
+        tables += [Table(title, columns, rows)] if rows else []
     return tables
 
 

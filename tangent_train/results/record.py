@@ -93,6 +93,7 @@ _FIELDS = {
     "headings": dict[str, dict[str, Text]],
     "classes": list,
     "latitude_bands": list,
+    "groups": list,
     "confusion": list[list[int]],
     "intervals": dict[str, list[float]],
     "protocol": dict[str, Text],
@@ -115,6 +116,8 @@ class Record:
         classes: Name (``class``) and scores of each class; empty without classes.
         latitude_bands: Edges ``latitude_deg`` (south, north) and scores of each band; empty for
             photos.
+        groups: Name (``group``), number of ``images`` and scores of groups of images, such as
+            weathers; empty for data without groups.
         confusion: Counts; rows are true, columns predicted classes. Empty without classes.
         intervals: 95 % bootstrap intervals over the images, for means that have one.
         protocol: Facts that make scores comparable, see `results.published`.
@@ -130,6 +133,7 @@ class Record:
     means: Mapping[str, float | None]
     classes: Sequence[Mapping[str, Any]] = ()
     latitude_bands: Sequence[Mapping[str, Any]] = ()
+    groups: Sequence[Mapping[str, Any]] = ()
     confusion: Sequence[Sequence[int]] = ()
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     protocol: Mapping[str, str] = field(default_factory=dict)
@@ -236,6 +240,7 @@ def load_record(folder: Path) -> Record:
     parts: dict[str, dict[str, Any]] = {
         "classes": {**dict.fromkeys(of_class, float | None), "class": Text},
         "latitude_bands": {**dict.fromkeys(headings, float | None), "latitude_deg": list[float]},
+        "groups": {**dict.fromkeys(headings, float | None), "group": Text, "images": int},
     }
     for part, kinds in parts.items():
         for entry in values[part]:

@@ -202,6 +202,15 @@ class Task(lightning.LightningModule, ABC):
         """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
         return {}
 
+    def scores_of(self, result: Any, places: Sequence[int]) -> dict[str, float]:
+        """Return scores over some of the evaluated images by name; by default, none.
+
+        Args:
+            result: Value of `metric`.
+            places: Places of the images in the order of the evaluation.
+        """
+        return {}
+
     def targets(self, batch: Any) -> Tensor:
         """Return the true labels of an evaluated batch, one item per prediction."""
         targets: Tensor = batch.target

@@ -26,6 +26,7 @@ from tangent_train.metrics.segmentation import (
     SegmentationScores,
     bootstrap_intervals,
     count_image,
+    mean_scores,
     segmentation_scores,
 )
 from tangent_train.registry import registered
@@ -329,6 +330,13 @@ class SegmentationTask(Task):
     def facts(self) -> dict[str, str]:
         """See `Task`: the scores count pixels of all images together, then average classes."""
         return {"absent_class": self.absent_class, "weighting": "pixels"}
+
+    def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
+        """See `Task`: mIoU and mAcc, of panoramas also by solid angle."""
+        sums = result.of_images[list(places)].sum(axis=0)
+        pixels, angles = map(mean_scores, sums, self._absent_classes(result))
+        scores = pixels | (by_solid_angle(angles) if result.solid_angle.any() else {})
+        return {name: float(score) for name, score in scores.items()}
 
     def _absent_classes(self, result: SegmentationCounts) -> tuple[AbsentClass, AbsentClass]:
         """Return the treatment of absent classes for scores by pixels and by solid angle."""

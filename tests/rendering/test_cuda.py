@@ -16,6 +16,8 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
+from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.representations.views import PinholeViews
 
 pytestmark = pytest.mark.gpu
 
@@ -64,6 +66,20 @@ def test_labels_of_each_precision_equal_those_on_the_cpu(
     on_gpu = tangent_to_labels(scores.cuda(), GRID, SHAPE, blend).cpu()
     least = 0.9999 if dtype == torch.float32 else 0.98  # what is rounded ties more often
     assert (on_gpu == expected).double().mean() > least
+
+
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_mosaics_equal_those_on_the_cpu_and_each_other(blend: Blend, averaged: bool) -> None:
+    scores = _random(GRID.num_images, 13, GRID.dim, GRID.dim).float()
+    found = []
+    for device in ("cpu", "cuda", "cuda"):
+        mosaic = ScoreMosaic(SHAPE, 13, blend, averaged=averaged, device=device)
+        for part in (slice(0, 30), slice(30, None)):
+            mosaic.add(scores[part].to(device), PinholeViews(GRID)[part])
+        found.append(mosaic.labels().cpu())
+    assert (found[1] == found[0]).double().mean() > 0.999
+    assert torch.equal(found[1], found[2])
 
 
 @pytest.mark.parametrize("blend", ["nearest", "feather"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from functools import partial
 from typing import Any
 
@@ -21,6 +22,8 @@ pytestmark = [
     pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
     pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning"),
     pytest.mark.filterwarnings("ignore:TensorFloat32 tensor cores:UserWarning"),
+    # The compiler of torch 2.11 imports a module that uses it.
+    pytest.mark.filterwarnings("ignore:`torch.jit.script_method` is deprecated:DeprecationWarning"),
 ]
 
 
@@ -71,8 +74,10 @@ def test_scores_equal_those_of_the_cpu(half: bool, tolerance: float) -> None:
     assert (found - exact).norm() < tolerance * exact.norm()
 
 
-def test_cuda_graphs_in_evaluation() -> None:
+def test_cuda_graphs_in_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     """They write every result to the same memory."""
+    # The checks of shapes while tests run cannot be compiled by torch 2.11.
+    monkeypatch.setattr(UNet, "forward", inspect.unwrap(UNet.forward))
     images = torch.randn(20, 2, 16, 16, device="cuda")
     plain = _task(images_per_forward=5).cuda().eval()
     graphs = _task(images_per_forward=5, compile={"mode": "reduce-overhead"}).cuda().eval()

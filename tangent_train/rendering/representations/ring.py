@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import RingGrid, SphereArea, TangentGrid
+from tangent_train.geometry import PinholeGrid, RingGrid, SphereArea, TangentGrid
+from tangent_train.geometry.coverage import check_joint_coverage
 from tangent_train.geometry.ring import checked_rings, half_extents
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
-from tangent_train.rendering.representations.views import RotationAugmentation
+from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
 _STRIDE = 32
 """Rows are a multiple of this where columns are: the stride of most networks."""
@@ -23,12 +28,14 @@ class RingRepresentation(PinholeRepresentation):
 
     Args:
         level: Level s, which sets the angular resolution of the views.
-        rings: Rings of views: ``pitch`` (latitude of the centers in degrees) and number of
-            ``views`` around the vertical.
+        rings: Rings of views: ``pitch`` (latitude of the centers in degrees), number of ``views``
+            around the vertical, and optionally their own ``fov``. Views of all rings have the same
+            number of pixels.
         fov: Horizontal and vertical field of view in degrees, or one number for both.
         dim: Rows and columns in pixels, or only the columns; see `ring_size` for the default.
             Pixels are square: rows and columns of another ratio than `fov` show more than it.
-        faces_per_panorama: Number of random views in a training sample; all by default.
+        faces_per_panorama: Number of random views in a training sample; all by default. A sample
+            has views of one field of view, drawn in proportion to their number.
         random_rotation: Rotation of the views as a whole in training.
         mirror: True to mirror half of the training samples left to right.
         blend: Blending of overlapping views, see `TangentRepresentation`.
@@ -42,12 +49,12 @@ class RingRepresentation(PinholeRepresentation):
         SettingError: A setting is invalid, or the views miss a direction.
     """
 
-    grid: RingGrid
+    grid: PinholeGrid
 
     def __init__(
         self,
         level: int,
-        rings: Sequence[Mapping[str, float]],
+        rings: Sequence[Mapping[str, Any]],
         fov: float | Sequence[float],
         dim: int | Sequence[int] | None = None,
         faces_per_panorama: int | None = None,
@@ -58,15 +65,27 @@ class RingRepresentation(PinholeRepresentation):
         rotations: int = 1,
         area: Sequence[float] | None = None,
     ) -> None:
-        across, *rest = [fov] if isinstance(fov, int | float) else fov
-        fov_deg = (across, rest[0] if rest else across)
-        self.symmetry_deg = 360 / max(ring.views for ring in checked_rings(rings))
-        size = ring_size(level, fov_deg, dim)
+        by_fov: dict[tuple[float, float], list[dict[str, float]]] = {}
+        for ring in rings:
+            others = {name: value for name, value in ring.items() if name != "fov"}
+            by_fov.setdefault(_pair(ring.get("fov", fov)), []).append(others)
+        if len(by_fov) > 1 and blend == "nearest":
+            raise SettingError(
+                "representation.blend",
+                found="nearest, with rings of different fov",
+                expected="feather, or the same fov for all rings",
+            )
+        checked = checked_rings([ring for part in by_fov.values() for ring in part])
+        self.symmetry_deg = 360 / max(ring.views for ring in checked)
+        size = ring_size(level, _pair(fov), dim)
         covered = None if area is None else SphereArea.of(area, "representation.area")
-        grid = RingGrid(rings, fov_deg, size, None, covered, by_owners=blend == "nearest")
+        how = {"by_owners": blend == "nearest", "is_complete": len(by_fov) == 1}
+        grids = [RingGrid(part, of, size, None, covered, **how) for of, part in by_fov.items()]
+        if len(grids) > 1:
+            check_joint_coverage(grids, covered)
         super().__init__(
-            grid,
-            [grid],
+            min(grids, key=lambda grid: grid.num_images),
+            grids,
             level,
             random_rotation,
             mirror,
@@ -76,6 +95,19 @@ class RingRepresentation(PinholeRepresentation):
             faces_per_panorama,
             covered is not None,
         )
+
+    def sample(self, rng: np.random.Generator) -> PinholeViews:
+        """See `PinholeRepresentation`; of one field of view, drawn by the number of its views."""
+        drawn = copy.copy(self)
+        if len(self._grids) > 1:
+            counts = np.array([grid.num_images for grid in self._grids])
+            drawn.grid = self._grids[rng.choice(len(counts), p=counts / counts.sum())]
+        return super(RingRepresentation, drawn).sample(rng)
+
+
+def _pair(fov: float | Sequence[float]) -> tuple[float, float]:
+    across, *rest = [fov] if isinstance(fov, int | float) else fov
+    return across, rest[0] if rest else across
 
 
 def ring_size(

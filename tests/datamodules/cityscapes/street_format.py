@@ -79,7 +79,8 @@ def write_synpass(root: Path, rows: int = 32, each: int = 2) -> Path:
     for (weather, split), points in SYNPASS.items():
         for point in points:
             for number in range(each):
-                ids = numbers(SYNPASS_NUMBERS, (rows, 2 * rows), number)
+                first = number + 5 * (weather == "fog")
+                ids = numbers(SYNPASS_NUMBERS, (rows, 2 * rows), first)
                 rgb = root / "img" / weather / split / point / f"{number:06d}.jpg"
                 rgb.parent.mkdir(parents=True, exist_ok=True)
                 assert cv2.imwrite(str(rgb), colors(ids))

@@ -22,21 +22,20 @@ FOLDERS = {
 }  # fmt: skip
 
 
-def write_matterport(
-    root: Path, release: str, scenes: Sequence[str] = SCENES, height: int = 32
-) -> Path:
-    """Two panoramas of each scene: stripes of all numbers, with 2,500 units of depth each.
+def write_matterport(root: Path, scenes: Sequence[str] = SCENES, height: int = 32) -> Path:
+    """Two panoramas of each scene in both releases.
 
-    The colors of the second panorama are a JPEG file with ``release=360fv``. A fifth of the rows
-    is black in both.
+    Labels are stripes of all numbers, with 1,500 units of depth each. The colors of the second
+    panorama of 360fv are a JPEG file. A fifth of the rows is black.
     """
     numbers = np.broadcast_to(np.arange(2 * height) % 42, (height, 2 * height)).astype(np.uint8)
+    color = np.full((height, 2 * height, 3), 90, np.uint8)
+    color[: height // 5] = 0
     for scene in scenes:
-        for k, ending in enumerate(("png", "jpg" if release == "360fv" else "png")):
-            rgb, semantic, depth = (root / scene / folder for folder in FOLDERS[release])
-            color = np.full((height, 2 * height, 3), 90, np.uint8)
-            color[: height // 5] = 0
-            write_png(rgb / f"{k}{scene}.{ending}", color)
-            write_png(semantic / f"{k}{scene}.png", numbers)
-            write_png(depth / f"{k}{scene}.png", 1500 * numbers.astype(np.uint16))
+        for release, folders in FOLDERS.items():
+            for k, ending in enumerate(("png", "jpg" if release == "360fv" else "png")):
+                rgb, semantic, depth = (root / scene / folder for folder in folders)
+                write_png(rgb / f"{k}{scene}.{ending}", color)
+                write_png(semantic / f"{k}{scene}.png", numbers)
+                write_png(depth / f"{k}{scene}.png", 1500 * numbers.astype(np.uint16))
     return root

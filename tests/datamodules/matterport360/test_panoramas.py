@@ -22,9 +22,8 @@ TWENTY = [
 
 
 @pytest.fixture(scope="module")
-def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    folder = tmp_path_factory.mktemp("matterport")
-    return {name: write_matterport(folder / name, name) for name in ("360fv", "sfss")}
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_matterport(tmp_path_factory.mktemp("matterport"))
 
 
 def _labels(data: Matterport360) -> list[int]:
@@ -35,25 +34,25 @@ def _labels(data: Matterport360) -> list[int]:
     return row[:42]
 
 
-def test_every_number_has_its_class(roots: dict[str, Path], erp: Any) -> None:
-    data = Matterport360(roots["360fv"], erp)
+def test_every_number_has_its_class(root: Path, erp: Any) -> None:
+    data = Matterport360(root, erp)
     assert data.class_names == ("unknown", *CLASSES)
     assert len(CLASSES) == 20
     assert _labels(data) == TWENTY
-    published = _labels(Matterport360(roots["360fv"], erp, classes="360bev"))
+    published = _labels(Matterport360(root, erp, classes="360bev"))
     differing = {n: CLASSES[published[n] - 1] for n in range(42) if published[n] != TWENTY[n]}
     assert differing == {24: "picture", 36: "objects", 41: "objects"}
-    sfss = Matterport360(roots["sfss"], erp, release="sfss")
+    sfss = Matterport360(root, erp, release="sfss")
     assert _labels(sfss) == list(range(42))
     assert len(sfss.class_names) == 42
     assert sfss.class_names[1:4] + sfss.class_names[-1:] == ("void", "wall", "floor", "misc")
 
 
 @pytest.mark.parametrize("release", ["360fv", "sfss"])
-def test_colors_depth_and_black_pixels(roots: dict[str, Path], erp: Any, release: Any) -> None:
+def test_colors_depth_and_black_pixels(root: Path, erp: Any, release: Any) -> None:
     given: Any = {"release": release, "inputs": ["rgb", "depth"]}
-    data = Matterport360(roots[release], erp, **given)
-    masked = Matterport360(roots[release], erp, **given, unknown="all_black")
+    data = Matterport360(root, erp, **given)
+    masked = Matterport360(root, erp, **given, unknown="all_black")
     for k in range(2):
         panorama, reading = data.source("test").read(k), cast("Any", data.index().read)
         assert (panorama.rgb[-1] == 90).all()
@@ -75,13 +74,13 @@ def test_scenes_are_those_of_the_published_lists(release: str, counts: tuple[int
     assert len(on_both) == 10
 
 
-def test_a_split_has_all_panoramas_of_its_scenes(roots: dict[str, Path], erp: Any) -> None:
-    data = Matterport360(roots["360fv"], erp)
+def test_a_split_has_all_panoramas_of_its_scenes(root: Path, erp: Any) -> None:
+    data = Matterport360(root, erp)
     found = {split: sorted({n[:11] for n in names_of(data, split)}) for split in SPLITS}
     assert found == {"train": [SCENES[0], SCENES[3]], "val": [SCENES[1]],
                      "test": [SCENES[2], SCENES[4]]}  # fmt: skip
     assert names_of(data, "val") == [f"{SCENES[1]}/{k}{SCENES[1]}" for k in range(2)]
-    other = Matterport360(roots["sfss"], erp, release="sfss", test_split="val")
+    other = Matterport360(root, erp, release="sfss", test_split="val")
     assert {n[:11] for n in names_of(other, "test")} == {SCENES[4]}
     train, val = ({n[:11] for n in names_of(other, split)} for split in ("train", "val"))
     assert train | val == set(SCENES[:3])
@@ -91,8 +90,8 @@ def test_a_split_has_all_panoramas_of_its_scenes(roots: dict[str, Path], erp: An
 # Lists and files that disagree.
 
 
-def test_missing_scenes_and_counts_are_reported(roots: dict[str, Path], erp: Any) -> None:
-    problems, count = Matterport360(roots["360fv"], erp).check()
+def test_missing_scenes_and_counts_are_reported(root: Path, erp: Any) -> None:
+    problems, count = Matterport360(root, erp).check()
     *missing, counts = problems.warnings
     assert (
         missing[0] == "59 of 61 scenes of train are missing, such as 1LXtFkjw3qL, "
@@ -107,7 +106,7 @@ def test_missing_scenes_and_counts_are_reported(roots: dict[str, Path], erp: Any
 
 
 def test_lists_of_the_release_are_compared(tmp_path: Path, erp: Any) -> None:
-    root = write_matterport(tmp_path, "sfss")
+    root = write_matterport(tmp_path)
     name = f"{SCENES[4]} 0{SCENES[4]}\n"
     (root / "train.txt").write_text("")
     (root / "validation.txt").write_text(name + name.replace(" 0", " 1") + name)
@@ -125,14 +124,12 @@ def test_lists_of_the_release_are_compared(tmp_path: Path, erp: Any) -> None:
     ]
 
 
-def test_other_files_and_settings_are_refused(
-    roots: dict[str, Path], erp: Any, tmp_path: Path
-) -> None:
+def test_other_files_and_settings_are_refused(root: Path, erp: Any, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no panoramas of release=360fv; expected <scene>/rgb"):
-        Matterport360(roots["sfss"], erp).setup()
+        Matterport360(tmp_path, erp).setup()
     with pytest.raises(SettingError, match=r"data\.classes: found 360bev; expected 41"):
-        Matterport360(roots["sfss"], erp, release="sfss", classes="360bev")
-    root = write_matterport(tmp_path, "360fv", SCENES[:3])
+        Matterport360(root, erp, release="sfss", classes="360bev")
+    root = write_matterport(tmp_path, SCENES[:3])
     write_png(root / SCENES[2] / f"semantic/0{SCENES[2]}.png", np.full((32, 64), 42, np.uint8))
     write_png(root / SCENES[0] / f"depth/1{SCENES[0]}.png", np.full((32, 64), 42, np.uint8))
     problems, _ = Matterport360(root, erp, inputs=["rgb", "depth"]).check()

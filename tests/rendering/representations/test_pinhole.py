@@ -63,10 +63,12 @@ def _rng(seed: int = 0) -> np.random.Generator:
 
 
 RINGS = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "views": 5}]
+WIDE_RINGS = [{"pitch": 0, "views": 6, "fov": 130}, *RINGS[1:]]
 
 REPRESENTATIONS: list[Representation] = [
     RingRepresentation(5, RINGS, 100),
     RingRepresentation(5, RINGS, (110, 100), 40, blend="nearest", mirror=True),
+    RingRepresentation(5, WIDE_RINGS, 100),
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
     TangentRepresentation(0, 5, crop_multiple=8, random_rotation="so3", mirror=True),
@@ -87,10 +89,9 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
 ) -> None:
     labels = _labels()
     source = representation if rotation is None else representation.with_rotation(rotation)
-    (views,) = source.view_sets()
-    rendered = views.render(labels, "nearest")
-    assert rendered.shape[1:] == representation.image_size
-    back = _labels_of(source, [_scores(rendered)])
+    rendered = [views.render(labels, "nearest") for views in source.view_sets()]
+    assert {images.shape[1:] for images in rendered} == {representation.image_size}
+    back = _labels_of(source, [_scores(images) for images in rendered])
     assert np.mean(back == labels) > 0.95, "all but the borders between classes"
 
 
@@ -101,6 +102,7 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
         CubemapRepresentation(5, random_rotation="yaw", mirror=True),
         CubemapRepresentation(5, random_rotation="so3"),
         RingRepresentation(5, RINGS, 100, None, 6, "yaw", mirror=True),
+        RingRepresentation(5, WIDE_RINGS, 100, None, 6, "yaw", mirror=True),
         EquirectRepresentation(5, crop_deg=60, random_rotation="yaw", mirror=True),
         EquirectRepresentation(5, random_rotation="so3"),
     ],
@@ -187,6 +189,9 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (RingRepresentation, {"rings": [{"pitch": 0, "view": 8}]}, "{'pitch': 0, 'view': 8}"),
         (RingRepresentation, {"rings": [{"pitch": 0, "views": 0}]}, "views of a ring: found 0"),
         (RingRepresentation, {"rings": [{"pitch": 90, "views": 2}]}, "the same direction"),
+        (RingRepresentation, {"rings": WIDE_RINGS[:2]}, r"11 views that miss .*latitude -\d\d°"),
+        (RingRepresentation, {"rings": WIDE_RINGS, "blend": "nearest"}, "expected feather, or the"),
+        (RingRepresentation, {"rings": [{**WIDE_RINGS[0], "fov": 175}]}, "fov: found"),
         (EquirectRepresentation, {"crop_deg": 0}, "crop_deg: found 0; expected 0 to 360"),
         (EquirectRepresentation, {"crop_deg": 361}, "crop_deg: found 361"),
         (EquirectRepresentation, {"rows": 0}, "rows: found 0"),
@@ -208,13 +213,11 @@ def test_rotated_views_see_the_panorama_rotated_back(representation: Representat
     """Compared with rotating the panorama instead, with `rotate_equirect`."""
     waves = 100 + 50 * np.sin(3 * equirect_directions(SHAPE) @ [[1, 0.3], [0, 1], [1, -0.5]])
     image = waves.astype(np.float32)
-    (rotated,), (plain,) = (
-        representation.with_rotation(TILT).view_sets(),
-        representation.view_sets(),
-    )
-    views = rotated.render(image, "bilinear")
-    expected = plain.render(rotate_equirect(image, TILT.T), "bilinear")
-    np.testing.assert_allclose(views, expected, atol=2)
+    rotated_sets = representation.with_rotation(TILT).view_sets()
+    for rotated, plain in zip(rotated_sets, representation.view_sets(), strict=True):
+        views = rotated.render(image, "bilinear")
+        expected = plain.render(rotate_equirect(image, TILT.T), "bilinear")
+        np.testing.assert_allclose(views, expected, atol=2)
 
 
 @pytest.mark.parametrize("rows", [24, 100])
