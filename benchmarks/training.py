@@ -27,8 +27,8 @@ from torch.nn import functional
 
 from benchmarks.measuring import Alternative, Goal, Row, Table, measure
 from tangent_train.callbacks.checkpoints import LastCheckpoint
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
+from tangent_train.files import config_folder
 
 OURS = "tangent-train"
 _WARM_UP = 3

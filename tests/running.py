@@ -14,7 +14,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.cli.compose import config_folder
+from tangent_train.files import config_folder
 
 Capture = pytest.CaptureFixture[str]
 Patch = pytest.MonkeyPatch

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from datamodules.images.pixel_files import write_pixels
 from datamodules.images.tangent_folders import face_name, shrink_to_level, write_each
 from tangent_train.errors import DataError
-from tangent_train.geometry import TangentGrid
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import Interpolation, equirect_to_tangent
 from tangent_train.rendering.camera_files import RIG_FILE, write_rig
 
@@ -50,14 +50,16 @@ class ColmapProject:
 
     Args:
         folder: New folder.
-        grid: Tangent images of every panorama.
+        grid: Views of every panorama.
+        level: Level s, see `shrink_to_level`.
         faces: Indices of the rendered images.
         suffix: Suffix of the image files.
         interpolation: See `equirect_to_tangent`.
     """
 
     folder: Path
-    grid: TangentGrid
+    grid: PinholeGrid
+    level: int
     faces: Sequence[int]
     suffix: str
     interpolation: Interpolation
@@ -89,7 +91,7 @@ class ColmapProject:
             SettingError: The files cannot hold its pixels.
         """
         if self.interpolation == "bilinear":
-            image = shrink_to_level(image, self.grid.level)
+            image = shrink_to_level(image, self.level)
 
         def render(prefix: str, face: int) -> None:
             path = f"{prefix}{name}{self.suffix}"

@@ -17,7 +17,7 @@ from datamodules.images.gpano import PanoramaArea, area_of_angles, read_area, wh
 from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.images.videos import VIDEO_SUFFIXES
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.geometry import PinholeGrid, equirect_shape
 from tangent_train.rendering import Interpolation, camera_files, equirect_to_tangent
 from tangent_train.threads import in_threads
 
@@ -70,7 +70,7 @@ def read_placed(
     return area.place(image), area
 
 
-def face_name(grid: TangentGrid, face: int) -> str:
+def face_name(grid: PinholeGrid, face: int) -> str:
     """Return the name of a tangent image, e.g. ``face_007``; names sort like the images."""
     return f"face_{face:0{max(3, len(str(grid.num_images - 1)))}}"
 

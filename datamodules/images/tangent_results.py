@@ -76,8 +76,8 @@ class TangentResults:
     """Results for all images of one panorama.
 
     Attributes:
-        arrays: ``(d, d)`` or ``(d, d, C)`` for every image of the grid, all of one shape and dtype.
-        grid: Grid of the images that the results belong to.
+        arrays: ``(h, w)`` or ``(h, w, C)`` for every image of the grid, all of one shape and dtype.
+        grid: Grid of the images, with the size of the results.
         kind: Meaning of the pixels.
     """
 
@@ -99,18 +99,23 @@ class TangentResults:
                 bits or floats are depth.
 
         Raises:
-            DataError: A file cannot be read, is not square, differs from the others, or cannot be
-                of this kind.
+            DataError: A file cannot be read, differs from the others, cannot be of this kind, or
+                has another ratio of sides than the images.
         """
         arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
         first = arrays[0]
-        height, width = first.shape[:2]
+        size = first.shape[0], first.shape[1]
+        try:
+            grid = grid if size == grid.size else grid.resized(size)
+        except SettingError as error:
+            found, expected = error.found, error.expected
+            raise DataError(files[0], found=found, expected=expected) from error
         for file, array in zip(files, arrays, strict=True):
-            if (array.shape, array.dtype) != (first.shape, first.dtype) or height != width:
+            if (array.shape, array.dtype) != (first.shape, first.dtype):
                 raise DataError(
                     file,
                     found=f"{array.dtype} of shape {array.shape}",
-                    expected=f"squares, all alike: {height}×{height} pixels of {first.dtype}",
+                    expected=f"that of the first file: {first.dtype} of shape {first.shape}",
                 )
         decided = _kind_of(files[0], first) if kind == "auto" else kind
         channels = _CHANNELS.get(decided, (first.shape[2:],))
@@ -155,19 +160,16 @@ class TangentResults:
             raise SettingError("output", found=path.name, expected=expected)
         dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
         pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
-        height, width = self.arrays[0].shape[:2]
-        same = (height, width) == self.grid.size
-        grid = self.grid if same else self.grid.resized((height, width))
         arrays = self.arrays
         if z_depth:
-            arrays = [_distances(array, grid, path) for array in arrays]
+            arrays = [_distances(array, self.grid, path) for array in arrays]
         whole = (*shape, *channels)
         if suffix == ".npy":
             with pixel_files.array_file(path, whole, dtype) as out:
-                self._render(arrays, grid, blend, out)
+                self._render(arrays, blend, out)
         else:
             panorama = np.empty(whole, arrays[0].dtype)
-            self._render(arrays, grid, blend, panorama)
+            self._render(arrays, blend, panorama)
             pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
 
     def _image_dtype(self) -> np.dtype[Any]:
@@ -177,9 +179,8 @@ class TangentResults:
             return np.result_type(*map(np.min_scalar_type, (min(values), max(values))))
         return np.dtype(np.float32) if dtype.kind == "f" else dtype
 
-    def _render(
-        self, arrays: Sequence[NDArray[Any]], grid: PinholeGrid, blend: Blend, out: NDArray[Any]
-    ) -> None:
+    def _render(self, arrays: Sequence[NDArray[Any]], blend: Blend, out: NDArray[Any]) -> None:
+        grid = self.grid
         shape = (out.shape[0], out.shape[1])
         if self.kind in ("labels", "depth"):
             out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, interpolation="nearest")
@@ -202,7 +203,7 @@ def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
 
 
 def _distances(depth: NDArray[Any], grid: PinholeGrid, path: Path) -> NDArray[Any]:
-    """Convert z-depth ``(d, d)`` of an image to distances."""
+    """Convert z-depth ``(h, w)`` of an image to distances."""
     lengths = ray_lengths(grid.camera_matrix, depth.shape)
     if depth.dtype.kind == "f":
         return (depth * lengths).astype(depth.dtype)

@@ -9,8 +9,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.help import Setting, bases, description, read_settings
+from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols, published_lines
 
 CONFIGS = config_folder()

@@ -109,7 +109,7 @@ class TrainedNetwork:
         """Side of the views if it does not depend on the level: fixed size, or imported network."""
         if self.fixed_size is not None:
             return max(self.fixed_size)
-        return None if self.photo_level is None else self.image_size[0]
+        return None if self.photo_level is None else self.image_size[1]
 
     @property
     def in_channels(self) -> int:

@@ -107,6 +107,7 @@ class PredictSettings(InputSettings):
     depth_scale: float
     projection: Literal["equirectangular", "perspective"]
     fov: float | None
+    views: str | dict[str, Any] | None
     levels: tuple[int, ...] | None
     base_level: int | None
     blend: Literal["feather", "nearest"]
@@ -132,7 +133,8 @@ class RenderSettings(InputSettings):
 
     output: Path | None
     overwrite: bool
-    base_level: int
+    views: str | dict[str, Any] | None
+    base_level: int | None
     level: int | None
     dim: int | None
     faces: tuple[int, ...] | None
@@ -177,6 +179,7 @@ class ImportSettings:
     unknown_wins: bool
     scores: ScoreKind | None
     image_size: tuple[int, ...] | None
+    views: str | dict[str, Any] | None
     levels: tuple[int, ...] | None
     base_level: int | None
     fov: float

@@ -16,6 +16,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.files import config_folder
 from tangent_train.registry import without_interpolation
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
@@ -28,13 +29,6 @@ _OPTION_WITH_VALUE = re.compile(
 
 _SWEEP_VALUE = re.compile(r"""('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)(?:,|$)""", re.DOTALL)
 """One value of a sweep, and the comma after it."""
-
-
-def config_folder() -> Path:
-    """Return the folder of the configs: the copy inside the wheel, else that of the checkout."""
-    package = Path(__file__).resolve().parents[1]
-    packaged = package / "configs"
-    return packaged if packaged.is_dir() else package.parent / "configs"
 
 
 def overrides_first(arguments: Sequence[str]) -> list[str]:

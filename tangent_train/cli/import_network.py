@@ -65,6 +65,7 @@ def import_network(config: Mapping[str, Any]) -> None:
             fov_deg=settings.fov,
             levels=settings.levels,
             base_level=settings.base_level,
+            views=settings.views,
             unknown_classes=settings.unknown_classes,
             unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),

@@ -43,12 +43,13 @@ def _main(command: str) -> None:
     from hydra.errors import HydraException
     from omegaconf.errors import OmegaConfBaseException
 
-    from tangent_train.cli.compose import config_folder, literal_paths, overrides_first
+    from tangent_train.cli.compose import literal_paths, overrides_first
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.run_folder import folders
     from tangent_train.cli.setting_names import probable_setting
     from tangent_train.cli.stored import stored_run
+    from tangent_train.files import config_folder
 
     end_with_first_process()
     typed_arguments = sys.argv[1:]

@@ -47,8 +47,8 @@ from tangent_train.results.predictions import (
 )
 
 _DECISIVE = (
-    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "levels",
-    "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
+    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
+    "levels", "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
     "min_confidence", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
@@ -303,7 +303,7 @@ def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
     views: PanoramaViews | PhotoViews
     if settings.projection == "equirectangular":
-        views = PanoramaViews(trained, *how, settings.fill)
+        views = PanoramaViews(trained, *how, settings.views, settings.fill)
         print_text(f"A panorama is labeled in {views.described(settings.area)}.")
     else:
         views = PhotoViews(trained, *how)
@@ -314,7 +314,7 @@ def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
 def _check_projection(settings: PredictSettings) -> None:
     """Refuse settings of photos for panoramas, and of panoramas for photos."""
     is_photo = settings.projection == "perspective"
-    others = ("area", "upright", "mask") if is_photo else ("fov",)
+    others = ("area", "upright", "mask", "views") if is_photo else ("fov",)
     for name in others:
         if (found := getattr(settings, name)) is not None:
             expected = "null for photos" if is_photo else "null without projection=perspective"

@@ -34,8 +34,10 @@ from tangent_train.cli.jobs import Job, run_jobs
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
-from tangent_train.geometry import TangentGrid, nearest_level, rotation_about
+from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
+from tangent_train.inference.representations import view_settings
 from tangent_train.keypoints.colmap import panorama_poses
+from tangent_train.registry import build_from_config
 from tangent_train.rendering.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,
@@ -113,14 +115,16 @@ def _rendering_jobs(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work
     def work(job: Job, progress: Callable[[float], object]) -> Path:
         image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
         shape = image.shape[0], image.shape[1]
-        grid, faces = _grid(settings, shape[0])
+        grid, faces, level = _grid(settings, shape[0])
         if settings.figure is not None:
+            if not isinstance(grid, TangentGrid):
+                raise SettingError("figure", found="a file", expected=f"null, for {settings.views}")
             write_pixels(settings.figure, tangent_figure(image, grid))
             if output is None:
                 return settings.figure
         files = tuple(f"{face_name(grid, face)}{suffix}" for face in faces)
         if settings.interpolation == "bilinear":
-            image = shrink_to_level(image, grid.level)
+            image = shrink_to_level(image, level)
         cameras = CameraFile(job.path.name, shape, grid, faces, files)
         folder = (output or Path()) / job.item
         write_tangent_folder(folder, image, cameras, settings.interpolation, progress)
@@ -150,8 +154,8 @@ def _suffix(settings: RenderSettings) -> str:
     return suffix
 
 
-def _grid(settings: RenderSettings, rows: int) -> tuple[TangentGrid, tuple[int, ...]]:
-    """Return the grid for a number of rows, and the indices of the images to write."""
+def _grid(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int, ...], int]:
+    """Return the grid for a number of rows, the indices of the images to write, and the level."""
     level = nearest_level(rows) if settings.level is None else settings.level
     rotation = None
     if settings.rotation is not None:  # x forward, y to the right, z up
@@ -159,8 +163,19 @@ def _grid(settings: RenderSettings, rows: int) -> tuple[TangentGrid, tuple[int, 
         # A positive rotation about y looks down.
         tilt = rotation_about((0, 1, 0), -pitch) @ rotation_about((1, 0, 0), -roll)
         rotation = rotation_about((0, 0, 1), yaw) @ tilt
-    grid = TangentGrid(settings.base_level, level, settings.dim, rotation)
-    return grid, tuple(int(face) for face in grid.face_indices(settings.faces))
+    section = view_settings(settings.views or {"option": "tangent", "base_level": 1})
+    for name in ("base_level", "dim"):
+        if (value := getattr(settings, name)) is not None:
+            if name not in section:
+                raise SettingError(name, found=value, expected=f"null, for {settings.views}")
+            section[name] = value
+    # Labels are rendered back from the owner of each direction.
+    section |= {"level": level} | ({"blend": "nearest"} if "blend" in section else {})
+    resting: PinholeGrid | None = getattr(build_from_config(section, "views"), "grid", None)
+    if resting is None:
+        raise SettingError("views", found=settings.views, expected="tangent, ring or cubemap")
+    grid = resting.with_rotation(rotation)
+    return grid, tuple(int(face) for face in grid.face_indices(settings.faces)), level
 
 
 def _render_project(settings: RenderSettings) -> None:
@@ -172,9 +187,9 @@ def _render_project(settings: RenderSettings) -> None:
     masks = _masks(settings)
     names = flat_names(inputs.names())
     # A camera has images of one size. Errors of unreadable panoramas are printed when rendering.
-    grid, faces = _grid(settings, max(_rows(settings, inputs)) or 512)
+    grid, faces, level = _grid(settings, max(_rows(settings, inputs)) or 512)
     with replaced_folder(output) as folder:
-        project = ColmapProject(folder, grid, faces, suffix, settings.interpolation)
+        project = ColmapProject(folder, grid, level, faces, suffix, settings.interpolation)
 
         def work(job: Job, progress: Callable[[float], object]) -> Path:
             name, path = job.item, job.path

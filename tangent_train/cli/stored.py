@@ -15,10 +15,11 @@ from typing import Any, get_args, get_origin, get_type_hints
 
 from tangent_train.checkpoints.content import INPUTS, NORMALIZATION, read_checkpoint
 from tangent_train.cli.command_settings import RunSettings
-from tangent_train.cli.compose import config_folder, path_text, quoted, values_of_sweep
+from tangent_train.cli.compose import path_text, quoted, values_of_sweep
 from tangent_train.cli.remembered import remembered_settings
 from tangent_train.cli.settings import Trust, names_of, parse_settings
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import config_folder
 from tangent_train.registry import SettingsFile, Text, check_fields
 from tangent_train.setting_rules import from_file
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 
 import numpy as np
@@ -20,24 +21,26 @@ _AT_ONCE = 2**23
 _ROUNDING = 1e-6
 
 
-def views_of_area(grid: PinholeGrid, area: SphereArea, *, by_owners: bool) -> NDArray[np.int64]:
-    """Return the images of a grid that are needed for an area.
+def views_of_area(
+    grids: Sequence[PinholeGrid], area: SphereArea, *, by_owners: bool = False
+) -> list[NDArray[np.int64]]:
+    """Return the images that are needed for an area.
 
     These are all images whose center lies in the area. Others are left out, those with the smallest
     share of their pixels in the area first, as long as the rest covers all of it.
 
     Args:
-        grid: Images that cover the area.
+        grids: Images that together cover the area, under the same rotation.
         area: The area, in the same frame.
         by_owners: True if every direction of the area must lie in the image with the nearest
             center; False if it may lie in any image.
 
     Returns:
-        ``(n,)`` indices of images.
+        Indices of images of each grid.
     """
-    if grid.rotation is None and area.rotation is None:
-        return np.array(_kept(grid, area.angles, by_owners))
-    return _needed(grid, area, by_owners)
+    if area.rotation is None and all(grid.rotation is None for grid in grids):
+        return [np.array(faces, np.int64) for faces in _kept((*grids,), area.angles, by_owners)]
+    return _needed(grids, area, by_owners)
 
 
 def best_views(grid: PinholeGrid, area: SphereArea, count: int) -> NDArray[np.int64]:
@@ -54,22 +57,28 @@ def best_views(grid: PinholeGrid, area: SphereArea, count: int) -> NDArray[np.in
 
 
 @lru_cache(maxsize=64)
-def _kept(grid: PinholeGrid, angles: tuple[float, ...], by_owners: bool) -> tuple[int, ...]:
-    return tuple(_needed(grid, SphereArea.of(angles), by_owners).tolist())
+def _kept(
+    grids: tuple[PinholeGrid, ...], angles: tuple[float, ...], by_owners: bool
+) -> list[NDArray[np.int64]]:
+    return _needed(grids, SphereArea.of(angles), by_owners)
 
 
-def _needed(grid: PinholeGrid, area: SphereArea, by_owners: bool) -> NDArray[np.int64]:
+def _needed(
+    grids: Sequence[PinholeGrid], area: SphereArea, by_owners: bool
+) -> list[NDArray[np.int64]]:
     """See `views_of_area`."""
     step = _step(area, _STEP_DEG)
     directions, steradians = area.lattice(step)
-    insets = _insets(grid, directions)
-    shares = _shares(grid, directions, steradians, insets)
+    of_grids = [_insets(grid, directions) for grid in grids]
+    parts = zip(grids, of_grids, strict=True)
+    shares = np.concatenate([_shares(grid, directions, steradians, part) for grid, part in parts])
+    insets, centers = np.concatenate(of_grids), np.concatenate([g.centers_xyz for g in grids])
     # Directions between those of the lattice are covered too: images are convex, and the margin is
     # more than half of the diagonal of its cells.
     inner = insets >= (-_ROUNDING if by_owners else math.sin(math.radians(0.75 * step)))
-    nearness = (grid.centers_xyz @ directions.T).astype(np.float32)
+    nearness = (centers @ directions.T).astype(np.float32)
     owner = nearness.argmax(axis=0)
-    kept, central = np.ones(grid.num_images, np.bool_), area.contains(grid.centers_xyz)
+    kept, central = np.ones(len(centers), np.bool_), area.contains(centers)
     for image in np.argsort(shares, kind="stable"):
         if central[image]:
             continue
@@ -82,7 +91,8 @@ def _needed(grid: PinholeGrid, area: SphereArea, by_owners: bool) -> NDArray[np.
         kept[image] = not covered.all()
         if not kept[image] and by_owners:
             owner[affected] = of_others
-    return np.flatnonzero(kept)
+    ends = np.cumsum([grid.num_images for grid in grids])
+    return [np.flatnonzero(part) for part in np.split(kept, ends[:-1])]
 
 
 def _step(area: SphereArea, most_deg: float) -> float:

@@ -29,7 +29,7 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.judge import NetworkJudge
-from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews
+from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews, ViewChoice
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -50,6 +50,7 @@ def load(
     base_level: int | None = None,
     blend: Blend = "feather",
     rotations: int = 1,
+    views: ViewChoice = None,
     fill: Fill = "black",
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
@@ -71,6 +72,8 @@ def load(
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over; 1 for photos.
+        views: Views of panoramas: an option of ``representation=``, such as ``ring``; or with
+            changed settings, ``{"option": "ring", "fov": 90}``. None as trained.
         fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
             color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``).
         images_per_forward: Number of images per call of the network, which limits memory; None for
@@ -88,13 +91,13 @@ def load(
     trained = original
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
-    views = trained, levels, base_level, blend, rotations
+    chosen = trained, levels, base_level, blend, rotations
     how = device, images_per_forward, min_confidence
-    panoramas = Predictor(trained, PanoramaViews(*views, fill), *how)
+    panoramas = Predictor(trained, PanoramaViews(*chosen, views, fill), *how)
     return Network(
         trained,
         panoramas,
-        lambda: Predictor(trained, PhotoViews(*views), *how),
+        lambda: Predictor(trained, PhotoViews(*chosen), *how),
         NetworkJudge(original, panoramas.device),
     )
 

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
 import numpy as np
+from omegaconf import OmegaConf
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from tangent_train.errors import SettingError, width_height
-from tangent_train.geometry import SphereArea, TangentGrid
+from tangent_train.files import config_folder
+from tangent_train.geometry import PinholeGrid, SphereArea, TangentGrid
 from tangent_train.inference.images import InputImage
-from tangent_train.registry import build_from_config
+from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.rendering import (
     EquirectRepresentation,
     PerspectiveRepresentation,
@@ -34,9 +36,16 @@ if TYPE_CHECKING:
 Levels = int | Sequence[int] | None
 """A level s, which sets the angular resolution, or several to average over; None as trained."""
 
+ViewChoice = str | Mapping[str, Any] | None
+"""Views of panoramas: an option of the configs of representations, such as ``ring``; or its name as
+``option``, with changed settings of the representation. None as trained."""
+
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
+
+_VIEWS = "tangent"
+"""Views of panoramas for imported photo networks, see `view_settings`."""
 
 _BASE_LEVEL = 1
 """For networks trained on photos (paper, section 5: transfer uses b = 1)."""
@@ -76,6 +85,7 @@ class PanoramaViews:
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
         rotations: Number of rotations about the vertical to average over.
+        views: See `ViewChoice`.
         fill: Colors outside the area of a partial panorama, in views that leave it.
 
     Attributes:
@@ -92,36 +102,33 @@ class PanoramaViews:
         base_level: int | None = None,
         blend: Blend = "feather",
         rotations: int = 1,
+        views: ViewChoice = None,
         fill: Fill = "black",
     ) -> None:
-        settings = panorama_settings(trained, levels, base_level)
+        settings = panorama_settings(trained, levels, base_level, views)
         settings["rotations"] = rotations
         if settings["_target_"] != _EQUIRECT:
             settings["blend"] = blend
-        self.representation = _built(trained, settings)
+        # Views that the user chooses may name any setting.
+        self.representation = _built(trained, settings, None if views else trained.source)
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
         self._trained, self._fill = trained, fill
 
     def __str__(self) -> str:
-        """Number and size of the views; of tangent images also angle and resolution by level."""
+        """Number and size of the views; of pinhole images also their angle and resolution."""
         return self.described()
 
     def described(self, area: Sequence[float] | None = None) -> str:
         """Return the text of `__str__` for panoramas of an area, see `SphereArea.of`."""
-        sets: Sequence[Any] = self.representation.view_sets()
         limited = self.representation.limited_to(SphereArea.of(area))
         rows, columns = limited.image_size
         text = f"{sum(map(len, limited.view_sets()))} views of {columns} × {rows}"
-        grids = [getattr(views, "grid", None) for views in sets]
+        grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
-            return text
-        parts = [
-            f"level {level}: {grid.width_deg:.0f}° wide, "
-            f"{math.radians(1 / grid.pitch):.1f} pixels per degree in the middle"
-            for level, grid in tangent.items()
-        ]
+            return f"{text} ({_described(grids[0])})" if grids else text
+        parts = [f"level {level}: {_described(grid)}" for level, grid in tangent.items()]
         if len(parts) > 1:
             parts.append(f"levels={next(iter(tangent))} alone takes 1/{len(parts)} of the time")
         base_level = next(iter(tangent.values())).base_level
@@ -142,6 +149,11 @@ class PanoramaViews:
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
         return [SourceViews(image, shape, representation.view_sets(), rotation)]
+
+
+def _described(grid: PinholeGrid) -> str:
+    density = math.radians(1 / grid.pitch)
+    return f"{grid.width_deg:.0f}° wide, {density:.1f} pixels per degree in the middle"
 
 
 class PhotoViews:
@@ -228,8 +240,76 @@ def images_of_side(side: int, level: int, base_level: int | None = None) -> dict
     return {"base_level": base_level, "dim": side if covers else 2 ** (level - base_level)}
 
 
+def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a representation of panoramas, without its level.
+
+    Args:
+        views: See `ViewChoice`.
+
+    Raises:
+        SettingError: There is no such option.
+    """
+    changes = {"option": views} if isinstance(views, str) else dict(views)
+    folder, option = config_folder() / "representation", changes.pop("option", None)
+    known = {
+        file.stem: file for file in sorted(folder.glob("*.yaml")) if file.stem != "perspective"
+    }
+    if option not in known:
+        raise SettingError("views", found=views, expected=f"an option: {', '.join(known)}")
+    section: Any = OmegaConf.to_container(OmegaConf.load(known[option]))
+    bases = [name for name in section.pop("defaults", ()) if name != "_self_"]
+    inherited = view_settings(bases[0]) if bases else {}
+    return {**inherited, **section, **changes, "level": None}
+
+
+def photo_network_settings(
+    side: int, levels: Levels = None, base_level: int | None = None, views: ViewChoice = None
+) -> dict[str, Any]:
+    """Return the settings of the representation of panoramas for an imported photo network.
+
+    Args:
+        side: Side of the network's images in pixels.
+        levels: See `Levels`; None for `wide_levels` of tangent images, and for the first of these
+            of other views.
+        base_level: Base level b of tangent images; None for the fewest images.
+        views: See `ViewChoice`; None for the default.
+
+    Raises:
+        SettingError: The views do not have these settings.
+    """
+    settings = view_settings(views or (_VIEWS if base_level is None else "tangent"))
+    is_tangent = settings["_target_"] == _TANGENT
+    chosen = (
+        wide_levels(side)[: 2 if is_tangent else 1] if levels is None else level_list(levels, 0)
+    )
+    settings["level"] = max(chosen)
+    if is_tangent:
+        if settings["dim"] is None and settings["crop_multiple"] is None:
+            settings |= images_of_side(side, settings["level"], base_level)
+        return settings | {"levels": chosen}
+    _check_single(chosen, base_level)
+    size = "rows" if settings["_target_"] == _EQUIRECT else "dim"
+    return settings | {size: side if settings[size] is None else settings[size]}
+
+
+def _check_single(levels: Sequence[int], base_level: int | None) -> None:
+    """Refuse settings that only tangent images have."""
+    if base_level is not None:
+        raise SettingError("base_level", found=base_level, expected="null, for these views")
+    if len(levels) > 1:
+        raise SettingError(
+            "levels",
+            found=list(levels),
+            expected="one level, for a network that does not take tangent images",
+            remedy="Use views=tangent for tangent images.",
+        )
+
+
 def panorama_settings(
-    trained: TrainedNetwork, levels: Levels = None, base_level: int | None = None
+    trained: TrainedNetwork,
+    levels: Levels = None,
+    base_level: int | None = None,
+    views: ViewChoice = None,
 ) -> dict[str, Any]:
     """Return the settings of the representation of panoramas, see `PanoramaViews`.
 
@@ -237,32 +317,35 @@ def panorama_settings(
         trained: The network.
         levels: See `Levels`.
         base_level: Base level b of tangent images; None as trained.
+        views: See `ViewChoice`.
 
     Raises:
-        SettingError: The representation does not support several levels.
+        SettingError: The representation does not have these settings.
     """
-    chosen = None if levels is None else level_list(levels, trained.level)
-    level = trained.level if chosen is None else max(chosen)
-    settings: dict[str, Any] = dict(trained.representation)
-    kind = settings["_target_"]
-    if kind == _PERSPECTIVE or (base_level is not None and kind != _TANGENT):
+    side, settings = trained.photo_side, dict(trained.representation)
+    if side is not None and views is not None:
+        return photo_network_settings(side, levels, base_level, views)
+    chosen = [trained.level] if levels is None else level_list(levels, trained.level)
+    level = max(chosen)
+    if views is not None:
+        settings = view_settings(views)
+    elif settings["_target_"] == _PERSPECTIVE or (
+        base_level is not None and settings["_target_"] != _TANGENT
+    ):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
-    is_tangent = settings["_target_"] == _TANGENT
-    if is_tangent and base_level not in (None, settings["base_level"]):
-        settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
-    if level != trained.level:
+    if level != trained.level and views is None:
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = level
-    if is_tangent and chosen is not None:
+    if settings["_target_"] != _TANGENT:
+        _check_single(chosen, base_level)
+        if side is not None and "dim" in settings:
+            settings["dim"] = settings["dim"] or side
+        return settings
+    if base_level not in (None, settings["base_level"]):
+        settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
+    if levels is not None:
         settings["levels"] = chosen if len(chosen) > 1 else None
-    elif chosen is not None and len(chosen) > 1:
-        raise SettingError(
-            "levels",
-            found=chosen,
-            expected="one level, for a network that does not take tangent images",
-            remedy="Give base_level= to use tangent images.",
-        )
-    if is_tangent and (side := trained.photo_side) is not None:
+    if side is not None:
         dim = settings.get("dim")
         # The network divides larger images.
         settings |= (
@@ -272,14 +355,14 @@ def panorama_settings(
 
 
 def _built(
-    trained: TrainedNetwork, settings: dict[str, Any]
+    trained: TrainedNetwork, settings: dict[str, Any], source: SettingsFile | None
 ) -> PinholeRepresentation | EquirectRepresentation:
     """Build the representation from settings.
 
     Raises:
         SettingError: The network does not support its image size.
     """
-    built: Any = build_from_config(settings, "representation", trained.source)
+    built: Any = build_from_config(settings, "representation", source)
     check_size(trained, built.image_size)
     return built
 
@@ -293,7 +376,8 @@ def _photo_representation(
         half_extent /= 2.0 ** (level - trained.level)
         size = trained.image_size
     else:
-        seen = _built(trained, panorama_settings(trained, level, base_level))
+        views = "tangent" if trained.photo_level is not None else None
+        seen = _built(trained, panorama_settings(trained, level, base_level, views), trained.source)
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
         size, half_extent = seen.image_size, seen.grid.half_size[0]

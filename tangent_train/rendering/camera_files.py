@@ -1,4 +1,4 @@
-"""Files with the cameras of tangent images: ``cameras.json``, and COLMAP's ``rig_config.json``.
+"""Files with the cameras of pinhole images: ``cameras.json``, and COLMAP's ``rig_config.json``.
 
 Their world frame is right-handed: x forward (to the middle column of the panorama), y left, z up.
 `FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
@@ -7,6 +7,7 @@ Their world frame is right-handed: x forward (to the middle column of the panora
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
 from tangent_train.files import parse_json, write_text
-from tangent_train.geometry import FLIP_Y, PanoramaPose, TangentGrid, checked_rotation
+from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 from tangent_train.registry import Text, check_fields
 
 CAMERAS_FILE = "cameras.json"
@@ -40,6 +41,8 @@ _CONVENTIONS = {
     "world_from_camera · d in the world. All cameras stand at the origin.",
     "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null if it "
     "is not rotated.",
+    "views": "world_from_camera of all views. Tangent images are determined by base_level, level, "
+    "dim and icosahedron_rotation.",
     "fov_deg": "Angle across the middle of an image, from edge to edge.",
 }
 _POSES = {
@@ -53,14 +56,17 @@ _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Matches lists of numbers, which are written on one line."""
 
 _EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
-_KINDS: dict[str, Any] = {
-    "format": Literal["tangent images"],
-    "source": dict,
+_KINDS: dict[str, Any] = {"format": Literal["tangent images"], "source": dict, "images": list}
+_KINDS_OF_TANGENT: dict[str, Any] = {
     "base_level": int,
     "level": int,
     "dim": int,
     "icosahedron_rotation": list[list[float]] | None,
-    "images": list,
+}
+_KINDS_OF_VIEWS: dict[str, Any] = {
+    "views": list[list[list[float]]],
+    "overlapping": bool,
+    "camera": dict,
 }
 
 
@@ -78,7 +84,7 @@ class CameraFile:
 
     source: str
     shape: tuple[int, int]
-    grid: TangentGrid
+    grid: PinholeGrid
     faces: tuple[int, ...]
     files: tuple[str, ...]
 
@@ -91,7 +97,15 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
         cameras: Content of the file. Its section ``conventions`` explains the fields.
     """
     grid = cameras.grid
-    rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
+    rows, columns = grid.size
+    described: dict[str, Any] = {
+        "views": [_world_from_camera(grid, face).tolist() for face in range(grid.num_images)],
+        "overlapping": grid.is_overlapping,
+    }
+    if isinstance(grid, TangentGrid):
+        rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
+        described = {"base_level": grid.base_level, "level": grid.level, "dim": grid.dim}
+        described |= {"icosahedron_rotation": rotation}
     content = {
         "format": _FORMAT,
         "conventions": _CONVENTIONS,
@@ -100,13 +114,10 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
             "height": cameras.shape[0],
             "width": cameras.shape[1],
         },
-        "base_level": grid.base_level,
-        "level": grid.level,
-        "dim": grid.dim,
-        "icosahedron_rotation": rotation,
+        **described,
         "camera": {
-            "width": grid.dim,
-            "height": grid.dim,
+            "width": columns,
+            "height": rows,
             "matrix": grid.camera_matrix.tolist(),
             "fov_deg": grid.width_deg,
         },
@@ -122,7 +133,7 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
     _write_json(path, content)
 
 
-def _world_from_camera(grid: TangentGrid, face: int) -> NDArray[np.float64]:
+def _world_from_camera(grid: PinholeGrid, face: int) -> NDArray[np.float64]:
     """Return the ``(3, 3)`` rotation from camera axes to the right-handed world of the files."""
     return np.asarray(FLIP_Y @ grid.world_from_camera[face])
 
@@ -145,7 +156,9 @@ def read_cameras(path: Path) -> CameraFile:
         content = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
-    fields = check_fields(path, content, _KINDS, _EXPECTED)
+    is_tangent = not (isinstance(content, Mapping) and "views" in content)
+    of_grid = _KINDS_OF_TANGENT if is_tangent else _KINDS_OF_VIEWS
+    fields = check_fields(path, content, _KINDS | of_grid, _EXPECTED)
     kinds: dict[str, Any] = {"height": int, "width": int}
     source = check_fields(path, fields["source"], kinds, _EXPECTED, "source")
     kinds = {"file": Text, "face": int}
@@ -157,14 +170,28 @@ def read_cameras(path: Path) -> CameraFile:
     if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
         raise DataError(path, found="an image twice", expected=_EXPECTED)
     try:
-        rotation = fields["icosahedron_rotation"]
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
-            in_world = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
-            grid = TangentGrid(fields["base_level"], fields["level"], fields["dim"], in_world)
+            grid = _grid_of(path, fields)
         grid.face_indices(faces)
     except (ValueError, OverflowError) as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
     return CameraFile(str(fields["source"].get("file")), shape, grid, faces, files)
+
+
+def _grid_of(path: Path, fields: Mapping[str, Any]) -> PinholeGrid:
+    """Return the grid that the fields of a file describe."""
+    if "views" not in fields:
+        rotation = fields["icosahedron_rotation"]
+        in_world = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
+        return TangentGrid(fields["base_level"], fields["level"], fields["dim"], in_world)
+    kinds: dict[str, Any] = {"width": int, "height": int, "matrix": list[list[float]]}
+    camera = check_fields(path, fields["camera"], kinds, _EXPECTED, "camera")
+    axes = np.array([FLIP_Y @ checked_rotation(view) for view in fields["views"]])
+    size = camera["height"], camera["width"]
+    focal = float(np.array(camera["matrix"], np.float64).reshape(3, 3)[0, 0])
+    if not (len(axes) and 2 <= min(size) <= max(size) <= _MOST_PIXELS and 0 < focal < math.inf):
+        raise ValueError(f"a camera of {size} pixels with a focal length of {focal}")
+    return PinholeGrid(axes, size, 1 / focal, is_overlapping=fields["overlapping"])
 
 
 @dataclass(frozen=True)
@@ -187,7 +214,7 @@ class RigFile:
 
 
 def write_rig(
-    path: Path, grid: TangentGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
+    path: Path, grid: PinholeGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
 ) -> None:
     """Write a ``rig_config.json`` for COLMAP 3.12 or later.
 
@@ -202,7 +229,7 @@ def write_rig(
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    focal, center = 1 / grid.pitch, grid.dim / 2
+    focal, (rows, columns) = 1 / grid.pitch, grid.size
     reference = _world_from_camera(grid, next(iter(faces.values())))
     cameras: list[dict[str, Any]] = []
     for prefix, face in faces.items():
@@ -217,7 +244,7 @@ def write_rig(
                 "image_prefix": prefix,
                 **(of_rig if cameras else {"ref_sensor": True}),
                 "camera_model_name": "PINHOLE",
-                "camera_params": (focal, focal, center, center),
+                "camera_params": (focal, focal, columns / 2, rows / 2),
                 "world_from_camera": axes.tolist(),
             }
         )

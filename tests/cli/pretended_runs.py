@@ -14,8 +14,8 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.cli.command_settings import check_settings
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer import transfer
+from tangent_train.files import config_folder
 from tests.cli.tiny_runs import SMALL_ROOMS
 from tests.results.made_records import made_record
 

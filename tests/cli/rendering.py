@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.render import render
+from tangent_train.files import config_folder
 from tangent_train.geometry import equirect_directions
 
 Refused = Callable[..., str]

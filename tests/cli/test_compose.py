@@ -14,9 +14,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder, literal_paths, path_text, quoted
+from tangent_train.cli.compose import literal_paths, path_text, quoted
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import config_folder
 from tests.running import composed
 
 EXPERIMENTS = sorted(

@@ -11,8 +11,8 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 
 from tangent_train.cli import transfer_stages
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build, build_data
+from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World

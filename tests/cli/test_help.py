@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.help import annotate, description, read_settings
+from tangent_train.files import config_folder
 from tests.running import composed
 
 CONFIGS = config_folder()

@@ -11,12 +11,13 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from torchvision import models as torchvision_models
 
 import tangent_train as tt
 from models import UNet
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -243,6 +244,67 @@ def test_wide_views_leave_no_gaps(side: int) -> None:
         assert 70 < math.degrees(2 * math.atan(grid.dim / 2 * grid.pitch)) < 150
 
 
+def _write_room() -> NDArray[np.uint8]:
+    """Blurred noise of high contrast, in room.png."""
+    rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
+    rgb = cv2.GaussianBlur(rgb, (0, 0), 3)
+    rgb = ((rgb.astype(np.float32) - 127) * 6 + 127).clip(0, 255).astype(np.uint8)
+    cv2.imwrite("room.png", rgb[..., ::-1])
+    return rgb
+
+
+def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys: Capture) -> None:
+    """Stored by the import, or chosen later: in a command and in Python, with the same labels."""
+    run("import", *OF_ONNX, "output=plain.onnx")
+    run("import", *OF_ONNX, "output=level.onnx", "views=ring_economy")
+    assert "panoramas: 14 views of 32 × 32 (100° wide, 0.2 pixels" in capsys.readouterr().out
+    trained = load_trained(here / "level.onnx")
+    assert (trained.level, trained.photo_side, trained.image_size) == (5, 32, (32, 32))
+    assert trained.representation["dim"] == 32
+    rgb = _write_room()
+    expected = tt.load("level.onnx").labels(rgb)
+    predict(checkpoint="plain.onnx", input="room.png", output="out", views="ring_economy")
+    assert "labeled in 14 views of 32 × 32" in capsys.readouterr().out
+    found = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
+    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(tt.load("plain.onnx", views="ring_economy").labels(rgb), expected)
+    assert (tt.load("level.onnx", views="tangent").labels(rgb) != expected).any()
+    both = (tt.load(name, views="tangent").labels(rgb) for name in ("level.onnx", "plain.onnx"))
+    np.testing.assert_array_equal(*both)
+    sizes = {
+        "ring": (18, (32, 32)),
+        "erp": (1, (32, 64)),
+        "cubemap": (6, (32, 32)),
+        "tangent": (40, (32, 32)),
+        "tangent_economy_16": (40, (32, 32)),
+    }
+    for option, (count, size) in sizes.items():
+        views = PanoramaViews(load_trained(here / "plain.onnx"), views=option)
+        assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
+    twice = PanoramaViews(trained, rotations=2, views={"option": "ring", "fov": [110, 100]})
+    assert str(twice).startswith("36 views of 32 × 32 (110° wide")
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"views": "rings"}, r"views: found rings; expected an option: cubemap, erp, .*, ring, "),
+        ({"views": "perspective"}, "views: found perspective"),
+        ({"views": {"fov": 90}}, "views: found"),
+        ({"views": {"option": "ring", "fow": 90}}, r"representation.*fow"),
+        ({"views": {"option": "ring", "fov": 80}}, "18 views that miss"),
+        ({"views": "ring", "base_level": 1}, "base_level: found 1"),
+        ({"views": "ring", "levels": [5, 4]}, "levels: found"),
+    ],
+)
+def test_impossible_views_are_refused(
+    given: dict[str, Any], message: str, here: Path, run: Run
+) -> None:
+    run("import", *OF_ONNX, "output=ours.onnx")
+    with pytest.raises(SettingError, match=message):
+        tt.load(here / "ours.onnx", **given)
+
+
 def test_an_unknown_size_is_512(here: Path, run: Run) -> None:
     """Networks that take any size have views of one side too."""
     torch.manual_seed(0)
@@ -309,10 +371,7 @@ def test_labels_without_settings_are_those_of_both_levels(
 ) -> None:
     """The same in tangent-predict and in Python; one setting halves the number of views."""
     run("import", *OF_ONNX, "output=ours.onnx")
-    rgb = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
-    rgb = cv2.GaussianBlur(rgb, (0, 0), 3)
-    rgb = ((rgb.astype(np.float32) - 127) * 6 + 127).clip(0, 255).astype(np.uint8)
-    cv2.imwrite("room.png", rgb[..., ::-1])
+    rgb = _write_room()
     labels: dict[str, Any] = {}
     settings: dict[str, dict[str, Any]] = {
         "default": {},

@@ -116,7 +116,7 @@ def test_a_folder_of_panoramas_and_back(tmp_path: Path, refused: Refused) -> Non
 def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
     write_pixels(tmp_path / "a.png", smooth(90))
     render_with(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
-    assert read_cameras(tmp_path / "tan" / "a" / "cameras.json").grid.level == 5
+    assert read_cameras(tmp_path / "tan" / "a" / "cameras.json").grid == TangentGrid(0, 5)
     # A checkerboard of single pixels: averaged it is gray, sampled it would be black and white.
     board = np.where(np.indices((128, 256)).sum(axis=0) % 2, 255, 0)
     write_pixels(tmp_path / "board.png", board[..., None].repeat(3, axis=2).astype(np.uint8))
@@ -188,6 +188,39 @@ def test_features_of_another_resolution(
     found = panorama[..., :3] / np.linalg.norm(panorama[..., :3], axis=-1, keepdims=True)
     away = np.degrees(np.arccos((found * expected).sum(-1).clip(-1, 1)))
     assert away.max() < (0.1 if blend == "nearest" else 3)
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Refused) -> None:
+    """Rows unlike columns; results of half the size, and directions computed from the file."""
+    write_pixels(tmp_path / "room.png", smooth(64))
+    views = {"option": "ring_economy", "fov": [110, 90], "dim": [40, 56]}
+    render_with(input=tmp_path / "room.png", output=tmp_path / "level", views=views)
+    render_with(back=tmp_path / "level", output=tmp_path / "colors", blend=blend)
+    colors = _read(tmp_path / "colors" / "room.png").astype(int)
+    assert np.abs(colors - smooth(64)).max() <= 12
+    content = json.loads((tmp_path / "level" / "room" / "cameras.json").read_text())
+    assert len(content["images"]) == 14
+    (tmp_path / "features").mkdir()
+    focal = content["camera"]["matrix"][0][0] / 2
+    x, y = np.meshgrid((np.arange(28) - 13.5) / focal, (np.arange(20) - 9.5) / focal)
+    for image in content["images"]:
+        world = np.stack([x, y, np.ones_like(x)], axis=-1) @ np.array(image["world_from_camera"]).T
+        np.save(tmp_path / "features" / f"{Path(image['file']).stem}.npy", world.astype(np.float32))
+    settings = {"back": tmp_path / "features", "cameras": tmp_path / "level" / "room"}
+    render_with(output=tmp_path / "back.npy", blend=blend, height=20, **settings)
+    found = np.load(tmp_path / "back.npy")
+    found /= np.linalg.norm(found, axis=-1, keepdims=True)
+    expected = equirect_directions((20, 40)) * (1, -1, 1)  # the world has y to the left
+    away = np.degrees(np.arccos((found * expected).sum(-1).clip(-1, 1)))
+    assert away.max() < (0.1 if blend == "nearest" else 3)
+    np.save(tmp_path / "features" / "face_003.npy", np.zeros((20, 20, 3), np.float32))
+    message = refused(output=tmp_path / "no.npy", **settings)
+    assert "face_003.npy: found float32 of shape (20, 20, 3)" in message
+    for setting, value in (("views", "erp"), ("base_level", 0), ("figure", "a.png")):
+        given = {"views": views} | {setting: value}
+        message = refused(input=tmp_path / "room.png", output=tmp_path / "no", **given)
+        assert f"{setting}: found" in message
 
 
 @pytest.mark.parametrize(
@@ -362,7 +395,7 @@ def test_settings_that_cannot_work(
         (
             {"face_003.png": (16, 16, 3)},
             {},
-            r"003\.png: found uint8 .*; expected squares, .* 32×",
+            r"003\.png: found uint8 .*; expected that of the first file: .*32",
         ),
         ({}, {"kind": "labels"}, "expected labels.*Choose kind=.*one channel"),
         ({}, {"z_depth": True}, "z_depth: found true for color"),

@@ -12,7 +12,7 @@ import pytest
 from PIL import Image
 
 from datamodules.images.pixel_files import read_pixels, write_pixels
-from tangent_train.geometry import FLIP_Y, TangentGrid, random_rotation
+from tangent_train.geometry import FLIP_Y, PinholeGrid, RingGrid, TangentGrid, random_rotation
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.rendering import read_rig
 from tests.cli.rendering import Refused, render_with, smooth
@@ -22,6 +22,7 @@ from tests.geometry.directions import angle_deg, random_directions
 pycolmap = pytest.importorskip("pycolmap")
 pycolmap.logging.minloglevel = 2
 NAMES = ("hall/room.png", "kitchen/room.png")
+RINGS = ((0, 8), (40, 5), (-40, 5))
 FRAMES = ("hall__room.png", "kitchen__room.png")
 
 
@@ -32,9 +33,23 @@ def panoramas(tmp_path: Path) -> Path:
     return tmp_path / "in"
 
 
+VIEWS: dict[str, tuple[dict[str, Any], PinholeGrid]] = {
+    "tangent": ({"base_level": 0}, TangentGrid(0, 5)),
+    "ring": (
+        {"views": {"option": "ring", "fov": [110, 100]}},
+        RingGrid([{"pitch": p, "views": n} for p, n in RINGS], (110, 100), (40, 40)),
+    ),
+}
+
+
+@pytest.fixture(params=["tangent"])
+def views(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
 @pytest.fixture
-def project(panoramas: Path, tmp_path: Path) -> Path:
-    settings = {"base_level": 0, "rotation": [30, 10, 5]}
+def project(panoramas: Path, tmp_path: Path, views: str) -> Path:
+    settings = VIEWS[views][0] | {"rotation": [30, 10, 5]}
     render_with(input=panoramas, output=tmp_path / "project", colmap=True, **settings)
     return tmp_path / "project"
 
@@ -50,22 +65,28 @@ def _database(project: Path) -> Any:
     return database
 
 
-def _grid(project: Path) -> TangentGrid:
-    """The images by the matrix of the first camera: the icosahedron is turned as a whole."""
+def _grid(project: Path, resting: PinholeGrid = TangentGrid(0, 5)) -> PinholeGrid:  # noqa: B008
+    """The images by the matrix of the first camera: all are turned as a whole."""
     first = next(iter(read_rig(project / "rig_config.json").world_from_camera.values()))
-    return TangentGrid(0, 5, rotation=FLIP_Y @ first @ TangentGrid(0, 5).world_from_camera[0].T)
+    return resting.with_rotation(FLIP_Y @ first @ resting.world_from_camera[0].T)
 
 
 # Rigs and cameras.
 
 
-def test_directions_are_where_colmap_projects_them(project: Path) -> None:
+@pytest.mark.parametrize("views", VIEWS, indirect=True)
+def test_directions_are_where_colmap_projects_them(project: Path, views: str) -> None:
     """Two frames of one rig; 500 directions in all views of both panoramas."""
-    grid = _grid(project)
+    grid = _grid(project, VIEWS[views][1])
+    count, (height, width) = grid.num_images, grid.size
     directions = random_directions(500)
     with _database(project) as database:
         (rig,) = database.read_all_rigs()
-        assert (rig.num_sensors(), database.num_frames(), database.num_images()) == (20, 2, 40)
+        assert (rig.num_sensors(), database.num_frames(), database.num_images()) == (
+            count,
+            2,
+            2 * count,
+        )
         frames: dict[str, list[int]] = {}
         for frame in database.read_all_frames():
             images = [database.read_image(data.id) for data in frame.data_ids]
@@ -74,7 +95,11 @@ def test_directions_are_where_colmap_projects_them(project: Path) -> None:
             for image in images:
                 face = int(image.name[5:8])
                 camera = database.read_camera(image.camera_id)
-                assert (camera.model.name, camera.width, camera.height) == ("PINHOLE", 32, 32)
+                assert (camera.model.name, camera.width, camera.height) == (
+                    "PINHOLE",
+                    width,
+                    height,
+                )
                 assert camera.has_prior_focal_length
                 sensor = camera.sensor_id
                 is_first = rig.is_ref_sensor(sensor)
@@ -88,14 +113,14 @@ def test_directions_are_where_colmap_projects_them(project: Path) -> None:
                 np.testing.assert_allclose(found - 0.5, expected, atol=1e-9)
                 # The pixel itself shows that direction.
                 columns, rows = np.floor(found).astype(int).T
-                inside = (np.floor(found) >= 0).all(axis=1) & (np.floor(found) < 32).all(axis=1)
+                inside = ((np.floor(found) >= 0) & (np.floor(found) < (width, height))).all(axis=1)
                 shown = read_pixels(project / "images" / image.name, indices=False)
                 colors = shown[rows[inside], columns[inside]] / 127.5 - 1
                 away = angle_deg(colors, directions[seen][inside])
                 assert len(away) > 20
                 assert away.max() < 5  # a pixel's diagonal and the rounding of colors
                 assert away.mean() < 2
-        assert frames == {name: list(range(20)) for name in FRAMES}
+        assert frames == {name: list(range(count)) for name in FRAMES}
 
 
 def test_sizes_differ_and_one_is_broken(panoramas: Path, tmp_path: Path, refused: Refused) -> None:

@@ -10,9 +10,9 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.command_settings import SETTINGS
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.setting_names import check_names
 from tangent_train.errors import SettingError
+from tangent_train.files import config_folder
 from tests.cli import tiny_runs
 from tests.cli.tiny_runs import Run, results
 from tests.running import composed

@@ -10,10 +10,10 @@ from hydra import initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.cli.transfer_views import views_of
 from tangent_train.errors import SettingError
+from tangent_train.files import config_folder
 from tangent_train.inference.representations import check_size
 from tangent_train.registry import build_from_config
 from tests.inference.trained import trained_network

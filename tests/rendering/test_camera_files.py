@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.geometry import TangentGrid, random_rotation
+from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid, random_rotation
 from tangent_train.rendering import (
     CameraFile,
     equirect_to_tangent,
@@ -21,11 +21,17 @@ from tangent_train.rendering import (
 )
 
 ROTATION = random_rotation(np.random.default_rng(3))
-GRIDS = [TangentGrid(0, 4), TangentGrid(1, 6, dim=25, rotation=ROTATION)]
+RINGS = [{"pitch": pitch, "views": 8} for pitch in (0, 45, -45)]
+GRIDS: list[PinholeGrid] = [
+    TangentGrid(0, 4),
+    TangentGrid(1, 6, dim=25, rotation=ROTATION),
+    RingGrid(RINGS, (80, 100), (30, 21), ROTATION),
+]
+CAMERA = {"width": 21, "height": 30, "matrix": np.eye(3).tolist()}
 FACES = (0, 7, 11, 19)
 
 
-def _cameras(grid: TangentGrid, faces: tuple[int, ...] = FACES) -> CameraFile:
+def _cameras(grid: PinholeGrid, faces: tuple[int, ...] = FACES) -> CameraFile:
     files = tuple(f"face_{face:03}.png" for face in faces)
     return CameraFile("room (1).jpg", (100, 200), grid, faces, files)
 
@@ -39,20 +45,25 @@ def _world_panorama(height: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("grid", GRIDS)
-def test_pixels_are_at_the_positions_in_the_file(grid: TangentGrid, tmp_path: Path) -> None:
+def test_pixels_are_at_the_positions_in_the_file(grid: PinholeGrid, tmp_path: Path) -> None:
     path, cameras = tmp_path / "new folder" / "cameras.json", _cameras(grid)
     write_cameras(path, cameras)
-    assert read_cameras(path) == cameras
+    again = read_cameras(path)
+    assert (again == cameras) is isinstance(grid, TangentGrid)
+    assert (again.faces, again.files) == (cameras.faces, cameras.files)
+    assert again.grid.is_overlapping is grid.is_overlapping
+    np.testing.assert_allclose(again.grid.directions(), grid.directions(), atol=1e-12)
     content = json.loads(path.read_text())
     seen = equirect_to_tangent(_world_panorama(500), grid, FACES)
     matrix = np.array(content["camera"]["matrix"])
-    assert content["camera"]["width"] == content["camera"]["height"] == grid.dim
-    edge_deg = np.degrees(2 * np.arctan(grid.dim / 2 / matrix[0, 0]))
+    rows, columns = grid.size
+    assert (content["camera"]["height"], content["camera"]["width"]) == grid.size
+    edge_deg = np.degrees(2 * np.arctan(columns / 2 / matrix[0, 0]))
     assert content["camera"]["fov_deg"] == pytest.approx(edge_deg)
     for image, shown in zip(content["images"], seen, strict=True):
         rotation = np.array(image["world_from_camera"])
         assert np.linalg.det(rotation) == pytest.approx(1)
-        for row, column in ((0, 0), (3, 11), (grid.dim - 1, 2)):
+        for row, column in ((0, 0), (3, 11), (rows - 1, 2)):
             ray = rotation @ np.linalg.inv(matrix) @ (column, row, 1)
             np.testing.assert_allclose(shown[row, column], ray / np.linalg.norm(ray), atol=5e-4)
 
@@ -66,6 +77,18 @@ def test_pixels_are_at_the_positions_in_the_file(grid: TangentGrid, tmp_path: Pa
         ({"source": {"file": "a.png", "height": 0, "width": 4}}, r"\(0, 4\) pixels"),
         ({"source": {"file": "a.png", "height": 4, "width": 2**20 + 1}}, "pixels"),
         ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
+        ({"views": []}, "a camera of"),
+        ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, -1]]]}, "rotation"),
+        ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]]}, "indices 0 to 0"),
+        (
+            {"camera": {"width": 21, "height": 1, "matrix": np.eye(3).tolist()}},
+            r"of \(1, 21\) pixels",
+        ),
+        (
+            {"camera": {"width": 21, "height": 30, "matrix": (-9 * np.eye(3)).tolist()}},
+            "length of -9",
+        ),
+        ({"camera": CAMERA | {"matrix": [[]]}}, "reshape"),
         ({"images": [{"file": "a.png"}]}, "no face"),
         ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),
         ({"images": [{"file": "a.png", "face": 1}, {"file": "a.jpg", "face": 2}]}, "twice"),
@@ -76,7 +99,7 @@ def test_inconsistent_files_are_refused(
     changes: dict[str, Any], message: str, tmp_path: Path
 ) -> None:
     path = tmp_path / "cameras.json"
-    write_cameras(path, _cameras(GRIDS[0]))
+    write_cameras(path, _cameras(GRIDS[2 if {"views", "camera"} & changes.keys() else 0]))
     content = json.loads(path.read_text()) | changes
     path.write_text(json.dumps({key: value for key, value in content.items() if value != "gone"}))
     with pytest.raises(DataError, match=rf"cameras\.json: .*{message}"):

@@ -6,7 +6,6 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -28,14 +27,12 @@ from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
 from tangent_train.inference.representations import (
     Levels,
+    ViewChoice,
     check_size,
-    images_of_side,
-    wide_levels,
+    photo_network_settings,
 )
-from tangent_train.registry import unregistered
-from tangent_train.rendering.representations.pinhole import level_list
+from tangent_train.registry import build_from_config, unregistered
 
-_TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PHOTO_LEVELS = (5, 13)
 
 
@@ -46,6 +43,7 @@ def import_network(
     fov_deg: float = 60.0,
     levels: Levels = None,
     base_level: int | None = None,
+    views: ViewChoice = None,
     unknown_classes: Collection[str] = (),
     unknown_wins: bool = True,
     image_size: tuple[int, int] | None = None,
@@ -57,8 +55,9 @@ def import_network(
         network: The network; it is set to evaluation mode.
         path: File to write: ``.ckpt``, or ``.onnx`` for a network from an ONNX file.
         fov_deg: Horizontal field of view of the photos it was trained on, for labels of photos.
-        levels: Levels s of the tangent images; None for `wide_levels`.
-        base_level: Base level b of the tangent images; None for the fewest images.
+        levels: See `photo_network_settings`.
+        base_level: See `photo_network_settings`.
+        views: See `photo_network_settings`.
         unknown_classes: Names of scores that are not classes, such as a background.
         unknown_wins: True if these scores may win; such pixels are unknown (label 0).
         image_size: Fixed rows and columns of the network's images; None for the size of its
@@ -87,18 +86,16 @@ def import_network(
     multiple = None if network.fixed_size else size_multiple_of(scores, 3)
     # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
-    chosen = wide_levels(side) if levels is None else level_list(levels, 0)
-    level = max(chosen)
-    seen: dict[str, Any] = {"_target_": _TANGENT, "level": level, "levels": chosen}
-    seen |= images_of_side(side, level, base_level)
+    seen = photo_network_settings(side, levels, base_level, views)
+    size = build_from_config(seen, "representation").image_size
     described = TrainedNetwork(
         inner=network.network,
         class_names=tuple(names),
         inputs=("rgb",),
         normalization=network.normalization,
-        level=level,
+        level=seen["level"],
         representation=seen,
-        image_size=(seen["dim"], seen["dim"]),
+        image_size=size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else network.image_size,
         photo_level=_photo_level(network.image_size[1], fov_deg),

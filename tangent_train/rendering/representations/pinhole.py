@@ -22,7 +22,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.geometry.area_views import best_views, views_of_area
-from tangent_train.geometry.coverage import check_coverage
+from tangent_train.geometry.coverage import check_joint_coverage
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
@@ -44,9 +44,11 @@ class PinholeRepresentation:
         rotations: Number of rotations about the vertical to average over.
         faces_per_panorama: Number of random images in a training sample; all by default.
         is_partial: True if the images do not cover the sphere.
+        is_joint: True if only all grids together cover what the representation covers.
 
     Attributes:
         grid: Images of `level`, not rotated.
+        grids: Images of each level to average over, not rotated.
 
     Raises:
         SettingError: A setting is invalid.
@@ -67,6 +69,7 @@ class PinholeRepresentation:
         rotations: int,
         faces_per_panorama: int | None = None,
         is_partial: bool = False,
+        is_joint: bool = False,
     ) -> None:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
@@ -84,10 +87,10 @@ class PinholeRepresentation:
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
         self.blend = blend
         self.faces_per_panorama = faces_per_panorama
-        self._grids = grids
+        self.grids = grids
         self._rotations = vertical_rotations(rotations, self.symmetry_deg)
         self._area: SphereArea | None = None
-        self._is_partial = is_partial
+        self._is_partial, self._is_joint = is_partial, is_joint
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -99,7 +102,7 @@ class PinholeRepresentation:
         rotated = copy.copy(self)
         rotation_or_none = unless_identity(rotation)
         rotated.grid = self.grid.with_rotation(rotation_or_none)
-        rotated._grids = [grid.with_rotation(rotation_or_none) for grid in self._grids]
+        rotated.grids = [grid.with_rotation(rotation_or_none) for grid in self.grids]
         return rotated
 
     def limited_to(self, area: SphereArea | None) -> Self:
@@ -120,39 +123,71 @@ class PinholeRepresentation:
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
         """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
-        grid = self.grid
+        return self._sample(rng, self.grid, *self._needed([self.grid], is_resting=True))
+
+    def _sample(
+        self,
+        rng: np.random.Generator,
+        grid: PinholeGrid,
+        needed: NDArray[np.int64],
+        most: int | None = None,
+    ) -> PinholeViews:
+        """Return `sample` of one grid.
+
+        Args:
+            rng: Random generator.
+            grid: The grid.
+            needed: Images that the area needs without rotation.
+            most: Maximum number of images; None for all that are needed.
+        """
         if self.random_rotation != "none":
             yaw = self.random_rotation == "yaw"
             angle = rng.uniform(0, 2 * math.pi)
             rotation = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
             grid = _rotated(grid, rotation)
-        faces = None if self._area is None else self._trained_faces(grid, self._area)
-        if self.faces_per_panorama is not None:
+        faces = None if self._area is None else needed
+        if self._area is not None and not (grid.rotation is None is self._area.rotation):
+            faces = best_views(grid, self._area, len(needed))
+        limits = [count for count in (self.faces_per_panorama, most) if count is not None]
+        if limits:
             available = grid.num_images if faces is None else faces
-            most = grid.num_images if faces is None else len(faces)
-            faces = rng.choice(available, min(self.faces_per_panorama, most), replace=False)
+            faces = rng.choice(available, min(*limits, len(needed)), replace=False)
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
 
-    def _trained_faces(self, grid: PinholeGrid, area: SphereArea) -> NDArray[np.int64]:
-        """Return the images of a training sample, see `limited_to`."""
-        resting = replace(area, rotation=None)
-        faces = self._needed(grid.with_rotation(None), resting)
-        is_resting = grid.rotation is None and area.rotation is None
-        return faces if is_resting else best_views(grid, area, len(faces))
+    def _needed(
+        self, grids: Sequence[PinholeGrid], *, is_resting: bool = False
+    ) -> list[NDArray[np.int64]]:
+        """Return the images of grids, under one rotation, that the area needs.
 
-    def _needed(self, grid: PinholeGrid, area: SphereArea) -> NDArray[np.int64]:
-        blend = blend_of(self.blend, is_overlapping=grid.is_overlapping)
-        return views_of_area(grid, area, by_owners=blend == "nearest")
+        Args:
+            grids: Grids to average over, or grids of a joint representation.
+            is_resting: True to ignore the rotations of grids and area.
+        """
+        area = self._area
+        if area is None:
+            return [grid.face_indices() for grid in grids]
+        if is_resting:
+            area, grids = replace(area, rotation=None), [g.with_rotation(None) for g in grids]
+        if self._is_joint:
+            return views_of_area(grids, area)
+        blends = (blend_of(self.blend, is_overlapping=grid.is_overlapping) for grid in grids)
+        return [
+            views_of_area([grid], area, by_owners=blend == "nearest")[0]
+            for grid, blend in zip(grids, blends, strict=True)
+        ]
 
     def view_sets(self) -> list[PinholeViews]:
         """Return all images of every level in every rotation."""
-        grids = [_rotated(grid, r) for grid in self._grids for r in self._rotations]
-        if self._is_partial:
-            for grid in grids:
-                check_coverage(grid, self._area, by_owners=self.blend == "nearest")
+        turned = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
+        for grids in turned if self._is_partial else ():
+            check_joint_coverage(grids, self._area)
         if self._area is not None:
-            grids = [grid.subset(self._needed(grid, self._area)) for grid in grids]
-        return [PinholeViews(grid) for grid in grids]
+            needed = map(self._needed, turned)
+            turned = [
+                [grid.subset(faces) for grid, faces in zip(*of_rotation, strict=True) if len(faces)]
+                for of_rotation in zip(turned, needed, strict=True)
+            ]
+        return [PinholeViews(grid) for grids in zip(*turned, strict=True) for grid in grids]
 
 
 @registered

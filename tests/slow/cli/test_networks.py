@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from tangent_train.checkpoints.trained import load_trained
-from tangent_train.cli.compose import config_folder
 from tangent_train.cli.run import build
+from tangent_train.files import config_folder
 from tangent_train.inference.export import SUFFIXES, export_network
 from tests.running import composed_settings
 from tests.tasks.odd_networks import assert_same, scores_of, some_images

@@ -113,7 +113,11 @@ def _camera_seeds() -> list[bytes]:
     seeds = []
     with TemporaryDirectory() as folder:
         path = Path(folder) / "cameras.json"
-        for grid, faces in ((TangentGrid(0, 4), range(20)), (rotated, (3, 7))):
+        for grid, faces in (
+            (TangentGrid(0, 4), range(20)),
+            (rotated, (3, 7)),
+            (rotated.subset([3, 7]), (0,)),
+        ):
             files = tuple(f"{face:05d}.png" for face in faces)
             write_cameras(path, CameraFile("room.jpg", (64, 128), grid, tuple(faces), files))
             seeds.append(path.read_bytes())
@@ -123,7 +127,7 @@ def _camera_seeds() -> list[bytes]:
 def _read_camera_list(path: Path) -> None:
     cameras = read_cameras(path)
     assert len(cameras.faces) == len(cameras.files)
-    assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (cameras.grid.dim,) * 2 + (3,)
+    assert cameras.grid.directions(cameras.faces[:1]).shape[1:] == (*cameras.grid.size, 3)
 
 
 def _photo_camera_seeds() -> list[bytes]:
