@@ -123,7 +123,8 @@ class PinholeRepresentation:
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
         """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
-        return self._sample(rng, self.grid, *self._needed([self.grid], is_resting=True))
+        (needed,) = self._needed([self.grid], is_resting=True)
+        return self._sample(rng, self.grid, needed)
 
     def _sample(
         self,
@@ -178,16 +179,14 @@ class PinholeRepresentation:
 
     def view_sets(self) -> list[PinholeViews]:
         """Return all images of every level in every rotation."""
-        turned = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
-        for grids in turned if self._is_partial else ():
+        rotated = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
+        for grids in rotated if self._is_partial else ():
             check_joint_coverage(grids, self._area)
+        of_rotations = (zip(grids, self._needed(grids), strict=True) for grids in rotated)
+        pairs = [pair for of_grid in zip(*of_rotations, strict=True) for pair in of_grid]
         if self._area is not None:
-            needed = map(self._needed, turned)
-            turned = [
-                [grid.subset(faces) for grid, faces in zip(*of_rotation, strict=True) if len(faces)]
-                for of_rotation in zip(turned, needed, strict=True)
-            ]
-        return [PinholeViews(grid) for grids in zip(*turned, strict=True) for grid in grids]
+            pairs = [(grid.subset(faces), faces) for grid, faces in pairs if len(faces)]
+        return [PinholeViews(grid) for grid, _ in pairs]
 
 
 @registered
