@@ -117,6 +117,7 @@ class PredictSettings(InputSettings):
     max_tilt_deg: float
     mask: float | Path | None = field(metadata=_EXISTS)
     min_confidence: float
+    min_share: float
     write: tuple[Literal["labels", "color", "overlay", "probabilities"], ...]
     report: int
     overwrite: bool

@@ -127,7 +127,8 @@ class PanoramaViews:
         grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
-            return f"{text} ({_described(grids[0])})" if grids else text
+            parts = list(dict.fromkeys(map(_described, grids)))
+            return f"{text} ({'; '.join(parts)})" if parts else text
         parts = [f"level {level}: {_described(grid)}" for level, grid in tangent.items()]
         if len(parts) > 1:
             parts.append(f"levels={next(iter(tangent))} alone takes 1/{len(parts)} of the time")

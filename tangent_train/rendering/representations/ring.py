@@ -53,7 +53,7 @@ class RingRepresentation(PinholeRepresentation):
     def __init__(
         self,
         level: int,
-        rings: Sequence[Mapping[str, Any]],
+        rings: Sequence[Mapping[str, float | Sequence[float]]],
         fov: float | Sequence[float],
         dim: int | Sequence[int] | None = None,
         faces_per_panorama: int | None = None,
@@ -64,7 +64,7 @@ class RingRepresentation(PinholeRepresentation):
         rotations: int = 1,
         area: Sequence[float] | None = None,
     ) -> None:
-        by_fov: dict[tuple[float, float], list[dict[str, float]]] = {}
+        by_fov: dict[tuple[float, float], list[dict[str, Any]]] = {}
         for ring in rings:
             others = {name: value for name, value in ring.items() if name != "fov"}
             by_fov.setdefault(_pair(ring.get("fov", fov)), []).append(others)
