@@ -138,8 +138,8 @@ class SynPASS(PanoramaDataModule):
         labels: list[Path] = []
         for weather in self._weathers:
             place = Path(weather, split)
-            labels += (self.root / "semantic" / place).glob("*/*_trainID.png")
-            for rgb in sorted((self.root / "img" / place).glob("*/*.jpg")):
+            labels += (self.root / "semantic" / place).glob("*/[!.]*_trainID.png")
+            for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
         problems.note_strays(labels, found)
