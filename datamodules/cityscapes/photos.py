@@ -13,7 +13,7 @@ On disk, as released (`leftImg8bit_trainvaltest`, `gtFine_trainvaltest`, `camera
 
 The images of ``test`` are not read: their label images are dummies.
 
-License: free for academic research, https://www.cityscapes-dataset.com/license.
+License: non-commercial purposes such as research, https://www.cityscapes-dataset.com/license.
 
 Citation: M. Cordts, M. Omran, S. Ramos, T. Rehfeld, M. Enzweiler, R. Benenson, U. Franke, S. Roth,
 B. Schiele: "The Cityscapes Dataset for Semantic Urban Scene Understanding", CVPR 2016.

@@ -12,7 +12,7 @@ On disk, as released::
 Pixels are square in angle: 400 rows span 400 / 2048 · 360° = 70.3°. The row of the horizon is not
 published. The default is the middle, so that the panoramas reach from -35.15° to 35.15°.
 
-License: free for academic research, https://github.com/chma1024/DensePASS.
+License: not stated by its page, https://github.com/chma1024/DensePASS; ask the authors.
 
 Citation: C. Ma, J. Zhang, K. Yang, A. Roitberg, R. Stiefelhagen: "DensePASS: Dense Panoramic
 Semantic Segmentation via Unsupervised Domain Adaptation with Attention-Augmented Context Exchange",
