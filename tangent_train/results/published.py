@@ -90,6 +90,7 @@ class Publication(NamedTuple):
             "s": self.key["level"] or "–",
             "input": self.key["inputs"] or "–",
             "b": self.key["base_level"] or "–",
+            "folds": ", ".join(self.folds) or "–",
             **{name: protocol.get(name, "–") for name in shown},
         }
         return Row(f"{self.name} (paper)", records, columns, published=True)

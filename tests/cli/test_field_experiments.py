@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -18,7 +19,7 @@ from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World
-from tests.running import Patch, composed, composed_settings
+from tests.running import ROOT, Patch, composed, composed_settings
 
 SMALL = ("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0", "panels=0")
 SMALL_PHOTOS = ("photos.data.num_workers=0",)
@@ -51,8 +52,9 @@ def _with_a_small_network(command: str, experiment: str) -> list[str]:
     return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in removed)]
 
 
-def test_every_experiment_of_the_field_has_a_protocol() -> None:
-    assert PROTOCOLS.keys() == FILES
+def test_every_experiment_of_the_field_has_a_protocol_and_is_documented() -> None:
+    page = (ROOT / "docs" / "how-to" / "field_benchmarks.md").read_text()
+    assert PROTOCOLS.keys() == FILES == set(re.findall(r"(?<=`)field/\w+(?=`)", page))
 
 
 @pytest.mark.parametrize("experiment", sorted(PROTOCOLS))
