@@ -36,6 +36,7 @@ WORLDS: Mapping[str, World] = {
     ),
     "Matterport360": World(write_matterport),
     "Stanford2D3DS": World(fabricate),
+    "Stanford2D3DSPerspective": World(partial(fabricate, photos=2)),
     "Structured3D": World(write_structured3d),
     "SynPASS": World(write_synpass),
 }

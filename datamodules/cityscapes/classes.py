@@ -5,25 +5,9 @@ from __future__ import annotations
 from datamodules.core.labels import ClassSet, class_sets
 
 CLASSES: tuple[str, ...] = (
-    "road",
-    "sidewalk",
-    "building",
-    "wall",
-    "fence",
-    "pole",
-    "traffic light",
-    "traffic sign",
-    "vegetation",
-    "terrain",
-    "sky",
-    "person",
-    "rider",
-    "car",
-    "truck",
-    "bus",
-    "train",
-    "motorcycle",
-    "bicycle",
+    *("road", "sidewalk", "building", "wall", "fence", "pole", "traffic light"),
+    *("traffic sign", "vegetation", "terrain", "sky", "person", "rider", "car"),
+    *("truck", "bus", "train", "motorcycle", "bicycle"),
 )
 """The 19 classes in the order of `trainId`; the label of a class is its index plus one."""
 

@@ -11,7 +11,8 @@ On disk, as released::
 
 Weathers are cloud, fog, rain and sun; splits are train, val and test.
 
-License: free for academic research, https://github.com/jamycheung/Trans4PASS.
+License: that of the data is not stated; the authors ask to be contacted before commercial use,
+https://github.com/jamycheung/Trans4PASS.
 
 Citation: J. Zhang, K. Yang, H. Shi, S. Reiß, K. Peng, C. Ma, H. Fu, P. H. S. Torr, K. Wang,
 R. Stiefelhagen: "Behind Every Domain There is a Shift: Adapting Distortion-aware Vision
@@ -28,7 +29,7 @@ from typing import ClassVar, Literal
 
 from datamodules.cityscapes.classes import THIRTEEN
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.index import SPLITS, Split, draw_groups
+from datamodules.core.index import SPLITS, Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.labels import ClassSet, class_sets
 from datamodules.core.numbered import NumberedReader, number_table
@@ -38,28 +39,9 @@ from tangent_train.errors import DataError
 from tangent_train.registry import registered
 
 CLASSES: tuple[str, ...] = (
-    "building",
-    "fence",
-    "other",
-    "pedestrian",
-    "pole",
-    "road line",
-    "road",
-    "sidewalk",
-    "vegetation",
-    "vehicles",
-    "wall",
-    "traffic sign",
-    "sky",
-    "ground",
-    "bridge",
-    "rail track",
-    "ground rail",
-    "traffic light",
-    "static",
-    "dynamic",
-    "water",
-    "terrain",
+    *("building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk"),
+    *("vegetation", "vehicles", "wall", "traffic sign", "sky", "ground", "bridge"),
+    *("rail track", "ground rail", "traffic light", "static", "dynamic", "water", "terrain"),
 )
 """The 22 classes as labels 1 to 22, which are also the numbers in the files."""
 
@@ -112,37 +94,31 @@ class SynPASS(PanoramaDataModule):
         self._weathers = WEATHERS if given == ["all"] else tuple(given)
         fine = bool(self._weathers) and set(self._weathers) <= set(WEATHERS)
         self.require("weather", fine, f"all, or some of {', '.join(WEATHERS)}")
-        self.require("time", self.time in ("all", "day", "night"), "all, day or night")
-        self.require("test_split", self.test_split in ("val", "test"), "val or test")
+        self.require_one_of("time", "all", "day", "night")
+        self.require_one_of("test_split", "val", "test")
 
     def find_images(
         self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, list[ImageFiles]]]:
+    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
         """See `ImageDataModule`."""
-        splits = {split: self._list_images(split, problems) for split in SPLITS}
+        splits: dict[Split, Sequence[ImageFiles]] = {
+            split: self._list_images(split, problems) for split in SPLITS
+        }
         if not any(splits.values()):
             expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
             raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
         if self._weathers == WEATHERS:
             counts = {str(split): len(images) for split, images in splits.items()}
             problems.compare_counts(counts, _PUBLISHED)
-        if self.test_split == "val":
-            splits["test"] = splits["val"]
-            held: set[str] = set()
-            point_of = {files.name: files.rgb.parent.name for files in splits["train"]}
-            if self.validation_fraction:
-                held = draw_groups(point_of.values(), self.validation_fraction, self.seed)
-            splits["val"] = [f for f in splits["train"] if point_of[f.name] in held]
-            splits["train"] = [f for f in splits["train"] if point_of[f.name] not in held]
-        elif not self.validation_fraction:
-            splits["val"] = []
+        given = self.test_split, self.validation_fraction, self.seed
+        splits = published_splits(splits, *given)
         self._times = {time: self._read_list(time) for time in ("day", "night")}
-        known = {files.rgb.parent.name for images in splits.values() for files in images}
+        known = {_point(files) for images in splits.values() for files in images}
         for time, points in self._times.items():
             problems.note_absent(f"all_map_{time}_val.txt", points - known)
         if self.time != "all":
             named = self._times[self.time]
-            splits["test"] = [f for f in splits["test"] if f.rgb.parent.name in named]
+            splits["test"] = [files for files in splits["test"] if _point(files) in named]
             if not splits["test"]:
                 raise DataError(
                     self.root / f"all_map_{self.time}_val.txt",
@@ -154,8 +130,8 @@ class SynPASS(PanoramaDataModule):
 
     def groups(self, item: ImageFiles) -> list[str]:
         """See `LabeledData`: weather, and day or night where a list names the point."""
-        point, weather = item.rgb.parent.name, item.name.partition("/")[0]
-        return [weather, *(time for time in self._times if point in self._times[time])]
+        times = (time for time, points in self._times.items() if _point(item) in points)
+        return [item.name.split("/")[1], *times]
 
     def _list_images(self, split: Split, problems: Problems) -> list[ImageFiles]:
         """Return the images of a folder, each with the label image of its name."""
@@ -163,10 +139,10 @@ class SynPASS(PanoramaDataModule):
         labels: list[Path] = []
         for weather in self._weathers:
             place = Path(weather, split)
-            labels += (self.root / "semantic" / place).glob("*/*_trainID.png")
-            for rgb in sorted((self.root / "img" / place).glob("*/*.jpg")):
-                name = (place / rgb.parent.name / rgb.stem).as_posix()
-                found.append(ImageFiles(name, rgb, self.root / "semantic" / f"{name}_trainID.png"))
+            labels += (self.root / "semantic" / place).glob("*/[!.]*_trainID.png")
+            for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
+                mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
+                found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
         problems.note_strays(labels, found)
         return found
 
@@ -180,3 +156,8 @@ class SynPASS(PanoramaDataModule):
         except (OSError, UnicodeDecodeError) as error:
             expected = "names of points, e.g. MAP_6_point10"
             raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error
+
+
+def _point(files: ImageFiles) -> str:
+    """Return the point of an image, e.g. ``MAP_1_point2``."""
+    return files.name.partition("/")[0]

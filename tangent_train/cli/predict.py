@@ -6,12 +6,13 @@ import math
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Masks
@@ -24,8 +25,9 @@ from tangent_train.cli.jobs import Job, Shard, run_jobs
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
-from tangent_train.errors import SettingError, counted
+from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
+from tangent_train.inference.confidences import class_thresholds, count_confidences
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import (
     DepthFolder,
@@ -36,6 +38,7 @@ from tangent_train.inference.images import (
 )
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
@@ -48,10 +51,13 @@ from tangent_train.results.predictions import (
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
-    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
-    "min_confidence", "every",
+    "levels", "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
+    "min_confidence", "min_share", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
+
+_COUNTED_IMAGES = 32
+"""Images whose confidences are counted for `min_share`, at most."""
 
 _SAVED_EVERY_S = 10.0
 """Time between summaries: work that may be lost when a process is killed."""
@@ -69,6 +75,7 @@ def predict(config: Mapping[str, Any]) -> None:
     """
     settings = parse_settings(PredictSettings, config)
     _check_projection(settings)
+    _check_confidence(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     original, trained = _networks(settings)
@@ -76,6 +83,8 @@ def predict(config: Mapping[str, Any]) -> None:
     names = inputs.names()
     shown = [names[number] for number in evenly_spread(settings.report, len(names))]
     label = _Labeler(settings, original, trained, folder, shown)
+    if settings.min_share:
+        label.find_thresholds(inputs)
     if shard is None:
         done = _label(settings, decisive, inputs, label, folder)
         _finish(settings, inputs, label, folder, done)
@@ -190,6 +199,31 @@ class _Labeler:
         self._depth = _depth_folder(settings, trained)
         self._masks = Masks(settings.mask)
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
+        self._thresholds: NDArray[np.float64] | None = None
+
+    def find_thresholds(self, inputs: Inputs) -> None:
+        """Find the confidence that each class needs, see `min_share`; some images are predicted.
+
+        Args:
+            inputs: All images, also those of other shards.
+        """
+        settings, names = self._settings, inputs.names()
+        chosen = {names[number] for number in evenly_spread(_COUNTED_IMAGES, len(names))}
+        num_classes = len(self._trained.class_names) - 1
+        counts = np.zeros((num_classes + 1, 1), np.int64)
+        print_text(f"Confidences are counted in {counted(len(chosen), 'images')}.")
+        for job in inputs.missing(set(names) - chosen):
+            with suppress(DataError, SettingError):  # reported when the image is labeled
+                if not job.error:
+                    image, area = self.read(job)
+                    _, scores = self._scores(image, area)
+                    maps: list[Any] = [self._trained.labels(scores.labels()), scores.confidences()]
+                    labels, confidences = maps if area is None else [area.cut(m) for m in maps]
+                    counts = counts + count_confidences(labels, confidences, num_classes)
+        self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
+        least = zip(self._trained.class_names[1:], self._thresholds[1:], strict=True)
+        listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
+        print_text(f"Smallest confidence of each class: {listed}.")
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; return it with the area of a panorama, or with None for a photo."""
@@ -203,14 +237,26 @@ class _Labeler:
     def __call__(self, job: Job, progress: Callable[[float], object]) -> LabeledImage:
         """Predict the labels of one image."""
         image, area = job.value
-        if self._settings.upright == "auto" and area is not None:
-            image = with_up(image, self._settings.max_tilt_deg, self._judge)
-        probabilities = "probabilities" in self._settings.write
-        scores = self._predictor.predict(image, progress, probabilities=probabilities)
+        image, scores = self._scores(image, area, progress)
         # Not written in another thread: scores take much memory.
         self._folder.write_probabilities(job.item, scores, area)
         labels = self._trained.labels(scores.labels())
+        if self._thresholds is not None:
+            is_sure = scores.confidences() >= self._thresholds[labels]
+            labels = np.where(is_sure, labels, labels.dtype.type(0))
         return LabeledImage(image, labels if area is None else area.cut(labels), area)
+
+    def _scores(
+        self,
+        image: InputImage,
+        area: PanoramaArea | None,
+        progress: Callable[[float], object] = lambda share: None,
+    ) -> tuple[InputImage, ScoreMosaic]:
+        """Predict the scores of one image; return it with its up direction."""
+        if self._settings.upright == "auto" and area is not None:
+            image = with_up(image, self._settings.max_tilt_deg, self._judge)
+        keeps_sums = self._settings.min_share > 0 or "probabilities" in self._settings.write
+        return image, self._predictor.predict(image, progress, probabilities=keeps_sums)
 
     def write(self, job: Job) -> Entry:
         """Write the labels of one image; return its entry in the summary."""
@@ -301,13 +347,27 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
+    views: PanoramaViews | PhotoViews
     if settings.projection == "equirectangular":
-        views: PanoramaViews | PhotoViews = PanoramaViews(trained, *how, settings.views)
-        print_text(f"A panorama is labeled in {views}.")
+        views = PanoramaViews(trained, *how, settings.views, settings.fill)
+        print_text(f"A panorama is labeled in {views.described(settings.area)}.")
     else:
         views = PhotoViews(trained, *how)
     device, count = settings.device, settings.images_per_forward
-    return Predictor(trained, views, device, count, settings.min_confidence)
+    # With `min_share`, a threshold of each class replaces it.
+    least = 0.0 if settings.min_share else settings.min_confidence
+    return Predictor(trained, views, device, count, least)
+
+
+def _check_confidence(settings: PredictSettings) -> None:
+    if not 0 <= settings.min_share < 1:
+        raise SettingError("min_share", found=settings.min_share, expected="0 to below 1")
+    if settings.min_share and not 0 < settings.min_confidence <= 1:
+        raise SettingError(
+            "min_confidence",
+            found=settings.min_confidence,
+            expected="above 0 to 1 with min_share, which lowers it for single classes",
+        )
 
 
 def _check_projection(settings: PredictSettings) -> None:

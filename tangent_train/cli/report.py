@@ -1,4 +1,4 @@
-"""``tangent-report``: compare finished runs with each other and with the paper's figures."""
+"""``tangent-report``: compare finished runs with each other and with published scores."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def report(arguments: Sequence[str]) -> None:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         "tangent-report",
-        description="Mean and spread of scores over folds and seeds, with the paper's figures.",
+        description="Mean and spread of scores over folds and seeds, with published scores.",
         epilog="Runs that differ only in fold and seed share a row. Example: tangent-report "
         "runs/paper/semseg_s7_b0_rgbd --output report_s7",
     )

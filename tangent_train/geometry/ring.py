@@ -46,7 +46,7 @@ class RingGrid(PinholeGrid):
         size: Rows and columns of the images.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         area: Area that the images must cover; None for the sphere.
-        by_owners: See `check_coverage`.
+        by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
         is_complete: False for images that cover the area together with those of other grids.
 
     Raises:
@@ -71,7 +71,7 @@ class RingGrid(PinholeGrid):
         rotation: ArrayLike | None = None,
         area: SphereArea | None = None,
         *,
-        by_owners: bool = False,
+        by_owners: bool = True,
         is_complete: bool = True,
     ) -> None:
         checked = checked_rings(rings)

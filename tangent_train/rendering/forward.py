@@ -93,12 +93,18 @@ def _render_tensor(
     source = image.reshape(-1, height * width)
     dtype = map_dtype(image.dtype == torch.float64, interpolation)
     chunks = [image.new_empty((*batch, 0, channels, *grid.size))]
-    for start in range(0, len(indices), step):
-        faces = tuple(indices[start : start + step].tolist())
-        # On the CPU the map itself is already cached.
-        key = None if image.device.type == "cpu" else ("forward", (height, width), faces, dtype)
-        build = partial(forward_positions, grid, (height, width), faces, dtype)
-        u, v = tensors_on(image.device, grid, key, build)
+    rows, columns = grid.size
+    at_once = max(step, _CHUNK // (rows * columns))  # on a GPU, many small calls take longer
+    for start in range(0, len(indices), at_once):
+        faces = indices[start : start + at_once].tolist()
+        tables = []
+        for first in range(0, len(faces), step):
+            part = tuple(faces[first : first + step])
+            # On the CPU the map itself is already cached.
+            key = None if image.device.type == "cpu" else ("forward", (height, width), part, dtype)
+            build = partial(forward_positions, grid, (height, width), part, dtype)
+            tables.append(tensors_on(image.device, grid, key, build))
+        u, v = (torch.cat(lines) for lines in zip(*tables, strict=True))
         values = _sampled(source, u, v, (height, width), interpolation)
         images = values.reshape(*batch, channels, len(faces), *grid.size)
         chunks.append(images.movedim(-3, -4))

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Views
 
 _LEAST_TOTAL = 1e-37
+_PIXELS_AT_ONCE = 1 << 17
 
 
 class ScoreMosaic:
@@ -124,6 +125,13 @@ class ScoreMosaic:
         else:
             total = torch.from_numpy(self.sums[rows][..., : self._num_classes])
         return total / total.sum(dim=-1, keepdim=True).clamp(min=_LEAST_TOTAL)
+
+    def confidences(self) -> NDArray[np.float32]:
+        """Return the ``(H, W)`` probabilities of the best classes; needs `averaged`."""
+        step = max(1, _PIXELS_AT_ONCE // self.shape[1])
+        starts = range(0, self.shape[0], step)
+        parts = [self.probabilities(slice(top, top + step)).amax(dim=-1) for top in starts]
+        return torch.cat(parts).cpu().numpy()
 
     def _owners(self, images: Views) -> Any:
         """Return the owner of each pixel, cached until images of another set are added."""

@@ -18,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from statistics import fmean
 from typing import Any, NamedTuple
 
 import yaml  # type: ignore[import-untyped]
@@ -49,6 +50,12 @@ class Publication(NamedTuple):
         named = [stage] if stage and method == "tangent images" else [method, stage]
         trained = self.key["trained_on"]
         return ", ".join(filter(None, [*named, trained and f"trained on {trained}"]))
+
+    @property
+    def scores(self) -> list[float]:
+        """Scores of the folds in percent, without mAcc."""
+        named = [line for line in self.lines if line["score"] != "macc"]
+        return [float(line["mean"]) for line in named if line["mean"]]
 
     @property
     def folds(self) -> tuple[str, ...]:
@@ -83,6 +90,7 @@ class Publication(NamedTuple):
             "s": self.key["level"] or "–",
             "input": self.key["inputs"] or "–",
             "b": self.key["base_level"] or "–",
+            "folds": ", ".join(self.folds) or "–",
             **{name: protocol.get(name, "–") for name in shown},
         }
         return Row(f"{self.name} (paper)", records, columns, published=True)
@@ -162,12 +170,11 @@ def _difference(
     publications: Sequence[Publication], differences: Mapping[str, tuple[str, str]]
 ) -> str:
     """Return a sentence on published scores of another protocol."""
-    first = publications[0]
-    scores = [line for line in first.lines if line["mean"] and line["score"] != "macc"]
-    text = ", ".join(line["mean"] for line in scores)
+    best = max(publications, key=lambda publication: fmean(publication.scores or [0.0]))
+    text = ", ".join(f"{score:g}" for score in best.scores)
     more = f" and {len(publications) - 1} more" if len(publications) > 1 else ""
     named = "; ".join(f"{n}: published {p}, this run {r}" for n, (p, r) in differences.items())
-    return f"Not comparable: {first.name} {text}{more} ({first.key['protocol']}). {named}."
+    return f"Not comparable: {best.name}: {text}{more} ({best.key['protocol']}). {named}."
 
 
 @cache

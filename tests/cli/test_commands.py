@@ -18,6 +18,7 @@ from typing import Any
 
 import cv2
 import lightning
+import numpy as np
 import pytest
 import torch
 from torch import nn
@@ -32,7 +33,7 @@ from tangent_train.console import print_text
 from tangent_train.results.record import load_record
 from tangent_train.results.tables import Table
 from tangent_train.tasks.segmentation import SegmentationTask
-from tests.cli.tiny_runs import SETTINGS, Run, results
+from tests.cli.tiny_runs import SETTINGS, SMALL_ROOMS, Run, results
 from tests.running import run_python
 
 CUT_SHORT = """
@@ -258,6 +259,33 @@ def test_the_last_step_of_an_epoch_is_tried_before_training(
     refused = pytest.raises(SystemExit, match=message)
     with refused if faces == 1 else pytest.raises(BegunError):
         run("train", *settings, rooms, "hydra.run.dir=run")
+
+
+@pytest.mark.parametrize("option", ["ring", "ring_wide"])
+def test_level_views_are_trained_evaluated_and_predicted(
+    option: str, rooms: str, tmp_path: Path, run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With attention between views; rows unlike columns; evaluated with and without the whole."""
+    network = ("network=unet_small_context", "network.network.network.widths=[4,8,8,8,8]")
+    views = [f"representation={option}", "representation.dim=[32,48]", "representation.mirror=true"]
+    views += ["representation.faces_per_panorama=4", "representation.random_rotation=yaw"]
+    small = (
+        *SMALL_ROOMS,
+        "data=synthrooms",
+        "data.inputs=[rgb]",
+        "trainer.max_epochs=1",
+        "panels=0",
+    )
+    run("train", *small, *network, *views, rooms, "hydra.run.dir=level")
+    checkpoint = f"checkpoint={tmp_path / 'level' / 'checkpoints' / 'best.ckpt'}"
+    run("evaluate", checkpoint, rooms, "hydra.run.dir=again")
+    assert results(tmp_path / "again")["confusion"] == results(tmp_path / "level")["confusion"]
+    run("evaluate", checkpoint, rooms, "representation.rotations=2", "hydra.run.dir=twice")
+    assert results(tmp_path / "twice")["confusion"] != results(tmp_path / "level")["confusion"]
+    cv2.imwrite("room.png", np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8))
+    run("predict", checkpoint, "input=room.png", "output=labels", "rotations=2")
+    count = {"ring": 36, "ring_wide": 32}[option]
+    assert f"labeled in {count} views of 48 × 32 (" in capsys.readouterr().out
 
 
 def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> None:

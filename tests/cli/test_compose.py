@@ -31,7 +31,8 @@ GROUPS = (
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes(experiment: str) -> None:
-    transfers = "transfer" in experiment or experiment.startswith("field/cityscapes_densepass")
+    pairs = "field/cityscapes_densepass", "field/stanford2d3ds_span8"
+    transfers = "transfer" in experiment or experiment.startswith(pairs)
     command = "transfer" if transfers else "train"
     config = composed(command, f"experiment={experiment}")
     OmegaConf.resolve(config)

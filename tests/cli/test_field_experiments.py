@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,16 +12,17 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 
+from datamodules.cityscapes.classes import CLASSES
 from tangent_train.cli import transfer_stages
 from tangent_train.cli.run import build, build_data
 from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World
-from tests.running import Patch, composed, composed_settings
+from tests.running import ROOT, Patch, composed, composed_settings
 
 SMALL = ("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0", "panels=0")
-SMALL_PHOTOS = ("photos.data.num_workers=0", "photos.data.photos_per_step=2")
+SMALL_PHOTOS = ("photos.data.num_workers=0",)
 PROTOCOLS = {
     entry["experiment"]: name
     for name, entry in protocols().items()
@@ -49,8 +52,9 @@ def _with_a_small_network(command: str, experiment: str) -> list[str]:
     return [*arguments, "network.widths=[4,8]", *(f"~network.{name}" for name in removed)]
 
 
-def test_every_experiment_of_the_field_has_a_protocol() -> None:
-    assert PROTOCOLS.keys() == FILES
+def test_every_experiment_of_the_field_has_a_protocol_and_is_documented() -> None:
+    page = (ROOT / "docs" / "how-to" / "field_benchmarks.md").read_text()
+    assert PROTOCOLS.keys() == FILES == set(re.findall(r"(?<=`)field/\w+(?=`)", page))
 
 
 @pytest.mark.parametrize("experiment", sorted(PROTOCOLS))
@@ -74,13 +78,37 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     arguments += [f"data.root={root}", *SMALL, *world.small]
     if transfers:
         _, photos = _world(worlds, settings["photos"]["data"])
-        arguments += [f"photos.data.root={photos}", *SMALL_PHOTOS]
+        arguments += [f"photos.data.root={photos}", *SMALL_PHOTOS, "photos.data.photos_per_step=2"]
         monkeypatch.setattr(transfer_stages, "run_process", _in_this_process(run))
     run(command, *arguments)
     (path,) = (tmp_path / "runs").rglob("S/results.json" if transfers else "results.json")
     found = results(path.parent)["protocol"]
     assert found.pop("size") != protocol.pop("size")
     assert found == protocol
+
+
+def test_an_imported_network_is_evaluated_on_photos_and_panoramas(
+    worlds: Worlds, run: Run, tmp_path: Path, monkeypatch: Patch
+) -> None:
+    from tests.inference.photo_networks import huggingface_networks as networks
+
+    size = {"height": 32, "width": 32}
+    networks.saved(partial(networks.segformer, CLASSES), tmp_path / "segformer", size=size)
+    run("import", "network=huggingface", "model=segformer", "output=segformer.ckpt")
+    monkeypatch.setattr(transfer_stages, "run_process", _in_this_process(run))
+    experiment = "field/cityscapes_densepass_13"
+    (_, panoramas), (_, photos) = worlds["DensePASS"], worlds["Cityscapes"]
+    arguments = [f"data.root={panoramas}", f"photos.data.root={photos}", "level=6", *SMALL_PHOTOS]
+    arguments += [f"experiment={experiment}", "checkpoint=segformer.ckpt", *SMALL[1:]]
+    run("transfer", *arguments, "class_map=cityscapes_to_densepass13")
+    folder = tmp_path / "runs" / "transfer" / experiment / "seed_0"
+    assert {path.name for path in folder.iterdir()} == {"P", "S"}
+    assert not list(folder.glob("*/checkpoints"))
+    found, protocol = results(folder / "S"), facts(PROTOCOLS[experiment])
+    assert found["protocol"] == protocol | {"size": "256 × 128"}
+    assert found["class_map"] == "cityscapes_to_densepass13"
+    report = (folder.parent / "transfer.md").read_text()
+    assert "Trans4PASS+ (S), trained on Cityscapes: 51.4 and" in report
 
 
 def _in_this_process(run: Run) -> Any:

@@ -94,12 +94,14 @@ def test_all_views_see_the_same_panoramas(rooms: DictConfig) -> None:
         "erp",
         {"name": "fine", "option": "erp", "rows": 400},
         {"name": "cube", "option": "cubemap", "dim": "${level}"},
+        "ring_economy",
         {"name": "wide", "level": 6, "base_level": 0, "blend": "feather"},
     ]
     stages = _stages(rooms, compare=views, representation__erp_height=200)
     assert _seen(stages, "S-erp", "level", "rows", "base_level") == ["Equi", 7, None, None]
     assert _seen(stages, "S-fine", "level", "rows") == ["Equi", 7, 400]
     assert _seen(stages, "S-cube", "level", "dim") == ["Cube", 7, 7]
+    assert _seen(stages, "S-ring_economy", "level", "dim", "rotations") == ["Ring", 7, None, 1]
     assert _seen(stages, "S-wide", "level", "base_level", "blend") == ["Tang", 6, 0, "feather"]
     assert [stages[f"S-{name}"].config["level"] for name in ("fine", "wide")] == [7, 6]
     rows = {s.config["representation"].get("erp_height") for n, s in stages.items() if n[0] == "S"}

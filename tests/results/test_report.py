@@ -101,7 +101,7 @@ def test_a_single_differing_fact_is_named_and_nothing_stands_beside(name: str) -
     first, *others = published.notes
     was = PROTOCOL.get(name, "–")
     assert first == (
-        "Not comparable: Tateno et al. 34.6 and 2 more (paper_512). "
+        "Not comparable: tangent images: 44.9 and 2 more (paper_512). "
         f"{name}: published {was}, this run changed."
     )
     assert 1 <= len(others) <= 2

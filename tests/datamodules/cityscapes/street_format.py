@@ -56,12 +56,13 @@ def write_cityscapes(root: Path, rows: int = 64, each: int = 1) -> Path:
 
 
 def write_densepass(root: Path, spelling: str = "_", names: Sequence[int] = (1, 10, 500)) -> Path:
-    """Write labeled panoramas of 400×2048 and an unlabeled one."""
+    """Write labeled panoramas of 400×2048, and unlabeled ones of three cities."""
     for name in names:
         ids = numbers(TRAIN_IDS, (400, 2048), name)
         write_png(root / f"leftImg8bit/val/cs/{name}{spelling}.png", colors(ids))
         write_png(root / f"gtFine/val/cs/{name}_labelTrainIds.png", ids)
-    write_png(root / "leftImg8bit/train/Zurich/1.png", colors(ids))
+    for city in ("Oslo", "Rome", "Zurich"):
+        write_png(root / f"leftImg8bit/train/{city}/1.png", colors(ids))
     return root
 
 

@@ -48,15 +48,15 @@ def test_every_number_has_its_class(shared: Path, index: int) -> None:
 
 def test_splits_are_those_of_the_folders(shared: Path) -> None:
     names = {split: names_of(panoramas(shared), split) for split in SPLITS}
-    assert names["test"] == ["sun/test/MAP_8_point1/000000", "sun/test/MAP_8_point1/000001"]
+    assert names["test"] == ["MAP_8_point1/sun/000000", "MAP_8_point1/sun/000001"]
     assert [len(names[split]) for split in SPLITS] == [6, 4, 2]
     assert not names_of(panoramas(shared, validation_fraction=0), "val")
 
 
 def test_a_test_on_val_takes_whole_training_points_for_validation(shared: Path) -> None:
     data = panoramas(shared, test_split="val", validation_fraction=0.4)
-    assert {name.split("/")[1] for name in names_of(data, "test")} == {"val"}
-    points = {s: {name.split("/")[2] for name in names_of(data, s)} for s in ("train", "val")}
+    points = {s: {name.split("/")[0] for name in names_of(data, s)} for s in SPLITS}
+    assert points["test"] == {"MAP_6_point10", "MAP_6_point11"}
     assert not points["train"] & points["val"]
     assert [len(names_of(data, split)) for split in SPLITS] == [4, 2, 4]
 
@@ -66,9 +66,9 @@ def test_weather_and_time_are_settings_and_groups(shared: Path) -> None:
     files = data.index().splits["test"]
     assert [data.groups(f) for f in files] == [["fog", "day"]] * 2 + [["sun", "night"]] * 2
     sun = panoramas(shared, weather=["sun"], test_split="val", validation_fraction=0)
-    assert {name.split("/")[0] for s in SPLITS for name in names_of(sun, s)} == {"sun"}
+    assert {name.split("/")[1] for s in SPLITS for name in names_of(sun, s)} == {"sun"}
     night = names_of(panoramas(shared, time="night", test_split="val"), "test")
-    assert {name.split("/")[2] for name in night} == {"MAP_6_point11"}
+    assert {name.split("/")[0] for name in night} == {"MAP_6_point11"}
 
 
 @pytest.mark.parametrize(

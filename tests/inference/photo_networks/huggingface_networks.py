@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -36,10 +36,11 @@ Made = tuple[Any, Any]
 """A network and its image processor."""
 
 
-def segformer() -> Made:
+def segformer(names: Sequence[str] = NAMES) -> Made:
+    labels = {"id2label": dict(enumerate(names)), "label2id": {n: k for k, n in enumerate(names)}}
     stages = {"hidden_sizes": [8, 8, 16, 16], "num_attention_heads": [1, 1, 2, 2]}
     config = transformers.SegformerConfig(
-        depths=[1] * 4, decoder_hidden_size=16, **stages, **_LABELS
+        depths=[1] * 4, decoder_hidden_size=16, **stages, **labels
     )
     processor = transformers.SegformerImageProcessor(size=_SIZE)
     return transformers.SegformerForSemanticSegmentation(config), processor

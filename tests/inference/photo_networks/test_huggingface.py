@@ -42,7 +42,7 @@ def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
     network, processor = networks.saved(networks.segformer, tmp_path, **settings)
     trained = networks.imported(tmp_path)
     assert trained.class_names == ("unknown", *networks.NAMES)
-    assert (trained.image_size, trained.representation["levels"]) == ((64, 64), [6, 5])
+    assert (trained.image_size, trained.level) == ((64, 64), 6)
     expected = networks.own_scores(network, processor)
     scores = networks.imported_scores(trained)
     networks.assert_same(scores, expected)

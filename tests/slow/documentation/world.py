@@ -25,9 +25,16 @@ from PIL import ExifTags, Image
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
+from tests.datamodules.cityscapes.street_format import (
+    write_cityscapes,
+    write_densepass,
+    write_synpass,
+)
 from tests.datamodules.folder.folder_format import write_data_set
 from tests.datamodules.folder.photo_format import write_photos
+from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
 from tests.inference.photo_networks import huggingface_networks as networks
@@ -46,6 +53,11 @@ def build_world(folder: Path) -> Path:
     """Write all files that the pages name; the folder can be copied anywhere."""
     fabricate(folder / "data" / "2d3ds", height=ROWS, photos=2)
     write_panoramas(write_views(folder / "data" / "synthia", _SEQUENCES), _SEQUENCES, ROWS)
+    write_cityscapes(folder / "data" / "cityscapes", ROWS)
+    write_densepass(folder / "data" / "densepass", names=(1, 2))
+    write_synpass(folder / "data" / "synpass", ROWS)
+    write_structured3d(folder / "data" / "structured3d", height=ROWS, photos=True)
+    write_matterport(folder / "data" / "matterport360", height=ROWS)
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
@@ -74,6 +86,7 @@ def build_world(folder: Path) -> Path:
     shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
+    shutil.copyfile(folder / "segformer.ckpt", folder / "cityscapes.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
