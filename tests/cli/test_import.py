@@ -217,7 +217,7 @@ def test_an_onnx_file_of_any_size_gets_wide_views(
     run: Run,
     capsys: Capture,
 ) -> None:
-    """With the longer side of the network's images: level views, or tangent images of two levels."""
+    """With the longer side of its images: level views, or tangent images of two levels."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
     assert f"panoramas: 16 views of {side} × {side} (130° wide" in capsys.readouterr().out
@@ -388,7 +388,9 @@ def test_labels_without_settings_are_those_of_wide_rings(
     for name, given in settings.items():
         capsys.readouterr()
         predict(checkpoint="ours.onnx", input="room.png", output=name, **given)
-        assert f"A panorama is labeled in {counts[name]} views of 32 × 32" in capsys.readouterr().out
+        assert (
+            f"A panorama is labeled in {counts[name]} views of 32 × 32" in capsys.readouterr().out
+        )
         labels[name] = cv2.imread(f"{name}/labels/room.png", cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(labels["default"], labels["wide"])
     np.testing.assert_array_equal(labels["two"], labels["both"])
