@@ -38,6 +38,8 @@ def test_all_settings_of_a_command_are_declared_and_others_are_not(command: str)
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiments_set_what_is_read(experiment: str) -> None:
     transfers = "transfer" in experiment or experiment == "zero_shot"
+    if experiment.startswith("field/"):
+        transfers = "_target_" in composed("transfer", f"experiment={experiment}").photos.data
     _check("transfer" if transfers else "train", f"experiment={experiment}")
 
 
