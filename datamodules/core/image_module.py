@@ -178,7 +178,7 @@ class PanoramaDataModule(ImageDataModule):
         panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
         area: The part of the sphere that all files show: west, east, south and north in degrees,
             see `SphereArea`; None for the whole sphere.
-        fill: Colors of the panorama outside the area, for the pixels of views that leave it.
+        fill: Colors of the panorama outside the area, in views that leave it.
         mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
             their labels are unknown. See `Masks`.
         test_rotation: Rotate the test panoramas: tilt in degrees, or `so3`, see `RotatedPanoramas`.
@@ -222,6 +222,7 @@ class PanoramaDataModule(ImageDataModule):
         self.require("max_tilt_deg", fine, "more than 0, at most 180")
         self.require("fill", self.fill in get_args(Fill), ", ".join(get_args(Fill)))
         self.sphere_area = SphereArea.of(self.area, "data.area")
+        self.representation = self.representation.limited_to(self.sphere_area)
         self.canvas = PanoramaArea.on_canvas(self.sphere_area, self.erp_height)
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from datamodules.core.panoramas import ImageFiles, ImageReader, steps_to_meters
 from datamodules.core.reading import SplitReader
 from datamodules.core.transforms import RotatedPanoramas
-from tangent_train.geometry import PanoramaPose
+from tangent_train.geometry import PanoramaPose, SphereArea
 
 
 class LabeledImage(NamedTuple):
@@ -28,6 +28,8 @@ class LabeledImage(NamedTuple):
         pose: Pose; None if unknown. In a photo's axes, x is the optical axis, y
             points to the right and z up in the image.
         camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
+        area: Area of a partial panorama, whose arrays show the whole sphere, see `Panorama`; None
+            for other images.
 
     The arrays may be shared or read-only: do not write to them.
     """
@@ -38,6 +40,7 @@ class LabeledImage(NamedTuple):
     distance_m: NDArray[np.float32] | None
     pose: PanoramaPose | None
     camera_matrix: NDArray[np.float64] | None = None
+    area: SphereArea | None = None
 
 
 @dataclass(frozen=True)
@@ -67,5 +70,5 @@ class LabeledImages(Dataset[LabeledImage]):
                 rotation = transform.rotation(index)
                 pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
         distance_m = None if image.depth is None else steps_to_meters(image.depth)
-        matrix = getattr(image, "camera_matrix", None)
-        return LabeledImage(files.name, image.rgb, image.labels, distance_m, pose, matrix)
+        matrix, area = (getattr(image, name, None) for name in ("camera_matrix", "area"))
+        return LabeledImage(files.name, image.rgb, image.labels, distance_m, pose, matrix, area)

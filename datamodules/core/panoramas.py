@@ -176,10 +176,11 @@ class Panorama(NamedTuple):
     area: SphereArea | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
-        """Return the sampler of its views: the representation, aligned with gravity."""
+        """Return the sampler of its views: those of the area, aligned with gravity."""
+        limited = representation.limited_to(self.area)
         if self.up is None:
-            return representation
-        return representation.with_rotation(upright_rotation(self.up))
+            return limited
+        return limited.with_rotation(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> NDArray[np.uint8]:
         """Return the labels that predictions on the panorama are compared with: all of them."""

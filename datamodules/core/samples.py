@@ -18,7 +18,7 @@ from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.reading import SplitReader
-from tangent_train.geometry import equirect_elevations
+from tangent_train.geometry import SphereArea, equirect_elevations
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -26,6 +26,8 @@ Inputs = Sequence[Tensor]
 """Rendered RGB, optionally depth and elevation, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
+
+_WHOLE = SphereArea.of(None)
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):
@@ -54,12 +56,15 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
         target: uint8 labels, 0 where unknown: ``(H, W)`` of a panorama; ``(N, h, w)`` of the
             crops of a photo.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
+        area: ``(13,)`` float64, the area of a partial panorama, see `SphereArea.numbers`; that of
+            the whole sphere for other images.
         index: Index in its split.
     """
 
     images: _Images
     target: Tensor
     rotation: Tensor
+    area: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
 
 
@@ -122,7 +127,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
         target = torch.tensor(image.target(self.representation))
-        return EvaluationSample(images, target, torch.from_numpy(rotation), index)
+        area = torch.from_numpy((getattr(image, "area", None) or _WHOLE).numbers)
+        return EvaluationSample(images, target, torch.from_numpy(rotation), area, index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

@@ -118,11 +118,9 @@ class EstimatedUp:
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
-            judge = None if self._judge is None else partial(self._judge, panorama)
-            if len(panorama.rgb) >= MOST_ROWS:
-                rgb = _without_fill(panorama)
-            else:
-                rgb = self._larger(index, files)
+            plain = _without_fill(panorama)
+            judge = None if self._judge is None else partial(self._judge, plain)
+            rgb = plain.rgb if len(plain.rgb) >= MOST_ROWS else self._larger(index, files)
             self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
         return panorama._replace(up=self._ups[index])
 
@@ -139,12 +137,12 @@ class EstimatedUp:
         return {**self.__dict__, "_judge": None}
 
 
-def _without_fill(panorama: Panorama) -> NDArray[np.uint8]:
-    """Return the colors, black outside the area: an estimate ignores what is black."""
+def _without_fill(panorama: Panorama) -> Panorama:
+    """Return the panorama, black outside its area: estimates ignore what is black."""
     if panorama.area is None:
-        return panorama.rgb
+        return panorama
     inside = panorama.area.contains(equirect_directions(panorama.labels.shape))
-    return np.where(inside[..., None], panorama.rgb, np.uint8(0))
+    return panorama._replace(rgb=np.where(inside[..., None], panorama.rgb, np.uint8(0)))
 
 
 class RotatedPanoramas:

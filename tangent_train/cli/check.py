@@ -49,6 +49,14 @@ def check(settings: Mapping[str, Any]) -> None:
             Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
+    if getattr(data, "area", None) is not None:
+        views = [sum(map(len, r.view_sets())) for r in (data.representation, representation)]
+        rows, columns = data.representation.image_size
+        print_text(
+            f"Area {list(data.area)}: {percent(data.sphere_area.share)} % of the sphere; "
+            f"{views[0]} of {views[1]} views, {columns} × {rows} pixels each.",
+            error=not terminal,
+        )
     summary = counted(len(listed), "problems") if listed else "Nothing is wrong"
     if warnings:
         summary = f"{counted(len(listed), 'problems')} and {counted(len(warnings), 'warnings')}"

@@ -51,7 +51,7 @@ from tangent_train.results.predictions import (
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
-    "levels", "base_level", "blend", "rotations", "upright", "max_tilt_deg", "mask",
+    "levels", "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
     "min_confidence", "min_share", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
@@ -347,9 +347,10 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
+    views: PanoramaViews | PhotoViews
     if settings.projection == "equirectangular":
-        views: PanoramaViews | PhotoViews = PanoramaViews(trained, *how, settings.views)
-        print_text(f"A panorama is labeled in {views}.")
+        views = PanoramaViews(trained, *how, settings.views, settings.fill)
+        print_text(f"A panorama is labeled in {views.described(settings.area)}.")
     else:
         views = PhotoViews(trained, *how)
     device, count = settings.device, settings.images_per_forward

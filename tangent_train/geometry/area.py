@@ -68,6 +68,20 @@ class SphereArea:
         return self.west, self.east, self.south, self.north
 
     @property
+    def numbers(self) -> NDArray[np.float64]:
+        """``(13,)`` angles and rotation, for batches; inverse of `of_numbers`."""
+        rotation = np.eye(3) if self.rotation is None else self.rotation
+        return np.concatenate([self.angles, rotation.ravel()])
+
+    @classmethod
+    def of_numbers(cls, numbers: NDArray[np.float64]) -> Self:
+        """Return the area of `numbers`."""
+        rotation = numbers[_ANGLES:].reshape(3, 3)
+        is_rotated = not np.array_equal(rotation, np.eye(3))
+        west, east, south, north = numbers[:_ANGLES].tolist()
+        return cls(west, east, south, north, rotation if is_rotated else None)
+
+    @property
     def width_deg(self) -> float:
         """Degrees of longitude from west to east."""
         return self.east - self.west if self.east > self.west else self.east - self.west + 360
@@ -104,15 +118,22 @@ class SphereArea:
         inside = (latitude >= self.south) & (latitude <= self.north)
         return inside & ((longitude - self.west) % 360 <= self.width_deg)
 
-    def directions(self, step_deg: float) -> NDArray[np.float64]:
-        """Return ``(n, 3)`` directions in a lattice from edge to edge, at most a step apart."""
-        columns, rows = (
-            np.linspace(0, angle, math.ceil(angle / step_deg) + 1)
-            for angle in (self.width_deg, self.north - self.south)
-        )
-        lattice = np.stack(np.meshgrid(self.west + columns, self.south + rows), axis=-1)
-        resting = lonlat_to_xyz(np.radians(lattice)).reshape(-1, 3)
-        return resting if self.rotation is None else resting @ self.rotation.T
+    def lattice(self, step_deg: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return directions in a lattice from edge to edge, at most a step apart.
+
+        Returns:
+            ``(n, 3)`` directions and ``(n,)`` steradians, which add up to the area's solid angle.
+        """
+        lines, weights = [], []
+        for start, angle in ((self.west, self.width_deg), (self.south, self.north - self.south)):
+            count = math.ceil(angle / step_deg)
+            lines.append(np.radians(start + angle / count * np.arange(count + 1)))
+            weights.append(np.full(count + 1, math.radians(angle / count)))
+            weights[-1][[0, -1]] /= 2
+        (columns, rows), (across, down) = lines, weights
+        resting = lonlat_to_xyz(np.stack(np.meshgrid(columns, rows), axis=-1)).reshape(-1, 3)
+        steradians = np.outer(down * np.cos(rows), across).ravel()
+        return resting if self.rotation is None else resting @ self.rotation.T, steradians
 
 
 def checked_angles(angles: Sequence[float], setting: str = "area") -> Sequence[float]:

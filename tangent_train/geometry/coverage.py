@@ -101,7 +101,7 @@ def _tested(
     grids: Sequence[PinholeGrid], area: SphereArea | None, by_owners: bool, on_edge: bool
 ) -> NDArray[np.float64] | None:
     """Return a missed direction of a dense set; None if the images show all."""
-    directions = (SphereArea.of(None) if area is None else area).directions(_STEP_DEG)
+    directions = (SphereArea.of(None) if area is None else area).lattice(_STEP_DEG)[0]
     for tested in np.split(directions, range(_TOGETHER, len(directions), _TOGETHER)):
         shown = np.concatenate([grid.shown(tested, on_edge=on_edge) for grid in grids], axis=1)
         if by_owners:

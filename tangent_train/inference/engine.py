@@ -24,7 +24,6 @@ from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
 from tangent_train.errors import SettingError, at_least
-from tangent_train.inference.representations import PanoramaViews
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import sphere_rays
@@ -38,8 +37,8 @@ if TYPE_CHECKING:
     from datamodules.core.inputs import Input
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.images import InputImage
-    from tangent_train.inference.representations import PhotoViews
-    from tangent_train.rendering import Interpolation, Representation
+    from tangent_train.inference.representations import PanoramaViews, PhotoViews
+    from tangent_train.rendering import Interpolation
     from tangent_train.rendering.representations.views import Views
 
     ViewImages = Callable[[slice], Tensor]
@@ -119,17 +118,19 @@ def fill(
 
 
 def upright_rays(
-    representation: Representation, device: torch.device | str
+    sets: Iterable[Views], rotation: NDArray[np.float64] | None, device: torch.device | str
 ) -> Iterator[Tensor | None]:
     """Yield the viewing rays of each set of views, in a frame with its zenith at z.
 
     Args:
-        representation: Representation of upright panoramas. Views of a tilted panorama are upright
-            too, so they have the same rays.
+        sets: Sets of views of a panorama.
+        rotation: ``(3, 3)`` rotation that aligns the views with gravity; None if they are upright.
         device: Device of the rays.
     """
-    for views in representation.view_sets():
+    for views in sets:
         rays = views.rays()
+        if rotation is not None:
+            rays = rotation.T.astype(np.float32) @ rays
         yield torch.from_numpy(rays).to(device) if len(rays) else None
 
 
@@ -280,14 +281,14 @@ class Predictor:
         """
         network: Any = self._trained.network
         sets: list[tuple[Views, ViewImages, Tensor | None]] = []
-        for shown, shape, views in self._view_sets(image):
-            rendered = RenderedViews(self._trained, shown, shape, self.device)
-            sets += [(part, rendered.of(part), None) for part in views]
         if sees_rays(network):
             network = partial(network, images_per_chunk=self._per_forward)
-            if isinstance(self._view_sets, PanoramaViews):
-                rays = upright_rays(self._view_sets.representation, self.device)
-                sets = [(*part[:2], of_set) for part, of_set in zip(sets, rays, strict=True)]
+        for shown, shape, views, rotation in self._view_sets(image):
+            rendered = RenderedViews(self._trained, shown, shape, self.device)
+            rays: Iterable[Tensor | None] = [None] * len(views)
+            if sees_rays(self._trained.network):
+                rays = upright_rays(views, rotation, self.device)
+            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
         count = sum(len(views) for views, _, _ in sets)
         mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
         return fill(mosaic, network, sets, self._per_forward, lambda done: progress(done / count))

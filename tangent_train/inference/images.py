@@ -53,12 +53,14 @@ class InputImage:
             from the center in panoramas, and z-depth in photos.
         up: ``(3,)`` direction of the zenith in a panorama; None if it is z.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for panoramas.
+        area: The part of the sphere that a panorama shows; it is black elsewhere. None for all.
     """
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.uint16] | None = None
     up: NDArray[np.float64] | None = None
     camera_matrix: NDArray[np.float64] | None = None
+    area: PanoramaArea | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -140,7 +142,8 @@ def read_panorama(
         area = whole_area(_IN_MEMORY, size, _NOT_WHOLE)
     steps = None if depth is None else depth(size)
     up = None if upright is None or path is None else read_up(path)
-    return InputImage(area.place(rgb), None if steps is None else area.place(steps), up), area
+    placed = None if steps is None else area.place(steps)
+    return InputImage(area.place(rgb), placed, up, area=area), area
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from datamodules.core.image_module import Upright
 from datamodules.core.panoramas import meters_to_steps
-from datamodules.images.gpano import PanoramaArea
+from datamodules.images.gpano import Fill, PanoramaArea
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -51,6 +51,7 @@ def load(
     blend: Blend = "feather",
     rotations: int = 1,
     views: ViewChoice = None,
+    fill: Fill = "black",
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
@@ -73,6 +74,8 @@ def load(
         rotations: Number of rotations about the vertical to average over; 1 for photos.
         views: Views of panoramas: an option of ``representation=``, such as ``ring``; or with
             changed settings, ``{"option": "ring", "fov": 90}``. None as trained.
+        fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
+            color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``).
         images_per_forward: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
         min_confidence: Pixels with a lower confidence get the label 0.
@@ -83,13 +86,14 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
+    check_choice("fill", fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
     chosen = trained, levels, base_level, blend, rotations
     how = device, images_per_forward, min_confidence
-    panoramas = Predictor(trained, PanoramaViews(*chosen, views), *how)
+    panoramas = Predictor(trained, PanoramaViews(*chosen, views, fill), *how)
     return Network(
         trained,
         panoramas,

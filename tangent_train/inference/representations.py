@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
 from tangent_train.errors import SettingError, width_height
 from tangent_train.files import config_folder
-from tangent_train.geometry import PinholeGrid, TangentGrid
+from tangent_train.geometry import PinholeGrid, SphereArea, TangentGrid
 from tangent_train.inference.images import InputImage
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.rendering import (
@@ -23,10 +23,12 @@ from tangent_train.rendering import (
     Representation,
 )
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
-from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from datamodules.images.gpano import Fill
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
@@ -61,12 +63,14 @@ class SourceViews(NamedTuple):
     Attributes:
         image: The panorama or photo.
         shape: Rows and columns to which it is resized first.
-        sets: Sets of views, each of which covers the whole image.
+        sets: Sets of views, each of which covers the whole image, or the area of a panorama.
+        rotation: ``(3, 3)`` rotation that aligns views of a panorama with gravity, or None.
     """
 
     image: InputImage
     shape: tuple[int, int]
     sets: Sequence[Views]
+    rotation: NDArray[np.float64] | None = None
 
 
 class PanoramaViews:
@@ -82,6 +86,7 @@ class PanoramaViews:
         blend: Blending of overlapping views.
         rotations: Number of rotations about the vertical to average over.
         views: See `ViewChoice`.
+        fill: Colors outside the area of a partial panorama, in views that leave it.
 
     Attributes:
         representation: Representation of upright panoramas.
@@ -98,6 +103,7 @@ class PanoramaViews:
         blend: Blend = "feather",
         rotations: int = 1,
         views: ViewChoice = None,
+        fill: Fill = "black",
     ) -> None:
         settings = panorama_settings(trained, levels, base_level, views)
         settings["rotations"] = rotations
@@ -107,13 +113,18 @@ class PanoramaViews:
         self.representation = _built(trained, settings, None if views else trained.source)
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
+        self._trained, self._fill = trained, fill
 
     def __str__(self) -> str:
         """Number and size of the views; of pinhole images also their angle and resolution."""
-        sets: Sequence[Any] = self.representation.view_sets()
-        rows, columns = self.image_size
-        text = f"{sum(map(len, sets))} views of {columns} × {rows}"
-        grids = [views.grid for views in sets if isinstance(views, PinholeViews)]
+        return self.described()
+
+    def described(self, area: Sequence[float] | None = None) -> str:
+        """Return the text of `__str__` for panoramas of an area, see `SphereArea.of`."""
+        limited = self.representation.limited_to(SphereArea.of(area))
+        rows, columns = limited.image_size
+        text = f"{sum(map(len, limited.view_sets()))} views of {columns} × {rows}"
+        grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
             parts = list(dict.fromkeys(map(_described, grids)))
@@ -125,13 +136,20 @@ class PanoramaViews:
         return f"{text} at base level {base_level} ({'; '.join(parts)})"
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Return the sets of views of one panorama."""
+        """Return the sets of views of one panorama, of its area if it is partial."""
         representation: Representation = self.representation
+        rotation, area = None, image.area
+        if area is not None:
+            limited = representation.limited_to(area.sphere)
+            if _fits(self._trained, limited.image_size):
+                representation = limited
+            image = replace(image, rgb=area.filled(image.rgb, self._fill))
         if image.up is not None:
-            representation = representation.with_rotation(upright_rotation(image.up))
+            rotation = upright_rotation(image.up)
+            representation = representation.with_rotation(rotation)
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
-        return [SourceViews(image, shape, representation.view_sets())]
+        return [SourceViews(image, shape, representation.view_sets(), rotation)]
 
 
 def _described(grid: PinholeGrid) -> str:
@@ -363,7 +381,8 @@ def _photo_representation(
         seen = _built(trained, panorama_settings(trained, level, base_level, views), trained.source)
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
-        size, half_extent = seen.image_size, seen.grid.half_size[0]
+        size = seen.image_size
+        half_extent = min(grid.half_size[0] for grid in seen.grids)
     check_size(trained, size)
     return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
 
@@ -379,8 +398,7 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         SettingError: The network does not support the size.
     """
     fixed, multiple = trained.fixed_size, trained.size_multiple
-    small = fixed is not None and any(n < least for n, least in zip(size, fixed, strict=True))
-    if small or (fixed is None and any(side % multiple for side in size)):
+    if not _fits(trained, size):
         raise SettingError(
             "levels and base_level",
             found=f"images of {width_height(size)}",
@@ -389,6 +407,13 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
             else f"multiples of {multiple}, the network's stride",
             remedy="Choose other levels, or leave both as trained.",
         )
+
+
+def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
+    """Return True if a network supports images of rows and columns."""
+    if trained.fixed_size is not None:
+        return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))
+    return not any(side % trained.size_multiple for side in size)
 
 
 def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:

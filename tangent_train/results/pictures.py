@@ -9,7 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.images.gpano import PanoramaArea
 from datamodules.images.palette import class_colors
+from tangent_train.geometry import SphereArea, equirect_directions
 from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]
@@ -80,6 +82,8 @@ def shown_arrays(
     prediction: Any,
     representation: Any,
     most_rows: int | None = None,
+    *,
+    cut: bool = True,
 ) -> tuple[_Image, NDArray[np.integer], NDArray[np.integer]]:
     """Return a panorama with its labels, or the crops of a photo side by side.
 
@@ -89,6 +93,8 @@ def shown_arrays(
         prediction: Predicted labels of the same shape.
         representation: Representation that defines the crops.
         most_rows: Largest number of rows, to which larger images are downsampled; None for all.
+        cut: True to cut a partial panorama to its area, unless it is rotated. Else it is black and
+            unknown outside.
 
     Returns:
         RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w.
@@ -99,9 +105,22 @@ def shown_arrays(
         (crops,) = image.sampler(representation).view_sets()
         shown = crops.render(image.rgb, "bilinear")
         rgb, truth, labels = map(np.hstack, (shown, truth, labels))
+    elif image.area is not None:
+        rgb, truth, labels = _of_area(image.area, (rgb, truth, labels), cut=cut)
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
     part = slice(step // 2, None, step)
     return rgb[part, part], truth[part, part], labels[part, part]
+
+
+def _of_area(area: SphereArea, arrays: Sequence[NDArray[Any]], *, cut: bool) -> list[NDArray[Any]]:
+    """Return arrays ``(H, W[, C])``, cut to an area or 0 outside of it."""
+    shape = arrays[0].shape[0], arrays[0].shape[1]
+    canvas = PanoramaArea.on_canvas(area, shape[0])
+    if area.rotation is not None:
+        inside = area.contains(equirect_directions(shape))
+        return [(array.T * inside.T).T for array in arrays]
+    parts = map(canvas.cut, arrays)
+    return list(parts if cut else map(canvas.place, parts))
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, get_args
 
@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.errors import SettingError, at_least
+from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
@@ -205,6 +206,7 @@ class SegmentationTask(Task):
         shape: tuple[int, ...],
         rotation: NDArray[np.float64] | None = None,
         target: Tensor | None = None,
+        area: SphereArea | None = None,
     ) -> Integer[Tensor, ...]:
         """Predict the label of every pixel of one panorama, or of the crops of a photo.
 
@@ -214,10 +216,11 @@ class SegmentationTask(Task):
                 crops.
             rotation: Rotation of the representation ``(3, 3)``.
             target: Ground truth, to add to the validation loss; None to compute no loss.
+            area: Area of a partial panorama; None for the whole sphere.
 
         Returns:
             Labels of that shape from 1 to K; 0 where an imported network predicts none of the
-            classes.
+            classes. Labels outside the area have no meaning.
         """
         if len(shape) > 2:  # crops, each separately
             best = images.new_empty(shape, dtype=torch.int64)
@@ -228,7 +231,7 @@ class SegmentationTask(Task):
                 if target is not None:
                     self._add_loss(scores, target[part])
         else:
-            mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target)
+            mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target, area)
             best = mosaic.labels().long().to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
@@ -238,13 +241,16 @@ class SegmentationTask(Task):
         shape: tuple[int, int],
         rotation: NDArray[np.float64] | None,
         target: Tensor | None,
+        area: SphereArea | None,
     ) -> ScoreMosaic:
         """Combine the scores of all views of a panorama, see `predict_labels`."""
-        upright: Any = self.representation
-        rotated = upright if rotation is None else upright.with_rotation(rotation)
+        limited = self.representation.limited_to(area)
+        rotated = limited if rotation is None else limited.with_rotation(rotation)
         sets = rotated.view_sets()
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
-        rays = upright_rays(upright, images.device) if self.sees_rays else [None] * len(sets)
+        rays: Iterable[Tensor | None] = [None] * len(sets)
+        if self.sees_rays:
+            rays = upright_rays(sets, rotation, images.device)
         count, several = self._num_scores, len(sets) > 1
         mosaic = ScoreMosaic(shape, count, rotated.blend, averaged=several, device=images.device)
         inputs = zip(sets, readers, rays, strict=True)
@@ -268,14 +274,15 @@ class SegmentationTask(Task):
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; return the predicted labels."""
         predictions = []
-        for images, target, rotation in zip(
-            batch.images, batch.target, batch.rotation, strict=True
+        for images, target, rotation, numbers in zip(
+            batch.images, batch.target, batch.rotation, batch.area, strict=True
         ):
             labels = self.predict_labels(
                 images,
                 tuple(target.shape),
                 rotation.cpu().numpy(),
                 None if self.is_tested else target,
+                SphereArea.of_numbers(numbers.cpu().numpy()),
             )
             predictions.append(labels)
             self.metric.update(labels, target)
@@ -351,7 +358,7 @@ class SegmentationTask(Task):
         self, name: str, image: Any, target: Tensor, prediction: Tensor
     ) -> EncodedImage:
         """Return the image with its true and predicted labels."""
-        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation)
+        rgb, truth, labels = shown_arrays(image, target, prediction, self.representation, cut=False)
         classes = len(self.class_names)
         counts = count_image(prediction.cpu(), target.cpu(), classes).pixels
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""

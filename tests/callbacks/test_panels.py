@@ -29,7 +29,7 @@ class _Source:
         return f"area/room {index}"
 
     def read(self, index: int) -> Any:
-        return SimpleNamespace(rgb=np.full((*SHAPE, 3), 20 * index, np.uint8))
+        return SimpleNamespace(rgb=np.full((*SHAPE, 3), 20 * index, np.uint8), area=None)
 
 
 def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:

@@ -41,7 +41,8 @@ def test_an_area_contains_what_is_between_its_edges(
 @pytest.mark.parametrize("step_deg", [5, 1.7])
 def test_directions_lie_in_the_area_and_leave_no_gap(step_deg: float) -> None:
     area = SphereArea(170, -150, -10, 25).rotated(random_rotation(np.random.default_rng(2)))
-    lattice = area.directions(step_deg)
+    lattice, steradians = area.lattice(step_deg)
+    assert steradians.sum() == pytest.approx(4 * np.pi * area.share, rel=1e-3)
     inner = SphereArea(170.01, -150.01, -9.99, 24.99, area.rotation)
     assert area.rotated(np.eye(3)).contains(lattice * (1 - 1e-9)).mean() > 0.6
     assert inner.contains(lattice).mean() > 0.5

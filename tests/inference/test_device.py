@@ -84,7 +84,7 @@ def test_tensors_are_rendered_like_arrays(name: str, monkeypatch: pytest.MonkeyP
     def rendered() -> list[NDArray[np.float32]]:
         return [
             RenderedViews(trained, shown, shape, "cpu")(part).numpy()
-            for shown, shape, sets in views(image)
+            for shown, shape, sets, _ in views(image)
             for part in sets
         ]
 

@@ -16,6 +16,7 @@ from torch.utils.data import DataLoader
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
 from tangent_train.errors import SettingError
+from tangent_train.geometry import SphereArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import quiet_trainer
@@ -24,11 +25,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([1.0, 3.0])
+WHOLE = torch.from_numpy(SphereArea.of(None).numbers)
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
 def _sample(images: Tensor, target: Tensor) -> Any:
-    return EvaluationSample(images, target, torch.eye(3).double(), 0)
+    return EvaluationSample(images, target, torch.eye(3).double(), WHOLE, 0)
 
 
 class Data(lightning.LightningDataModule):

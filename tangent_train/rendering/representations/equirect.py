@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, Self
 
 import numpy as np
@@ -12,7 +14,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import equirect_shape, random_rotation
+from tangent_train.geometry import (
+    SphereArea,
+    equirect_directions,
+    equirect_shape,
+    lonlat_to_equirect,
+    random_rotation,
+    xyz_to_lonlat,
+)
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, check_choice
 from tangent_train.rendering.forward import Interpolation, Pixels, rotate_equirect
@@ -23,6 +32,11 @@ from tangent_train.rendering.representations.views import (
     Views,
 )
 from tangent_train.rendering.resampling import resize
+
+_STRIDE = 32
+"""Parts of panoramas have a multiple of this many rows and columns: the stride of most networks."""
+
+_FINE_ROWS = 128
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +49,8 @@ class EquirectViews(Views):
         width: Number of columns of the view; None for all.
         mirrored: True if the view is mirrored left to right.
         rows: Rows to which the panorama is resized; None to keep its size.
+        top: First row of the view.
+        height: Number of rows of the view; None for all.
     """
 
     rotation: NDArray[np.float64] | None = None
@@ -42,6 +58,8 @@ class EquirectViews(Views):
     width: int | None = None
     mirrored: bool = False
     rows: int | None = None
+    top: int = 0
+    height: int | None = None
 
     def __len__(self) -> int:
         return 1
@@ -58,8 +76,9 @@ class EquirectViews(Views):
         if self.rows is not None:
             shown = resize(shown, (self.rows, 2 * self.rows), interpolation)
         if isinstance(image, Tensor):
-            columns: Any = shown.roll(-self.first, -1)[None, ..., : self.width]
+            columns: Any = shown.roll(-self.first, -1)[None, ..., self._lines, : self.width]
             return columns.flip(-1) if self.mirrored else columns
+        shown = shown[self._lines]
         if self.first or self.width is not None:
             stop = self.first + (self.width or shown.shape[1])
             shown = shown.take(np.arange(self.first, stop), axis=1, mode="wrap")
@@ -68,8 +87,13 @@ class EquirectViews(Views):
         view: Any = np.ascontiguousarray(shown[None])
         return view
 
+    @property
+    def _lines(self) -> slice:
+        return slice(self.top, None if self.height is None else self.top + self.height)
+
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return the scores of the unrotated panorama, extended by a pixel on all sides."""
+        scores = self._extended(scores)
         scores = scores.roll(self.first, -1)
         if self.rotation is not None:
             scores = rotate_equirect(scores, self.rotation)
@@ -82,12 +106,23 @@ class EquirectViews(Views):
         box = np.array([[-x, -y, shape[1] + x, shape[0] + y]])
         return framed, PhotoCrops(box, (rows + 2, columns + 2), is_overlapping=False)
 
+    def _extended(self, scores: Tensor) -> Tensor:
+        """Return scores ``(…, h, w)`` of a part of the panorama repeated to all of it."""
+        if self.rows is None or scores.shape[-2:] == (self.rows, 2 * self.rows):
+            return scores
+        rows, columns = scores.shape[-2:]
+        down = (torch.arange(self.rows) - self.top).clamp(0, rows - 1)
+        across = torch.arange(2 * self.rows)
+        across = across.where(across < self.rows + columns // 2, across - 2 * self.rows)
+        return scores[..., down[:, None], across.clamp(0, columns - 1)]
+
 
 @registered
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
 
-    Evaluation always uses the whole image.
+    Evaluation always uses the whole image, or the rows and columns that show the area of a partial
+    panorama.
 
     Args:
         level: Level s of the panorama.
@@ -130,7 +165,8 @@ class EquirectRepresentation:
         self.mirror = mirror
         self._rows = rows or self.erp_height
         self._rotation: NDArray[np.float64] | None = None
-        columns = self.image_size[1]
+        self._area: SphereArea | None = None
+        columns = 2 * self._rows
         self._first_columns = [round(columns * k / rotations) for k in range(rotations)]
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
@@ -139,27 +175,141 @@ class EquirectRepresentation:
         rotated._rotation = unless_identity(rotation)
         return rotated
 
+    def limited_to(self, area: SphereArea | None) -> Self:
+        """Return the same representation with only the rows and columns that show an area.
+
+        Their numbers are rounded up to a multiple of 32 (of a divisor of `rows`). Under rotation,
+        evaluation takes as many as needed, and a training sample as many as without rotation,
+        where they see most of the area.
+        """
+        limited = copy.copy(self)
+        limited._area = None if area is None or area.is_whole else area
+        return limited
+
     @property
     def image_size(self) -> tuple[int, int]:
-        """Rows and columns of the image in evaluation."""
-        return self._rows, 2 * self._rows
+        """Rows and columns of the image of an unrotated panorama in evaluation."""
+        window = _Window.whole(self._rows)
+        if self._area is not None:
+            window = _resting_window(self._area.angles, self._rows)
+        return window.height, window.width
 
     def sample(self, rng: np.random.Generator) -> EquirectViews:
         """Return the panorama or a random crop of it, optionally rotated."""
-        first, width, columns = 0, None, self.image_size[1]
+        rotation, columns, shift = self._rotation, 2 * self._rows, None
         if self.crop_deg is not None or self.random_rotation == "yaw":
-            first, width = (
-                int(rng.random() * columns),
-                round(columns * (self.crop_deg or 360) / 360),
-            )
-        rotation = self._rotation
+            shift = rng.random()
         if self.random_rotation == "so3":
             drawn = random_rotation(rng).T
             rotation = drawn if rotation is None else rotation @ drawn
+        window = self._window(rotation, self.image_size)
+        if shift is not None:
+            width = min(window.width, round(columns * (self.crop_deg or 360) / 360))
+            starts = columns if window.width == columns else window.width - width + 1
+            window = replace(window, first=window.first + int(shift * starts), width=width)
         mirrored = self.mirror and bool(rng.random() < 0.5)
-        return EquirectViews(rotation, first, width, mirrored, self._rows)
+        return self._views(rotation, window, mirrored=mirrored)
 
     def view_sets(self) -> list[EquirectViews]:
-        """Return the whole panorama in every rotation."""
-        rotation, rows = self._rotation, self._rows
-        return [EquirectViews(rotation, first, rows=rows) for first in self._first_columns]
+        """Return the whole panorama, or its part that shows the area, in every rotation."""
+        window = self._window(self._rotation)
+        # A part has its edges at the same longitudes in every rotation.
+        shifts = self._first_columns if window.width == 2 * self._rows else [0]
+        windows = (replace(window, first=window.first + shift) for shift in shifts)
+        return [self._views(self._rotation, shifted) for shifted in windows]
+
+    def _window(
+        self, rotation: NDArray[np.float64] | None, size: tuple[int, int] | None = None
+    ) -> _Window:
+        """Return the part of the rotated panorama that is rendered, see `limited_to`.
+
+        Args:
+            rotation: See `EquirectViews`.
+            size: Rows and columns in training.
+        """
+        if self._area is None:
+            return _Window.whole(self._rows)
+        area = self._area if rotation is None else self._area.rotated(rotation.T)
+        if area.rotation is None:
+            return _resting_window(area.angles, self._rows)
+        return _find_window(area, self._rows, size)
+
+    def _views(
+        self, rotation: NDArray[np.float64] | None, window: _Window, *, mirrored: bool = False
+    ) -> EquirectViews:
+        columns = 2 * self._rows
+        width = window.width if window.width < columns else None
+        first = window.first % columns
+        return EquirectViews(
+            rotation, first, width, mirrored, self._rows, window.top, window.height
+        )
+
+
+@dataclass(frozen=True)
+class _Window:
+    """A part of an equirectangular image, which may continue across its right edge."""
+
+    top: int
+    height: int
+    first: int
+    width: int
+
+    @classmethod
+    def whole(cls, rows: int) -> Self:
+        return cls(0, rows, 0, 2 * rows)
+
+
+@lru_cache(maxsize=16)
+def _resting_window(angles: tuple[float, ...], rows: int) -> _Window:
+    return _find_window(SphereArea.of(angles), rows)
+
+
+def _find_window(area: SphereArea, rows: int, size: tuple[int, int] | None = None) -> _Window:
+    """Return the smallest window that shows an area, or the one of a given size that shows most.
+
+    Args:
+        area: The area, in the frame of the image.
+        rows: Rows of the image.
+        size: Rows and columns of the window.
+    """
+    step, beyond = 1, 0
+    if area.rotation is not None:  # found in steps, to save time
+        step = max((k for k in range(1, rows // _FINE_ROWS + 1) if rows % k == 0), default=1)
+        beyond = step
+    seen = area.contains(equirect_directions((rows // step, 2 * rows // step)))
+    if not seen.any():  # smaller than a pixel
+        corner = lonlat_to_equirect(xyz_to_lonlat(area.lattice(180)[0][0]), seen.shape)
+        column, row = corner.round().astype(int)
+        seen[row % len(seen), column % seen.shape[1]] = True
+    runs = [
+        _run(seen.sum(axis=1 - axis).repeat(step), beyond, math.gcd(rows, _STRIDE), length, axis)
+        for axis, length in enumerate(size or (None, None))
+    ]
+    (top, height), (first, width) = runs
+    return _Window(min(max(top, 0), rows - height), height, first, width)
+
+
+def _run(
+    counts: NDArray[np.int64], beyond: int, multiple: int, length: int | None, axis: int
+) -> tuple[int, int]:
+    """Return start and length of a run of rows or columns; columns continue across the end.
+
+    Args:
+        counts: Pixels of the area in each row or column.
+        beyond: Lines added on both sides.
+        multiple: The length is a multiple of this.
+        length: Length of the run that contains as many pixels as possible; None for the shortest
+            run that contains all.
+        axis: 0 for rows, 1 for columns.
+    """
+    total, lines = len(counts), np.flatnonzero(counts)
+    gaps = np.diff(lines, append=lines[0] + total)
+    widest = int(gaps.argmax())
+    needed = total - int(gaps[widest]) + 1 + 2 * beyond
+    start = int(lines[(widest + 1) % len(lines)]) - beyond
+    if length is None:
+        length = min(total, -(-needed // multiple) * multiple)
+    elif length < needed:
+        sums = np.cumsum(np.concatenate([[0], counts, axis * counts]))
+        return int((sums[length:-1] - sums[: -length - 1])[:total].argmax()), length
+    return (0 if length == total else start - (length - needed) // 2), length

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Self, TypeVar
 
 import numpy as np
@@ -14,13 +15,16 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
+    SphereArea,
     TangentGrid,
     equirect_shape,
     random_rotation,
     rotation_about,
 )
+from tangent_train.geometry.area_views import best_views, views_of_area
+from tangent_train.geometry.coverage import check_joint_coverage
 from tangent_train.registry import registered
-from tangent_train.rendering.checks import Blend, check_choice
+from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
 _Grid = TypeVar("_Grid", bound=PinholeGrid)
@@ -39,9 +43,12 @@ class PinholeRepresentation:
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over.
         faces_per_panorama: Number of random images in a training sample; all by default.
+        is_partial: True if the images do not cover the sphere.
+        is_joint: True if only all grids together cover what the representation covers.
 
     Attributes:
         grid: Images of `level`, not rotated.
+        grids: Images of each level to average over, not rotated.
 
     Raises:
         SettingError: A setting is invalid.
@@ -61,6 +68,8 @@ class PinholeRepresentation:
         blend: Blend,
         rotations: int,
         faces_per_panorama: int | None = None,
+        is_partial: bool = False,
+        is_joint: bool = False,
     ) -> None:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
@@ -78,8 +87,10 @@ class PinholeRepresentation:
         self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
         self.blend = blend
         self.faces_per_panorama = faces_per_panorama
-        self._grids = grids
+        self.grids = grids
         self._rotations = vertical_rotations(rotations, self.symmetry_deg)
+        self._area: SphereArea | None = None
+        self._is_partial, self._is_joint = is_partial, is_joint
 
     @property
     def image_size(self) -> tuple[int, int]:
@@ -91,25 +102,91 @@ class PinholeRepresentation:
         rotated = copy.copy(self)
         rotation_or_none = unless_identity(rotation)
         rotated.grid = self.grid.with_rotation(rotation_or_none)
-        rotated._grids = [grid.with_rotation(rotation_or_none) for grid in self._grids]
+        rotated.grids = [grid.with_rotation(rotation_or_none) for grid in self.grids]
         return rotated
+
+    def limited_to(self, area: SphereArea | None) -> Self:
+        """Return the same representation with only the images that an area needs.
+
+        Evaluation renders those of `views_of_area`. A training sample contains as many images as
+        the unrotated area needs, so that samples of one batch have equal numbers: those of
+        `views_of_area`, or under rotation those that see most.
+
+        Raises:
+            SettingError: The images of a partial representation do not cover the area.
+        """
+        limited = copy.copy(self)
+        limited._area = None if area is None or area.is_whole else area
+        if self._is_partial:
+            limited.view_sets()
+        return limited
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
         """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
-        grid = self.grid
+        (needed,) = self._needed([self.grid], is_resting=True)
+        return self._sample(rng, self.grid, needed)
+
+    def _sample(
+        self,
+        rng: np.random.Generator,
+        grid: PinholeGrid,
+        needed: NDArray[np.int64],
+        most: int | None = None,
+    ) -> PinholeViews:
+        """Return `sample` of one grid.
+
+        Args:
+            rng: Random generator.
+            grid: The grid.
+            needed: Images that the area needs without rotation.
+            most: Maximum number of images; None for all that are needed.
+        """
         if self.random_rotation != "none":
             yaw = self.random_rotation == "yaw"
             angle = rng.uniform(0, 2 * math.pi)
             rotation = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
             grid = _rotated(grid, rotation)
-        faces = None
-        if self.faces_per_panorama is not None:
-            faces = rng.choice(grid.num_images, self.faces_per_panorama, replace=False)
+        faces = None if self._area is None else needed
+        if self._area is not None and not (grid.rotation is None is self._area.rotation):
+            faces = best_views(grid, self._area, len(needed))
+        limits = [count for count in (self.faces_per_panorama, most) if count is not None]
+        if limits:
+            available = grid.num_images if faces is None else faces
+            faces = rng.choice(available, min(*limits, len(needed)), replace=False)
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
+
+    def _needed(
+        self, grids: Sequence[PinholeGrid], *, is_resting: bool = False
+    ) -> list[NDArray[np.int64]]:
+        """Return the images of grids, under one rotation, that the area needs.
+
+        Args:
+            grids: Grids to average over, or grids of a joint representation.
+            is_resting: True to ignore the rotations of grids and area.
+        """
+        area = self._area
+        if area is None:
+            return [grid.face_indices() for grid in grids]
+        if is_resting:
+            area, grids = replace(area, rotation=None), [g.with_rotation(None) for g in grids]
+        if self._is_joint:
+            return views_of_area(grids, area)
+        blends = (blend_of(self.blend, is_overlapping=grid.is_overlapping) for grid in grids)
+        return [
+            views_of_area([grid], area, by_owners=blend == "nearest")[0]
+            for grid, blend in zip(grids, blends, strict=True)
+        ]
 
     def view_sets(self) -> list[PinholeViews]:
         """Return all images of every level in every rotation."""
-        return [PinholeViews(_rotated(grid, r)) for grid in self._grids for r in self._rotations]
+        rotated = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
+        for grids in rotated if self._is_partial else ():
+            check_joint_coverage(grids, self._area)
+        of_rotations = (zip(grids, self._needed(grids), strict=True) for grids in rotated)
+        pairs = [pair for of_grid in zip(*of_rotations, strict=True) for pair in of_grid]
+        if self._area is not None:
+            pairs = [(grid.subset(faces), faces) for grid, faces in pairs if len(faces)]
+        return [PinholeViews(grid) for grid, _ in pairs]
 
 
 @registered

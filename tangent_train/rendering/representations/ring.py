@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -93,15 +92,18 @@ class RingRepresentation(PinholeRepresentation):
             blend,
             rotations,
             faces_per_panorama,
+            covered is not None,
+            len(grids) > 1,
         )
 
     def sample(self, rng: np.random.Generator) -> PinholeViews:
         """See `PinholeRepresentation`; of one field of view, drawn by the number of its views."""
-        drawn = copy.copy(self)
-        if len(self._grids) > 1:
-            counts = np.array([grid.num_images for grid in self._grids])
-            drawn.grid = self._grids[rng.choice(len(counts), p=counts / counts.sum())]
-        return super(RingRepresentation, drawn).sample(rng)
+        if not self._is_joint:
+            return super().sample(rng)
+        needed = self._needed(self.grids, is_resting=True)
+        counts = np.array([len(faces) for faces in needed])
+        drawn = rng.choice(len(counts), p=counts / counts.sum())
+        return self._sample(rng, self.grids[drawn], needed[drawn], counts[counts > 0].min())
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.geometry import PinholeGrid
+from tangent_train.geometry import PinholeGrid, SphereArea
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
@@ -126,6 +126,14 @@ class Representation(Sampler, Protocol):
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
         """Return the same representation in rotated directions R·d, for tilted panoramas."""
+        ...
+
+    def limited_to(self, area: SphereArea | None) -> Self:
+        """Return the same representation with only the views that an area needs.
+
+        Args:
+            area: Part of the sphere, in the frame of the panorama; None for all of it.
+        """
         ...
 
 
