@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tangent_train.imports import import_own_packages
 
 if TYPE_CHECKING:
-    from tangent_train.geometry import TangentGrid
+    from tangent_train.geometry import RingGrid, TangentGrid
     from tangent_train.inference.network import load
     from tangent_train.rendering import (
         apply,
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     )
 
 __all__ = [
+    "RingGrid",
     "TangentGrid",
     "apply",
     "equirect_to_tangent",
@@ -31,7 +32,7 @@ __all__ = [
 
 import_own_packages()
 
-_HOMES = {"TangentGrid": "geometry", "load": "inference.network"}
+_HOMES = {"RingGrid": "geometry", "TangentGrid": "geometry", "load": "inference.network"}
 
 
 def __getattr__(name: str) -> Any:

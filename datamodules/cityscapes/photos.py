@@ -13,7 +13,7 @@ On disk, as released (`leftImg8bit_trainvaltest`, `gtFine_trainvaltest`, `camera
 
 The images of ``test`` are not read: their label images are dummies.
 
-License: free for academic research, https://www.cityscapes-dataset.com/license.
+License: non-commercial purposes such as research, https://www.cityscapes-dataset.com/license.
 
 Citation: M. Cordts, M. Omran, S. Ramos, T. Rehfeld, M. Enzweiler, R. Benenson, U. Franke, S. Roth,
 B. Schiele: "The Cityscapes Dataset for Semantic Urban Scene Understanding", CVPR 2016.
@@ -126,8 +126,9 @@ class Cityscapes(PhotoDataModule):
         if self.validation_fraction:
             held = draw_groups(cities, self.validation_fraction, self.seed)
         problems.compare_counts({"train": len(train), "test": len(test)}, _PUBLISHED)
-        labels = self.root.glob("gtFine/[tv][ra]*/*/*_labelIds.png")
-        problems.note_strays(labels, [*train, *test])
+        for split, images in (("train", train), ("val", test)):
+            labels = (self.root / "gtFine" / split).glob("*/[!.]*_labelIds.png")
+            problems.note_strays(labels, images)
         return CityscapesReader(_TABLE, self.fov), {
             "train": [f for f, city in zip(train, cities, strict=True) if city not in held],
             "val": [f for f, city in zip(train, cities, strict=True) if city in held],
@@ -146,7 +147,7 @@ class Cityscapes(PhotoDataModule):
                     remedy=_GET_IT,
                 )
         found = []
-        for rgb in sorted((self.root / "leftImg8bit" / split).glob("*/*_leftImg8bit.png")):
+        for rgb in sorted((self.root / "leftImg8bit" / split).glob("*/[!.]*_leftImg8bit.png")):
             city, stem = rgb.parent.name, rgb.name.removesuffix("_leftImg8bit.png")
             labels, camera = (
                 self.root / kind / split / city / f"{stem}_{end}"

@@ -12,7 +12,7 @@ On disk, as released::
 Pixels are square in angle: 400 rows span 400 / 2048 · 360° = 70.3°. The row of the horizon is not
 published. The default is the middle, so that the panoramas reach from -35.15° to 35.15°.
 
-License: free for academic research, https://github.com/chma1024/DensePASS.
+License: not stated by its page, https://github.com/chma1024/DensePASS; ask the authors.
 
 Citation: C. Ma, J. Zhang, K. Yang, A. Roitberg, R. Stiefelhagen: "DensePASS: Dense Panoramic
 Semantic Segmentation via Unsupervised Domain Adaptation with Attention-Augmented Context Exchange",
@@ -79,11 +79,13 @@ class DensePASS(PanoramaDataModule):
         """See `ImageDataModule`."""
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
-        paths = {path.stem.removesuffix("_"): path for path in images.glob("*.png")}
-        if not paths:
+        files = list(images.glob("[!.]*.png"))
+        paths = {path.stem.removesuffix("_"): path for path in files}
+        if not paths or len(paths) < len(files):
+            found = "panoramas in both spellings" if files else "no panoramas"
             expected = "1_.png or 1.png, and others"
-            raise DataError(images, found="no panoramas", expected=expected, remedy=_GET_IT)
+            raise DataError(images, found=found, expected=expected, remedy=_GET_IT)
         test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
         problems.compare_counts({"test": len(test)}, _PUBLISHED)
-        problems.note_strays(labels.glob(f"*{_LABELS}"), test)
+        problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
         return NumberedReader(_TABLE), {"train": [], "val": [], "test": test}

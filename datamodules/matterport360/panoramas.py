@@ -158,9 +158,10 @@ class Matterport360(PanoramaDataModule):
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
-        found = {path.stem: path for path in sorted((*rgb.glob("*.jpg"), *rgb.glob("*.png")))}
+        # Hidden files are leftovers of archives made on a Mac.
+        found = {path.stem: path for end in ("jpg", "png") for path in rgb.glob(f"[!.]*.{end}")}
         images = []
-        for stem, path in found.items():
+        for stem, path in sorted(found.items()):
             labels, depth = (folder / f"{stem}.png" for folder in folders)
             with_depth = depth if "depth" in self.inputs else None
             images.append(ImageFiles(f"{scene}/{stem}", path, labels, with_depth))

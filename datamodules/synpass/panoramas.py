@@ -11,7 +11,8 @@ On disk, as released::
 
 Weathers are cloud, fog, rain and sun; splits are train, val and test.
 
-License: free for academic research, https://github.com/jamycheung/Trans4PASS.
+License: that of the data is not stated; the authors ask to be contacted before commercial use,
+https://github.com/jamycheung/Trans4PASS.
 
 Citation: J. Zhang, K. Yang, H. Shi, S. Reiß, K. Peng, C. Ma, H. Fu, P. H. S. Torr, K. Wang,
 R. Stiefelhagen: "Behind Every Domain There is a Shift: Adapting Distortion-aware Vision
@@ -138,8 +139,8 @@ class SynPASS(PanoramaDataModule):
         labels: list[Path] = []
         for weather in self._weathers:
             place = Path(weather, split)
-            labels += (self.root / "semantic" / place).glob("*/*_trainID.png")
-            for rgb in sorted((self.root / "img" / place).glob("*/*.jpg")):
+            labels += (self.root / "semantic" / place).glob("*/[!.]*_trainID.png")
+            for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
         problems.note_strays(labels, found)

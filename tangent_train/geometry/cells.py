@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import permutations
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,17 +20,16 @@ def cell_neighbors(centers_xyz: NDArray[np.float64]) -> NDArray[np.int32]:
     Returns:
         ``(N, k)`` indices, padded with the cell itself.
     """
-    count = len(centers_xyz)
-    hull = _hull(centers_xyz)
-    joined = np.ones((count, count), np.bool_)
-    if hull is not None:
-        joined[:] = False
-        for a, b in permutations(range(3), 2):
-            joined[hull[0][:, a], hull[0][:, b]] = True
-    np.fill_diagonal(joined, val=False)
-    neighbors = np.repeat(np.arange(count)[:, None], max(1, joined.sum(axis=1).max()), axis=1)
-    for cell, others in enumerate(joined):
-        neighbors[cell, : others.sum()] = np.flatnonzero(others)
+    hull, count = _hull(centers_xyz), len(centers_xyz)
+    if hull is None:
+        pairs = np.argwhere(~np.eye(count, dtype=np.bool_))
+    else:
+        sides = hull[0][:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]]
+        pairs = np.unique(sides.reshape(-1, 2), axis=0)
+    cells, others = pairs.T
+    number = np.arange(len(cells)) - np.searchsorted(cells, cells)
+    neighbors = np.repeat(np.arange(count)[:, None], 1 + number.max(initial=0), axis=1)
+    neighbors[cells, number] = others
     return neighbors.astype(np.int32)
 
 

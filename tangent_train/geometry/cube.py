@@ -22,9 +22,6 @@ _FACES = [  # right, down, forward
 ]
 _AXES = np.array(_FACES).swapaxes(1, 2)
 
-_NEIGHBORS = np.nonzero(_AXES[..., 2] @ _AXES[..., 2].T == 0)[1].reshape(6, 4).astype(np.int32)
-_NEIGHBORS.setflags(write=False)
-
 
 @dataclass(frozen=True, eq=False, init=False)
 class CubeGrid(SquareGrid):
@@ -63,11 +60,6 @@ class CubeGrid(SquareGrid):
         margin = at_least("margin", margin, 0)
         dim = at_least("dim", dim, 2 + 2 * margin)
         self._set(rotation, size=(dim, dim), pitch=2 / (dim - 2 * margin))
-
-    @property
-    def neighbors(self) -> NDArray[np.int32]:
-        """``(6, 4)`` faces that share an edge with each face: all but itself and its opposite."""
-        return _NEIGHBORS
 
     @property
     def is_overlapping(self) -> bool:

@@ -18,7 +18,7 @@ _MAX_LEVEL = 30  # a panorama of 2³¹ rows; much larger powers of two take too 
 
 
 class _FaceTable:
-    """Data that depend only on the base level: centers, axes, neighbors, extent of the cells."""
+    """Data that depend only on the base level: centers, axes, extent of the cells."""
 
     def __init__(self, base_level: int) -> None:
         vertices, self.faces = icosphere(base_level)
@@ -30,16 +30,6 @@ class _FaceTable:
         south = np.cross(east, self.centers_xyz)
         self.world_from_camera = np.stack([east, south, self.centers_xyz], axis=-1)
         self.faces_of_vertex = _group(self.faces, len(vertices))
-
-    @cached_property
-    def neighbors(self) -> NDArray[np.int32]:
-        """See `TangentGrid.neighbors`."""
-        around = np.sort(self.faces_of_vertex[self.faces].reshape(len(self.faces), -1), axis=1)
-        itself = np.arange(len(self.faces))[:, None]
-        repeated = np.pad(around[:, 1:] == around[:, :-1], ((0, 0), (1, 0)))
-        around = np.where(repeated, itself, around)
-        order = np.argsort(around == itself, axis=1, kind="stable")[:, :12]
-        return np.take_along_axis(around, order, axis=1).astype(np.int32)
 
     @cached_property
     def owned_extent(self) -> float:
@@ -140,11 +130,6 @@ class TangentGrid(SquareGrid):
         """Return the smallest `dim` whose images cover every owned cell."""
         extent = _face_table(base_level).owned_extent
         return math.ceil(2 * extent / _pitch(base_level, level) - 1e-9) + 1
-
-    @property
-    def neighbors(self) -> NDArray[np.int32]:
-        """``(N, 12)`` faces that share a vertex with a face, padded with the face itself."""
-        return _face_table(self.base_level).neighbors
 
     @property
     def is_overlapping(self) -> bool:

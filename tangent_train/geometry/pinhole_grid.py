@@ -56,16 +56,12 @@ class PinholeGrid:
     ) -> None:
         self._set(rotation, size=size, pitch=pitch, _axes=axes, _is_overlapping=is_overlapping)
 
-    @property
+    @cached_property
     def neighbors(self) -> NDArray[np.int32]:
         """``(N, k)`` neighbors of every image, padded with the image itself.
 
         Stepping repeatedly to the neighbor with the nearest center ends at the owner.
         """
-        return self._cell_neighbors
-
-    @cached_property
-    def _cell_neighbors(self) -> NDArray[np.int32]:
         return cell_neighbors(self._resting_axes()[..., 2])
 
     @property

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from tangent_train.rendering.representations.views import Views
 
 _LEAST_TOTAL = 1e-37
-_PIXELS_AT_ONCE = 1 << 20
+_PIXELS_AT_ONCE = 1 << 17
 
 
 class ScoreMosaic:

@@ -151,7 +151,7 @@ def test_gaps_are_refused(rings: Any, fov: Any, message: str, by_owners: bool) -
 def test_a_direction_may_be_shown_by_another_view_than_its_owner() -> None:
     """Narrow views overlap far more above and below than at their sides."""
     rings, fov, size = ((0, 8), (75, 4), (-75, 4)), (47.0, 124.0), (52, 12)
-    grid_of(rings, fov, size)
+    grid_of(rings, fov, size, by_owners=False)
     with pytest.raises(SettingError, match=r"nearest center \(blend=nearest\)"):
         grid_of(rings, fov, size, by_owners=True)
 

@@ -113,6 +113,10 @@ def test_torch_agrees_with_the_compiled_kernels(
         for rows in (slice(None), np.array([3, 1])):
             probabilities = (mosaic.probabilities(rows) for mosaic in (of_torch, compiled))
             torch.testing.assert_close(*probabilities, atol=1e-5, rtol=0)
+        monkeypatch.setattr("tangent_train.rendering.mosaic._PIXELS_AT_ONCE", 2**8)
+        best = compiled.probabilities(slice(None)).amax(dim=-1)
+        for mosaic in (of_torch, compiled):
+            np.testing.assert_allclose(mosaic.confidences(), best, atol=1e-5)
 
 
 @pytest.mark.parametrize("name", SETS)

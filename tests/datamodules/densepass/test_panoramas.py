@@ -82,6 +82,9 @@ def test_missing_labels_other_sizes_and_an_empty_folder_are_refused(tmp_path: Pa
     assert "1 without an image" in problems.warnings[-1]
     with pytest.raises(DataError, match=r"val/cs: found no panoramas.*DensePASS"):
         panoramas(root / "gtFine").setup()
+    write_png(root / "leftImg8bit/val/cs/1.png", np.zeros((400, 2048, 3), np.uint8))
+    with pytest.raises(DataError, match=r"val/cs: found panoramas in both spellings"):
+        panoramas(root).setup()
 
 
 def test_training_is_refused(shared: Path) -> None:

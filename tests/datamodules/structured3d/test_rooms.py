@@ -105,8 +105,12 @@ def test_published_8_classes_depend_on_the_other_classes_of_an_image(others: lis
     assert (looped + 1).tolist() == published
 
 
-def test_both_sets_are_read(root: Path, erp: Any) -> None:
-    right, published = (Structured3D(root, erp, classes=c) for c in ("8", "published_s3d8"))
+def test_both_sets_are_read_and_stored(root: Path, erp: Any, tmp_path: Path) -> None:
+    right, published = (
+        Structured3D(root, erp, classes=c, store=tmp_path) for c in ("8", "published_s3d8")
+    )
+    for data in (right, published):
+        data.prepare_data()
     names = ("unknown", "ceiling", "chair", "door", "floor", "sofa", "table", "wall", "window")
     assert right.class_names == published.class_names == names
     before, after = (data.source("test").labels(0) for data in (right, published))
