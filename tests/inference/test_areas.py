@@ -96,8 +96,8 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
         counts.append(metric.compute())
     whole, part = counts
     for name in ("pixels", "bands", "solid_angle"):  # true classes, which the fill does not change
-        sums = [getattr(count, name).sum(axis=-1) for count in counts]
-        np.testing.assert_allclose(*sums, rtol=1e-12)
+        expected, found = (getattr(count, name).sum(axis=-1) for count in counts)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
     assert whole.pixels.sum() > 0
     before, after = torch.stack(labels[:2]), torch.stack(labels[2:])
     assert (before == after)[before > 0].double().mean() > 0.98
@@ -171,7 +171,7 @@ def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -
         90 - (bottom - 1) * pixel, 90 - (top + 1) * pixel,
     )  # fmt: skip
     inside = inner.contains(kept.directions()).all(axis=(1, 2))
-    assert 5 < inside.sum() < len(inside)
+    assert 5 < inside.sum() < inside.size
     whole = TangentRepresentation(1, 5).grid
     faces = (whole.centers_xyz @ kept.centers_xyz.T).argmax(axis=0)
     for of_whole, of_part in zip(*rendered, strict=True):
