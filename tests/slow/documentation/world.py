@@ -13,6 +13,7 @@ import sys
 import tempfile
 import tomllib
 import traceback
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +23,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from datamodules.cityscapes.classes import CLASSES
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
@@ -44,7 +46,8 @@ ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROWS = 128
 SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
-"""A photo network as the hub has it, where its name on the hub is a path."""
+OF_CITYSCAPES = "nvidia/segformer-b0-finetuned-cityscapes-1024-1024"
+"""Photo networks as the hub has them, where their names on the hub are paths."""
 _SEQUENCES = dict.fromkeys(("01", "02", "04", "05", "06"), 2)
 _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BATCHES": "2"}
 
@@ -68,6 +71,8 @@ def build_world(folder: Path) -> Path:
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
     networks.saved(networks.segformer, folder / SEGFORMER, size=small_photos)
+    of_streets = partial(networks.segformer, CLASSES)
+    networks.saved(of_streets, folder / OF_CITYSCAPES, size=small_photos)
     demo = f"runs/demo/{TIME}"
     for line in (
         f"tangent-train experiment=rooms/demo hydra.run.dir={demo}",
@@ -78,6 +83,7 @@ def build_world(folder: Path) -> Path:
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.safetensors",
         "tangent-render input=room.jpg output=tangent",
         f"tangent-import network=huggingface model={SEGFORMER} output=segformer.ckpt",
+        f"tangent-import network=huggingface model={OF_CITYSCAPES} output=cityscapes.ckpt",
     ):
         run(line.split(), {}, folder)
     for root in ("synthrooms", "rooms_standard"):
@@ -86,7 +92,6 @@ def build_world(folder: Path) -> Path:
     shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
-    shutil.copyfile(folder / "segformer.ckpt", folder / "cityscapes.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
