@@ -106,6 +106,7 @@ def _print_written(done: Sequence[Path], count: int) -> None:
 def _rendering_jobs(settings: RenderSettings) -> tuple[Iterable[Job], int, _Work]:
     """Return the panoramas, their number, and the function that renders one to its folder."""
     inputs, suffix = _panoramas(settings), _suffix(settings)
+    _grid(settings, 512)  # invalid views are refused before any panorama
     names, output = inputs.names(), settings.output
     if settings.figure is not None and len(names) > 1:
         raise SettingError("figure", found=f"{len(names)} panoramas", expected="one panorama")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,6 +16,7 @@ from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 
 _WIDEST_DEG = 170.0
+_MOST_VIEWS = 360  # of a ring
 _SAME = 1 - 1e-12
 
 
@@ -103,11 +104,14 @@ def checked_rings(rings: Sequence[Mapping[str, float]]) -> tuple[Ring, ...]:
     """
     checked = []
     for ring in rings:
-        pitch: object = ring.get("pitch")
-        if set(ring) != {"pitch", "views"} or not isinstance(pitch, int | float) or abs(pitch) > 90:
-            expected = "{pitch: -90 to 90, views: 1 or more}"
+        pitch: Any = ring.get("pitch")
+        views: Any = ring.get("views")
+        is_pitch = isinstance(pitch, int | float) and abs(pitch) <= 90
+        is_count = isinstance(views, int) and 1 <= views <= _MOST_VIEWS
+        if set(ring) != {"pitch", "views"} or not (is_pitch and is_count):
+            expected = f"{{pitch: -90 to 90, views: 1 to {_MOST_VIEWS}}}"
             raise SettingError("rings", found=dict(ring), expected=expected)
-        checked.append(Ring(float(pitch), at_least("views of a ring", ring["views"], 1)))
+        checked.append(Ring(float(ring["pitch"]), int(ring["views"])))
     if not checked:
         raise SettingError("rings", found="[]", expected="one ring or more")
     return tuple(checked)

@@ -383,7 +383,8 @@ def _photo_representation(
         seen = _built(trained, panorama_settings(trained, level, base_level, views), trained.source)
         if isinstance(seen, EquirectRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
-        size, half_extent = seen.image_size, seen.grid.half_size[0]
+        size = seen.image_size
+        half_extent = min(grid.half_size[0] for grid in seen.grids)
     check_size(trained, size)
     return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
 
