@@ -87,6 +87,26 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     assert found == protocol
 
 
+OF_THE_PAPER = [
+    (name, entry["experiment"])
+    for name, entry in protocols().items()
+    if entry.get("experiment", "").startswith("paper/")
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "experiment"), [*OF_THE_PAPER, ("paper_512", "paper/transfer_stanford")]
+)
+def test_experiments_of_the_paper_have_the_facts_of_its_scores(name: str, experiment: str) -> None:
+    command = "transfer" if "transfer" in experiment else "train"
+    settings = composed_settings(command, f"experiment={experiment}")
+    settings |= settings["photos"] if name == "paper_photos" else {}
+    protocol = facts(name)
+    assert settings["task"].get("absent_class") == protocol.pop("absent_class", None)
+    assert protocol.pop("weighting", "pixels") == "pixels"
+    assert build_data(settings).facts == protocol
+
+
 def test_an_imported_network_is_evaluated_on_photos_and_panoramas(
     worlds: Worlds, run: Run, tmp_path: Path, monkeypatch: Patch
 ) -> None:
