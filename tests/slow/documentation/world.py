@@ -32,7 +32,7 @@ from tests.datamodules.cityscapes.street_format import (
     write_densepass,
     write_synpass,
 )
-from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.folder_format import write_data_set, write_strips
 from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
@@ -64,6 +64,8 @@ def build_world(folder: Path) -> Path:
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
+    write_strips(folder / "my_strips", (50, 2 * ROWS), 12)
+    _write_streets(folder / "my_streets")
     write_photos(folder / "my_photos")
     classes = {name: [name] for name in ("wall", "floor", "window")}  # those of my_rooms
     (folder / "my_map.json").write_text(json.dumps({"source": "ADE20K", "classes": classes}))
@@ -104,6 +106,17 @@ def build_world(folder: Path) -> Path:
             else:
                 np.save(out, rgb[..., 0] // 32 if kind == "room" else rgb.astype(np.float32))
     return folder
+
+
+def _write_streets(root: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name in "abcd":
+        for folder, image in (
+            ("images", rng.integers(0, 256, (50, 2 * ROWS, 3), np.uint8)),
+            ("labels", rng.integers(0, 3, (50, 2 * ROWS), np.uint8)),
+        ):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(root / folder / f"{name}.png"), image)
 
 
 def _write_pictures(folder: Path) -> None:
