@@ -77,3 +77,9 @@ def wait_for(done: Callable[[], object], seconds: float = 60.0) -> None:
         if time.monotonic() > end:
             raise TimeoutError
         time.sleep(0.02)
+
+
+def command_of(experiment: str) -> str:
+    """Return the command that an experiment is for, transfer or train."""
+    pairs = "transfer", "zero_shot", "field/cityscapes_densepass", "field/stanford2d3ds_span8"
+    return "transfer" if any(name in experiment for name in pairs) else "train"

@@ -13,9 +13,9 @@ from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
 
 
-def _checked(root: Path, capsys: Capture) -> tuple[str, str]:
+def _checked(root: Path, capsys: Capture, *changes: str) -> tuple[str, str]:
     settings = ["data=folder", "level=4", f"data.root='{root}'", "data.validation_fraction=0"]
-    check(composed_settings("check", *settings))
+    check(composed_settings("check", *settings, *changes))
     return capsys.readouterr()
 
 
@@ -68,3 +68,19 @@ def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:
     out, err = _checked(root, capsys)
     assert out == f"Nothing is wrong; 3 panoramas of {root} checked.\n"
     assert "Warning" not in err
+
+
+def test_the_views_of_an_area_are_counted(tmp_path: Path, capsys: Capture) -> None:
+    write_classes(tmp_path, [None, "door"])
+    for name in ("a", "b", "c"):
+        save(tmp_path / "images" / f"{name}.png", np.zeros((12, 64, 3), np.uint8))
+        save(tmp_path / "labels" / f"{name}.png", np.ones((12, 64), np.uint8))
+    (tmp_path / "test.txt").write_text("a")
+    area = "[-180,180,-33.75,33.75]"
+    expected = f"Area {area.replace(',', ', ')}: 55.6 % of the sphere; 10 of 20 views, 16 × 16"
+    _, err = _checked(tmp_path, capsys, f"data.area={area}")
+    assert expected in err
+    with pytest.raises(SystemExit):
+        _checked(tmp_path, capsys, "data.area=[-180,180,-60,60]")
+    out, err = capsys.readouterr()
+    assert out.count("expected 64 × 21 (width × height), for square pixels in data.area=") == 3

@@ -18,7 +18,7 @@ from tangent_train.cli.compose import literal_paths, path_text, quoted
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import config_folder
-from tests.running import composed
+from tests.running import command_of, composed
 
 EXPERIMENTS = sorted(
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
@@ -31,10 +31,7 @@ GROUPS = (
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_experiment_composes(experiment: str) -> None:
-    pairs = "field/cityscapes_densepass", "field/stanford2d3ds_span8"
-    transfers = "transfer" in experiment or experiment.startswith(pairs)
-    command = "transfer" if transfers else "train"
-    config = composed(command, f"experiment={experiment}")
+    config = composed(command_of(experiment), f"experiment={experiment}")
     OmegaConf.resolve(config)
     assert config.name in (experiment, experiment.removeprefix("rooms/"))
 

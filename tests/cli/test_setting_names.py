@@ -15,7 +15,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
 from tests.cli import tiny_runs
 from tests.cli.tiny_runs import Run, results
-from tests.running import composed
+from tests.running import command_of, composed
 
 EXPERIMENTS = [
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
@@ -37,8 +37,7 @@ def test_all_settings_of_a_command_are_declared_and_others_are_not(command: str)
 
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_experiments_set_what_is_read(experiment: str) -> None:
-    transfers = "transfer" in experiment or experiment == "zero_shot"
-    _check("transfer" if transfers else "train", f"experiment={experiment}")
+    _check(command_of(experiment), f"experiment={experiment}")
 
 
 @pytest.mark.parametrize("group", ["debug", "callbacks", "logger", "sweep", "launcher", "recipe"])

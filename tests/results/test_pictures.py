@@ -2,9 +2,17 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
+from datamodules.core.panoramas import Panorama
 from datamodules.images.palette import class_colors
-from tangent_train.results.pictures import colorize, mixed_picture, prediction_panel
+from tangent_train.geometry import SphereArea, equirect_directions, rotation_about
+from tangent_train.results.pictures import (
+    colorize,
+    mixed_picture,
+    prediction_panel,
+    shown_arrays,
+)
 
 NAMES = ("unknown", "wall", "floor", "sofa")
 
@@ -47,3 +55,23 @@ def test_the_panel_shows_input_truth_prediction_and_error(rows: int, scale: int)
     assert np.all(error[(truth != 0) & (prediction == truth)] == 255)
     assert np.all(error[(truth != 0) & (prediction != truth)] == (214, 39, 40))
     assert panel.shape[0] > 44 + 2 * height, "a legend follows"
+
+
+@pytest.mark.parametrize("rotation", [None, 0.4])
+def test_a_partial_panorama_is_shown_cut_or_black_around(rotation: float | None) -> None:
+    area = SphereArea(90, -90, -45, 22.5)
+    if rotation is not None:
+        area = area.rotated(rotation_about((0, 1, 0), rotation))
+    rng = np.random.default_rng(0)
+    image = Panorama(
+        rng.integers(1, 256, (32, 64, 3), np.uint8), None, np.ones((32, 64), np.uint8), area=area
+    )
+    labels = torch.ones(32, 64, dtype=torch.uint8)
+    inside = area.contains(equirect_directions((32, 64)))
+    for found in shown_arrays(image, labels, labels, None, cut=False):
+        assert (found[inside] > 0).all()
+        assert (found[~inside] == 0).all()
+    rgb, truth, _ = shown_arrays(image, labels, labels, None)
+    assert truth.shape == ((12, 32) if rotation is None else (32, 64))
+    if rotation is None:
+        np.testing.assert_array_equal(rgb, image.rgb[12:24][:, np.r_[48:64, 0:16]])

@@ -11,27 +11,16 @@ import pytest
 from PIL import Image
 
 from datamodules import FolderPanoramas
+from datamodules.core.panoramas import ImageFiles, Panorama
+from datamodules.core.transforms import EstimatedUp, RotatedPanoramas, placed
 from datamodules.images.gpano import Fill, PanoramaArea
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import SphereArea, equirect_directions
 from tangent_train.rendering import EquirectRepresentation
-from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, read_png, write_png
-from tests.datamodules.folder.folder_format import blocks, save, write_classes
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, read_png
+from tests.datamodules.folder.folder_format import save, write_strips
 
 AREA = (-180, 180, -35.15, 35.15)
-
-
-def write_strips(root: Path, size: tuple[int, int], count: int = 4, *, depth: bool = False) -> Path:
-    """Partial panoramas of rows and columns, whose red channel holds the label values."""
-    write_classes(root)
-    for number in range(count):
-        values = blocks(number, max(size))[: size[0], : size[1]]
-        green = np.random.default_rng(number).integers(1, 256, size, np.uint8)
-        save(root / "images" / f"{number}.png", np.stack([values, green, green], axis=-1))
-        save(root / "labels" / f"{number}.png", values)
-        if depth:
-            write_png(root / "depth" / f"{number}.png", values.astype(np.uint16) + 300)
-    return root
 
 
 @pytest.mark.parametrize("level", [7, 6])
@@ -152,6 +141,38 @@ def test_a_mask_is_of_the_part_or_of_the_whole_sphere(
     if size[0] == 128:
         counts = counts[39:89]
     np.testing.assert_array_equal(after[39:89], before[39:89] * counts)
+
+
+@pytest.mark.parametrize("rows", [1024, 128])
+def test_the_estimate_of_up_does_not_see_the_fill(
+    rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither at the size that is read nor from the file, whatever the rotation."""
+    seen: list[Any] = []
+    monkeypatch.setattr(
+        "datamodules.core.transforms.estimate_up", lambda *given: seen.append(given)
+    )
+    area = SphereArea(-180, 180, -45, 30)
+    canvas = PanoramaArea.on_canvas(area, rows)
+    image = np.full((*canvas.image_shape, 3), 200, np.uint8)
+    files = ImageFiles("a", Path("a"), Path("a"))
+    labels = np.ones(canvas.image_shape, np.uint8)
+    rotated = RotatedPanoramas("so3", 0)
+    panorama = placed(canvas, "reflect", Panorama(image, None, labels), 0, files)
+    panorama = rotated(panorama, 0)
+    assert panorama.rgb.min() == 200
+    judged: list[Any] = []
+    native = np.full((427, 2048, 3), 200, np.uint8)
+    judge: Any = lambda of, _: judged.append(of)  # noqa: E731
+    EstimatedUp(60, lambda _: native, rotated, judge, area)(panorama, 0, files)
+    ((rgb, _, judge),) = seen
+    judge(None)
+    assert len(rgb) == max(512, rows)
+    for colors in (rgb, judged[0].rgb):
+        assert panorama.area is not None
+        inside = panorama.area.contains(equirect_directions(colors.shape[:2]))
+        assert (colors[inside] == 200).mean() > 0.98
+        assert (colors[~inside] == 0).mean() > 0.98
 
 
 @pytest.mark.parametrize(

@@ -64,3 +64,16 @@ def write_data_set(
             name = f"scene_{scene}/view.{number}"
             write_panorama(root, name, seed, height, suffixes[seed % 4], depth=depth)
     return root
+
+
+def write_strips(root: Path, size: tuple[int, int], count: int = 4, *, depth: bool = False) -> Path:
+    """Partial panoramas of rows and columns, whose red channel holds the label values."""
+    write_classes(root)
+    for number in range(count):
+        values = blocks(number, max(size))[: size[0], : size[1]]
+        green = np.random.default_rng(number).integers(1, 256, size, np.uint8)
+        save(root / "images" / f"{number}.png", np.stack([values, green, green], axis=-1))
+        save(root / "labels" / f"{number}.png", values)
+        if depth:
+            write_png(root / "depth" / f"{number}.png", values.astype(np.uint16) + 300)
+    return root

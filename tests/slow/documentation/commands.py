@@ -169,7 +169,8 @@ def small_settings(words: list[str], world: Path) -> list[str]:
     search = ",".join(f"file://{folder}" for folder in folders)
     found = composed(config, *overrides, f"hydra.searchpath=[{search}]")
     settings = {n: v for n, v in SMALL.items() if OmegaConf.select(found, n) is not None}
-    if "experiment=zero_shot" in arguments:  # an experiment without training refuses these
+    evaluates = {"experiment=zero_shot", "checkpoint=cityscapes.ckpt"} & set(arguments)
+    if evaluates:  # a transfer without training refuses these
         settings = {
             n: v for n, v in settings.items() if not n.startswith(("fine_tuning", "network"))
         }

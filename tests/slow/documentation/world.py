@@ -13,6 +13,7 @@ import sys
 import tempfile
 import tomllib
 import traceback
+from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -22,6 +23,7 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
+from datamodules.cityscapes.classes import CLASSES
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
 from tests.conftest import fabricate
@@ -30,7 +32,7 @@ from tests.datamodules.cityscapes.street_format import (
     write_densepass,
     write_synpass,
 )
-from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.folder_format import write_data_set, write_strips
 from tests.datamodules.folder.photo_format import write_photos
 from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
@@ -44,7 +46,8 @@ ROOT = Path(__file__).resolve().parents[3]
 SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
 ROWS = 128
 SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
-"""A photo network as the hub has it, where its name on the hub is a path."""
+OF_CITYSCAPES = "nvidia/segformer-b0-finetuned-cityscapes-1024-1024"
+"""Photo networks as the hub has them, where their names on the hub are paths."""
 _SEQUENCES = dict.fromkeys(("01", "02", "04", "05", "06"), 2)
 _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BATCHES": "2"}
 
@@ -61,6 +64,8 @@ def build_world(folder: Path) -> Path:
     write_paper_pairs(folder / "data" / "pairs", ROWS)
     write_homes(folder / "zind" / "sample_tour", rows=ROWS)
     write_data_set(folder / "my_rooms", height=ROWS, depth=True)
+    write_strips(folder / "my_strips", (50, 2 * ROWS), 12)
+    _write_streets(folder / "my_streets")
     write_photos(folder / "my_photos")
     classes = {name: [name] for name in ("wall", "floor", "window")}  # those of my_rooms
     (folder / "my_map.json").write_text(json.dumps({"source": "ADE20K", "classes": classes}))
@@ -68,6 +73,8 @@ def build_world(folder: Path) -> Path:
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
     networks.saved(networks.segformer, folder / SEGFORMER, size=small_photos)
+    of_streets = partial(networks.segformer, CLASSES)
+    networks.saved(of_streets, folder / OF_CITYSCAPES, size=small_photos)
     demo = f"runs/demo/{TIME}"
     for line in (
         f"tangent-train experiment=rooms/demo hydra.run.dir={demo}",
@@ -78,6 +85,7 @@ def build_world(folder: Path) -> Path:
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.safetensors",
         "tangent-render input=room.jpg output=tangent",
         f"tangent-import network=huggingface model={SEGFORMER} output=segformer.ckpt",
+        f"tangent-import network=huggingface model={OF_CITYSCAPES} output=cityscapes.ckpt",
     ):
         run(line.split(), {}, folder)
     for root in ("synthrooms", "rooms_standard"):
@@ -86,7 +94,6 @@ def build_world(folder: Path) -> Path:
     shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
-    shutil.copyfile(folder / "segformer.ckpt", folder / "cityscapes.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)
@@ -99,6 +106,17 @@ def build_world(folder: Path) -> Path:
             else:
                 np.save(out, rgb[..., 0] // 32 if kind == "room" else rgb.astype(np.float32))
     return folder
+
+
+def _write_streets(root: Path) -> None:
+    rng = np.random.default_rng(0)
+    for name in "abcd":
+        for folder, image in (
+            ("images", rng.integers(0, 256, (50, 2 * ROWS, 3), np.uint8)),
+            ("labels", rng.integers(0, 3, (50, 2 * ROWS), np.uint8)),
+        ):
+            (root / folder).mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(root / folder / f"{name}.png"), image)
 
 
 def _write_pictures(folder: Path) -> None:

@@ -1,0 +1,198 @@
+"""Partial panoramas in evaluation and prediction, beside the whole panoramas they are cut from."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from datamodules import FolderPanoramas
+from datamodules.core.class_weights import class_weights
+from datamodules.images.gpano import PanoramaArea
+from tangent_train.geometry import SphereArea
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage
+from tangent_train.inference.representations import PanoramaViews
+from tangent_train.registry import build_from_config
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks.segmentation import SegmentationTask
+from tests.datamodules.folder.folder_format import save, write_classes
+from tests.inference.trained import CUBE, ERP, TANGENT, color_network, sphere, trained_network
+from tests.models.sphere_networks import awake, small_context
+from tests.tasks.shapes import quiet_trainer
+
+SGD = functools.partial(torch.optim.SGD, lr=1.0)
+ROWS = 64
+AREA = (150, 60, -50.625, 61.875)
+RING: dict[str, Any] = {
+    "_target_": "tangent_train.rendering.RingRepresentation",
+    "level": 5,
+    "rings": [{"pitch": 0, "views": 6}, {"pitch": 45, "views": 4}, {"pitch": -45, "views": 4}],
+    "fov": 100,
+}
+KINDS = {
+    "tangent": TANGENT | {"level": 5},
+    "nearest": TANGENT | {"level": 5, "blend": "nearest", "rotations": 2},
+    "cube map": CUBE | {"level": 5},
+    "ring": RING,
+    "equirectangular": ERP | {"level": 5, "rotations": 2},
+}
+
+
+def write_both(root: Path, angles: tuple[float, ...] = AREA) -> tuple[Path, Path]:
+    """Whole panoramas whose labels are unknown outside an area, and the same cut to it."""
+    canvas = PanoramaArea.on_canvas(SphereArea.of(angles), ROWS)
+    for folder in (root / "whole", root / "part"):
+        write_classes(folder, [None, "dark", "green", "bright"])
+        (folder / "test.txt").write_text("0\n1\n")
+    for number in range(4):
+        rgb = np.roll(sphere(ROWS), 7 * number, axis=1)
+        labels = np.random.default_rng(number).integers(0, 4, (8, 16), np.uint8)
+        labels = labels.repeat(8, axis=0).repeat(8, axis=1)
+        for part, image in (("images", rgb), ("labels", labels)):
+            save(root / "part" / part / f"{number}.png", np.ascontiguousarray(canvas.cut(image)))
+            outside = canvas.place(canvas.cut(image)) if part == "labels" else image
+            save(root / "whole" / part / f"{number}.png", outside)
+    return root / "whole", root / "part"
+
+
+def _task(kind: str, network: nn.Module | None = None) -> SegmentationTask:
+    made = build_from_config(KINDS[kind], "representation")
+    inner = network or color_network(kernel=1)
+    return SegmentationTask(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
+
+
+def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanoramas:
+    area = AREA if root.name == "part" else None
+    chosen: Any = {"area": area, "fill": "edge", "validation_fraction": 0, "seed": 3, **settings}
+    return FolderPanoramas(root, task.representation, **chosen)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("rotation", [None, 30, "so3"])
+def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotation: Any) -> None:
+    """At the edges, the pixels that a pixel network gets are interpolated with the fill."""
+    counts, labels, views = [], [], []
+    for root in write_both(tmp_path):
+        task = _task(kind)
+        data = _data(root, task, test_rotation=rotation)
+        metric = task.build_metric()
+        for plain in data.test_dataloader():
+            batch: Any = data.on_after_batch_transfer(plain, 0)
+            predicted = task.predict_labels(
+                batch.images[0],
+                tuple(batch.target[0].shape),
+                batch.rotation[0].numpy(),
+                area=SphereArea.of_numbers(batch.area[0].numpy()),
+            )
+            metric.update(predicted, batch.target[0])
+            labels.append(predicted.where(batch.target[0] > 0, 0))
+            views.append(batch.images.numel())
+        counts.append(metric.compute())
+    whole, part = counts
+    for name in ("pixels", "bands", "solid_angle"):  # true classes, which the fill does not change
+        expected, found = (getattr(count, name).sum(axis=-1) for count in counts)
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+    assert whole.pixels.sum() > 0
+    before, after = torch.stack(labels[:2]), torch.stack(labels[2:])
+    assert (before == after)[before > 0].double().mean() > 0.98
+    is_less = rotation is None and kind != "cube map"
+    assert sum(views[2:]) <= sum(views[:2]) - is_less
+    if kind == "equirectangular" and rotation is None:  # nothing is interpolated
+        assert torch.equal(before, after)
+        np.testing.assert_array_equal(part.of_images, whole.of_images)
+
+
+def test_the_validation_loss_is_that_of_the_labels_in_the_area(tmp_path: Path) -> None:
+    logged = []
+    for root in write_both(tmp_path):
+        task = _task("equirectangular")
+        data = _data(root, task, validation_fraction=0.5)
+        logged.append(quiet_trainer().validate(task, data, verbose=False)[0])
+    assert logged[0] == pytest.approx(logged[1], rel=1e-6)
+    assert {"val/loss", "val/miou"} < logged[0].keys()
+
+
+@pytest.mark.parametrize("kind", ["tangent", "nearest", "equirectangular", "context"])
+@pytest.mark.parametrize("up", [None, (0.3, 0.2, 0.9)])
+def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
+    """With a network that sees surroundings, tilted or not, and with cross-image attention."""
+    torch.manual_seed(0)
+    network = awake(small_context()).eval() if kind == "context" else color_network()
+    of = "tangent" if kind == "context" else kind
+    task = _task(of, network)
+    data = _data(write_both(tmp_path)[1], task, fill="reflect")
+    panorama = data.source("test").read(0)
+    zenith = None if up is None else np.array(up) / np.linalg.norm(up)
+    data.source("test")._kept = [panorama._replace(up=zenith)] * 2
+    batch: Any = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
+    expected = task.predict_labels(
+        batch.images[0],
+        tuple(batch.target[0].shape),
+        batch.rotation[0].numpy(),
+        area=SphereArea.of_numbers(batch.area[0].numpy()),
+    )
+    trained = trained_network(KINDS[of], inner=network)
+    views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"), fill="reflect")
+    if "rotations" in KINDS[of]:
+        views = PanoramaViews(trained, None, None, views.blend, 2, fill="reflect")
+    black = data.canvas.place(data.canvas.cut(panorama.rgb))
+    image = InputImage(black, up=zenith, area=data.canvas)
+    labels = Predictor(trained, views).predict(image).labels()
+    cut = data.canvas.cut
+    assert len(np.unique(cut(labels.numpy()))) > 1
+    np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
+
+
+def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -> None:
+    """Pixel for pixel: colors and labels of all views that see nothing else."""
+    small = TangentRepresentation(1, 5)
+    rendered = []
+    for root in write_both(tmp_path):
+        task = _task("tangent")
+        task.representation = small
+        data = _data(root, task)
+        image = data.source("test").read(0)
+        (views,) = image.sampler(small).view_sets()
+        rendered.append(
+            [views.render(image.rgb, "bilinear"), views.render(image.labels, "nearest")]
+        )
+        kept = views.grid
+    assert len(rendered[1][0]) < 80
+    canvas = PanoramaArea.on_canvas(SphereArea.of(AREA), ROWS)
+    (top, bottom), (left, right), pixel = canvas.rows, canvas.columns, 180 / ROWS
+    inner = SphereArea(
+        (left + 1) * pixel - 180, (right - 1) % (2 * ROWS) * pixel - 180,
+        90 - (bottom - 1) * pixel, 90 - (top + 1) * pixel,
+    )  # fmt: skip
+    inside = inner.contains(kept.directions()).all(axis=(1, 2))
+    assert 5 < inside.sum() < inside.size
+    whole = TangentRepresentation(1, 5).grid
+    faces = (whole.centers_xyz @ kept.centers_xyz.T).argmax(axis=0)
+    for of_whole, of_part in zip(*rendered, strict=True):
+        np.testing.assert_array_equal(of_whole[faces[inside]], of_part[inside])
+
+
+@pytest.mark.parametrize("rotation", ["none", "so3"])
+def test_batches_are_collated_and_losses_ignore_the_fill(tmp_path: Path, rotation: Any) -> None:
+    task = _task("tangent", nn.Conv2d(3, 3, 1))
+    task.representation = TangentRepresentation(0, 5, random_rotation=rotation)
+    losses = []
+    for fill in ("black", "reflect"):
+        data = _data(write_both(tmp_path)[1], task, fill=fill, panoramas_per_step=2)
+        batch: Any = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
+        assert batch.images.shape[:2] == batch.labels.shape[:2]
+        assert batch.images.shape[:2] == (2, len(data.representation.view_sets()[0]))
+        images, labels = task.training_pairs(batch)
+        losses.append(
+            float(task.loss_sum((images,), labels).detach()) / float(task.loss_norm(labels))
+        )
+        weights = data.class_weights("log")
+    assert losses[0] == pytest.approx(losses[1], rel=0.02)
+    stored = [np.bincount(np.asarray(data.source("train").labels(k)).ravel()) for k in range(2)]
+    assert torch.equal(weights, class_weights(np.sum(stored, axis=0)[1:], "log"))
