@@ -88,12 +88,12 @@ class RingGrid(PinholeGrid):
                 expected="views of different directions",
                 remedy="Give each pitch once, with one view at 90 and -90.",
             )
-        self._set(None, rings=checked, size=(rows, columns), pitch=pitch, _axes=axes)
+        resting = PinholeGrid(axes, (rows, columns), pitch)
         if is_complete:
-            check_coverage(self, area, by_owners=by_owners)
-        self._set(rotation, _is_overlapping=not is_complete or overlaps(self, area))
-        for cached in ("world_from_camera", "centers_xyz"):
-            vars(self).pop(cached, None)
+            check_coverage(resting, area, by_owners=by_owners)
+        overlapping = not is_complete or overlaps(resting, area)
+        super().__init__(axes, resting.size, pitch, rotation, is_overlapping=overlapping)
+        vars(self).update(rings=checked)
 
 
 def checked_rings(rings: Sequence[Mapping[str, float]]) -> tuple[Ring, ...]:

@@ -146,21 +146,23 @@ class Comparison(NamedTuple):
         )
 
     def tables(self, like: Record) -> list[Table]:
-        """Return a table of the rows, or nothing without rows.
+        """Return a table of the rows for one evaluation, or nothing without rows.
 
         Args:
-            like: Evaluation with the headings.
+            like: Evaluation with the headings and the fold.
         """
-        if not self.rows:
+        fold, rows = like.fold, self.rows
+        rows = [row.of_fold(fold) if fold and fold in row.folds else row for row in rows]
+        if not rows:
             return []
-        names = [n for n in like.headings if any(r.score(n).mean is not None for r in self.rows)]
+        names = [n for n in like.headings if any(r.score(n).mean is not None for r in rows)]
         cells = [
             (
                 row.label,
                 row.facts["input"],
                 *(score_text(row.score(name).mean, like.headings[name].unit) for name in names),
             )
-            for row in self.rows
+            for row in rows
         ]
         header = ("", "input", *(like.headings[name].column for name in names))
         return [Table("Published, same protocol", header, cells, text_columns=(0, 1))]

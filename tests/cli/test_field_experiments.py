@@ -19,7 +19,7 @@ from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.field_worlds import WORLDS, World
-from tests.running import ROOT, Patch, composed, composed_settings
+from tests.running import ROOT, Patch, command_of, composed, composed_settings
 
 SMALL = ("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0", "panels=0")
 SMALL_PHOTOS = ("photos.data.num_workers=0",)
@@ -63,9 +63,8 @@ def test_an_experiment_of_the_field_follows_its_protocol(
 ) -> None:
     """At its full size by its settings, and in a small run that is trained and evaluated."""
     protocol = facts(PROTOCOLS[experiment])
-    composed_transfer = composed_settings("transfer", f"experiment={experiment}")
-    transfers = "_target_" in composed_transfer["photos"]["data"]
-    command = "transfer" if transfers else "train"
+    command = command_of(experiment)
+    transfers = command == "transfer"
     arguments = _with_a_small_network(command, experiment)
     settings = composed_settings(command, *arguments)
     world, root = _world(worlds, settings["data"])
@@ -85,6 +84,25 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     found = results(path.parent)["protocol"]
     assert found.pop("size") != protocol.pop("size")
     assert found == protocol
+
+
+OF_THE_PAPER = [
+    (name, entry["experiment"])
+    for name, entry in protocols().items()
+    if entry.get("experiment", "").startswith("paper/")
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "experiment"), [*OF_THE_PAPER, ("paper_512", "paper/transfer_stanford")]
+)
+def test_experiments_of_the_paper_have_the_facts_of_its_scores(name: str, experiment: str) -> None:
+    settings = composed_settings(command_of(experiment), f"experiment={experiment}")
+    settings |= settings["photos"] if name == "paper_photos" else {}
+    protocol = facts(name)
+    assert settings["task"].get("absent_class") == protocol.pop("absent_class", None)
+    assert protocol.pop("weighting", "pixels") == "pixels"
+    assert build_data(settings).facts == protocol
 
 
 def test_an_imported_network_is_evaluated_on_photos_and_panoramas(

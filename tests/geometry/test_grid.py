@@ -15,6 +15,7 @@ from scipy.spatial import SphericalVoronoi
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
+    RingGrid,
     TangentGrid,
     nearest_level,
     rotation_about,
@@ -22,6 +23,7 @@ from tangent_train.geometry import (
 )
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
+RINGS = [{"pitch": pitch, "views": 6} for pitch in (0, 45, -45)]
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
@@ -70,6 +72,12 @@ def test_grids_are_compared_by_value() -> None:
         CubeGrid(32, ROTATION),
         CubeGrid(32, margin=1),
         TangentGrid(0, 5).resized((33, 33)),
+        TangentGrid(0, 5).subset([3, 4]),
+        TangentGrid(0, 5).subset([3, 5]),
+        RingGrid(RINGS, (100, 100), (8, 8)),
+        RingGrid(RINGS, (100, 100), (8, 8), ROTATION),
+        RingGrid(RINGS, (100, 100), (8, 9)),
+        RingGrid([*RINGS, {"pitch": -10, "views": 3}], (100, 100), (8, 8)),
     ]
     assert len(set(different)) == len({hash(grid) for grid in different}) == len(different)
     for grid in different:
