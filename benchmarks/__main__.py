@@ -28,7 +28,7 @@ from torch.utils.collect_env import get_pretty_env_info
 from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 from tangent_train.results.tables import Table as TextTable
 
-MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels")}
+MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels", "area")}
 MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
 """Module of each benchmark; it has a function of the same name."""
 

@@ -222,8 +222,8 @@ class PanoramaDataModule(ImageDataModule):
         self.require("max_tilt_deg", fine, "more than 0, at most 180")
         self.require("fill", self.fill in get_args(Fill), ", ".join(get_args(Fill)))
         self.sphere_area = SphereArea.of(self.area, "data.area")
-        self.representation = self.representation.limited_to(self.sphere_area)
         self.canvas = PanoramaArea.on_canvas(self.sphere_area, self.erp_height)
+        self.representation = self.representation.limited_to(self.canvas.sphere)
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", self.canvas)

@@ -18,7 +18,7 @@ from datamodules.images.image_files import image_paths, short_names
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PanoramaPose
+from tangent_train.geometry import PanoramaPose, SphereArea
 
 
 class PairedPanorama(NamedTuple):
@@ -30,6 +30,7 @@ class PairedPanorama(NamedTuple):
         file: Image file.
         distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
+        area: Area of a partial panorama, which `rgb` shows on the whole sphere; or None.
     """
 
     name: str
@@ -37,6 +38,7 @@ class PairedPanorama(NamedTuple):
     file: Path
     distance_m: NDArray[np.float32] | None = None
     pose: PanoramaPose | None = None
+    area: SphereArea | None = None
 
 
 class PanoramaPair(NamedTuple):
@@ -196,8 +198,9 @@ class ImagePairs(PanoramaPairs):
         return self._paths[files]
 
     def panorama(self, files: int) -> PairedPanorama:
-        """See `PanoramaPairs`; a partial panorama is black elsewhere."""
+        """See `PanoramaPairs`; a partial panorama repeats its edges elsewhere."""
         path = self._paths[files]
         rgb = read_rgb(path)
-        size = (rgb.shape[0], rgb.shape[1])
-        return PairedPanorama(self._names[files], read_area(path, size).place(rgb), path)
+        area = read_area(path, (rgb.shape[0], rgb.shape[1]))
+        whole = area.filled(area.place(rgb), "edge")
+        return PairedPanorama(self._names[files], whole, path, area=area.sphere)

@@ -167,7 +167,9 @@ def test_usable_images_take_the_places_of_broken_ones_in_the_report(
     assert page.count("<li><button") == 3
 
 
-def test_a_part_of_a_panorama_is_labeled_as_that_part(tmp_path: Path, predict: Predict) -> None:
+def test_a_part_of_a_panorama_is_labeled_as_that_part(
+    tmp_path: Path, predict: Predict, capsys: Capture
+) -> None:
     """Away from its borders, across the seam, it gets what the whole panorama gets there."""
     rows, columns = np.arange(16, 48), np.r_[112:128, 0:16]
     whole, part = tmp_path / "whole.png", tmp_path / "part.png"
@@ -175,7 +177,10 @@ def test_a_part_of_a_panorama_is_labeled_as_that_part(tmp_path: Path, predict: P
     write_pixels(part, sphere(64)[rows][:, columns])
     common = {"blend": "nearest", "write": "[labels,probabilities]"}
     predict(**common, input=whole, output=tmp_path / "w")
-    predict(**common, input=part, output=tmp_path / "p", area="[135,-135,-45,45]")
+    assert "A panorama is labeled in 20 views" in capsys.readouterr().out
+    predict(**common, input=part, output=tmp_path / "p", area="[135,-135,-45,45]", fill="edge")
+    assert "A panorama is labeled in 3 views" in capsys.readouterr().out
+    assert json.loads((tmp_path / "p" / "summary.json").read_text())["fill"] == "edge"
     inner = slice(8, -8)
     for read in (
         lambda folder, name: read_png(folder / "labels" / f"{name}.png"),

@@ -149,6 +149,17 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
 
 
+def test_a_network_of_one_size_gets_the_whole_image() -> None:
+    area = PanoramaArea.on_canvas(SphereArea.of(AREA), ROWS)
+    image = InputImage(area.place(area.cut(sphere(ROWS))), area=area)
+    sizes = []
+    for fixed in (None, (ROWS, 2 * ROWS)):
+        trained = trained_network(ERP | {"level": 5}, fixed_size=fixed)
+        ((_, _, (views,), _),) = PanoramaViews(trained)(image)
+        sizes.append(views.render(image.rgb, "bilinear").shape[1:3])
+    assert sizes == [(64, 96), (64, 128)]
+
+
 def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -> None:
     """Pixel for pixel: colors and labels of all views that see nothing else."""
     small = TangentRepresentation(1, 5)

@@ -14,6 +14,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
     PanoramaPose,
+    SphereArea,
     TangentGrid,
     equirect_shape,
     nearest_level,
@@ -149,7 +150,8 @@ class Comparer:
         images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
         # Keypoints of a panorama of the previous pair are used again.
         self._cache = {
-            (side.name, level): self._cache.get((side.name, level)) or self._detect(image, level)
+            (side.name, level): self._cache.get((side.name, level))
+            or self._detect(image, level, side.area)
             for side, image in zip(sides, images, strict=True)
         }
         left, right = (self._cache[side.name, level] for side in sides)
@@ -159,7 +161,8 @@ class Comparer:
                 np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
             )
             image = rotate_equirect(images[1], rotation)
-            conditions[ROTATED] = rotation, image, self._detect(image, level)
+            area = pair.right.area and pair.right.area.rotated(rotation)
+            conditions[ROTATED] = rotation, image, self._detect(image, level, area)
         views = _depth_views(pair)
         overlap = None if views is None else _defined(fov_overlap(*views))
         known = {
@@ -189,17 +192,22 @@ class Comparer:
             raise SettingError("level", found=level, expected=expected)
         return level
 
-    def _detect(self, rgb: NDArray[np.uint8], level: int) -> dict[str, SphericalKeypoints]:
-        """Keypoints of a panorama by representation, in the order of `representations`."""
+    def _detect(
+        self, rgb: NDArray[np.uint8], level: int, area: SphereArea | None
+    ) -> dict[str, SphericalKeypoints]:
+        """Return the keypoints of an area by representation, in the order of `representations`."""
         found = {"ERP": detect_on_equirect(rgb)}
         grids: dict[str, TangentGrid | CubeGrid] = {}
         if self.controls:
             found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)))
             grids[CUBE] = CubeGrid(2**level)
         grids |= {f"L{b}": TangentGrid(b, level) for b in self.base_level}
-        return found | {
+        found |= {
             name: detect_on_tangent_images(rgb, grid, self.margin) for name, grid in grids.items()
         }
+        if area is None:
+            return found
+        return {name: k.select(area.contains(k.directions_xyz)) for name, k in found.items()}
 
     def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
         matches = match(left.descriptors, right.descriptors, self.ratio, mutual=self.mutual)

@@ -17,6 +17,8 @@ from tangent_train.geometry import (
     equirect_directions,
     rotation_about,
 )
+from tangent_train.inference.representations import view_settings
+from tangent_train.registry import build_from_config
 from tangent_train.rendering import (
     Blend,
     CubemapRepresentation,
@@ -30,7 +32,7 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import PinholeViews
-from tests.geometry.directions import unit
+from tests.geometry.directions import random_directions, unit
 from tests.rendering.reference import certain_labels, panorama_lonlat, sample_panorama
 
 SHAPE = (64, 128)
@@ -232,6 +234,28 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
     clear = certain_labels(expected, margin=1e-4)
     assert clear.mean() > 0.99
     np.testing.assert_array_equal(found[clear], expected.argmax(axis=-1)[clear])
+
+
+@pytest.mark.parametrize(
+    ("option", "counts", "step_deg"),
+    [("ring", [18], 22.5), ("ring_economy", [14], 30), ("ring_wide", [6, 10], 30)],
+)
+def test_options_of_rings_cover_the_sphere_and_turn_by_half_a_view(
+    option: str, counts: list[int], step_deg: float
+) -> None:
+    settings = view_settings(option) | {"level": 6, "rotations": 2}
+    sets = build_from_config(settings, "representation").view_sets()
+    assert sorted(len(views) for views in sets) == sorted(2 * counts)
+    directions, shown = random_directions(20_000), np.zeros(20_000, bool)
+    around = rotation_about((0, 0, 1), math.radians(step_deg))
+    for grid in {views.grid.with_rotation(None) for views in sets}:
+        first, second = (v.grid for v in sets if v.grid.with_rotation(None) == grid)
+        np.testing.assert_allclose(second.centers_xyz, first.centers_xyz @ around.T, atol=1e-12)
+        pixels = grid.project(directions[:, None], np.arange(grid.num_images))
+        with np.errstate(invalid="ignore"):
+            inside = (pixels >= -0.5) & (pixels <= np.array(grid.size[::-1]) - 0.5)
+        shown |= inside.all(axis=-1).any(axis=1)
+    assert shown.all()
 
 
 def test_the_identity_counts_as_not_rotated() -> None:

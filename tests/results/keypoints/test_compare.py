@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
+from PIL import Image
 
-from datamodules.core.panorama_pairs import PanoramaPair
+from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair
+from tangent_train.geometry import SphereArea
 from tangent_train.results.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer
+from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 from tests.results.keypoints.ball_room import ball_pair
 
 pytest.importorskip("pycolmap")
@@ -66,3 +71,30 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
             assert (row["putative"], row["geometry"]) == (0, "none")
             assert row["pose_auc_20"] is None
             assert row["pmr"] is row["ms"] is row["p"] is None
+
+
+def test_keypoints_of_partial_panoramas_lie_in_their_areas(
+    pair: PanoramaPair, tmp_path: Path
+) -> None:
+    """Rotated or not, read from files that repeat their edges outside."""
+    files = []
+    for name, side in (("left", pair.left), ("right", pair.right)):
+        xmp = gpano_xmp(
+            GPANO_TAGS
+            | {"FullPanoWidthPixels": 384, "FullPanoHeightPixels": 192, "CroppedAreaTopPixels": 40}
+            | {"CroppedAreaLeftPixels": 100, "CroppedAreaImageWidthPixels": 200}
+            | {"CroppedAreaImageHeightPixels": 120}
+        )
+        files.append(str(tmp_path / f"{name}.webp"))
+        Image.fromarray(side.rgb[40:160, 100:300]).save(files[-1], xmp=xmp, lossless=True)
+    read = ImagePairs(files[0], files[1]).read(0)
+    area = SphereArea(-86.25, 101.25, -60, 52.5)
+    assert read.left.area is not None
+    assert read.left.area.angles == area.angles
+    comparison = Comparer((1,), seed=3).compare(read)
+    for condition in (AS_GIVEN, ROTATED):
+        for matched in comparison.found[condition].values():
+            assert len(matched.left) > 20
+            assert area.contains(matched.left.directions_xyz).all()
+            is_inside = area.contains(matched.right.directions_xyz)
+            assert is_inside.all() == (condition == AS_GIVEN)
