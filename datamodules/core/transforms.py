@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from datamodules.images.gpano import Fill, PanoramaArea, read_up
+from datamodules.images.gpano import Fill, PanoramaArea, black_outside, read_up
 from datamodules.images.masks import Masks
 from tangent_train.geometry import (
     SphereArea,
-    equirect_directions,
     random_rotation,
     rotation_about,
 )
@@ -118,9 +117,11 @@ class EstimatedUp:
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
-            plain = _without_fill(panorama)
-            judge = None if self._judge is None else partial(self._judge, plain)
-            rgb = plain.rgb if len(plain.rgb) >= MOST_ROWS else self._larger(index, files)
+            rgb = panorama.rgb
+            if panorama.area is not None:  # estimates ignore what is black
+                rgb = black_outside(rgb, panorama.area)
+            judge = self._judge and partial(self._judge, panorama._replace(rgb=rgb))
+            rgb = rgb if len(rgb) >= MOST_ROWS else self._larger(index, files)
             self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
         return panorama._replace(up=self._ups[index])
 
@@ -135,14 +136,6 @@ class EstimatedUp:
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_judge": None}
-
-
-def _without_fill(panorama: Panorama) -> Panorama:
-    """Return the panorama, black outside its area: estimates ignore what is black."""
-    if panorama.area is None:
-        return panorama
-    inside = panorama.area.contains(equirect_directions(panorama.labels.shape))
-    return panorama._replace(rgb=np.where(inside[..., None], panorama.rgb, np.uint8(0)))
 
 
 class RotatedPanoramas:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from datamodules.core.panoramas import resize_nearest
 from datamodules.images.xmp import read_properties
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import SphereArea
+from tangent_train.geometry import SphereArea, equirect_directions
 from tangent_train.rendering.upright.gravity import up_from_pose
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
@@ -228,6 +228,17 @@ def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaAr
         )
     across, down = ((area.west + 180) / 360, width / 360), ((90 - area.north) / 180, height / 180)
     return _area(f"area={list(angles)}", size, across, down)
+
+
+def black_outside(image: NDArray[_Pixel], area: SphereArea) -> NDArray[_Pixel]:
+    """Return a panorama ``(H, W[, C])`` that is 0 outside an area, which may be rotated."""
+    if area.rotation is None:
+        canvas = PanoramaArea.on_canvas(area, len(image))
+        return canvas.place(canvas.cut(image))
+    inside = area.contains(equirect_directions((image.shape[0], image.shape[1])))
+    return np.where(
+        inside.reshape(inside.shape + (1,) * (image.ndim - 2)), image, image.dtype.type(0)
+    )
 
 
 def check_area_size(

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea
+from datamodules.images.gpano import PanoramaArea, black_outside
 from datamodules.images.palette import class_colors
-from tangent_train.geometry import SphereArea, equirect_directions
 from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]
@@ -106,21 +106,13 @@ def shown_arrays(
         shown = crops.render(image.rgb, "bilinear")
         rgb, truth, labels = map(np.hstack, (shown, truth, labels))
     elif image.area is not None:
-        rgb, truth, labels = _of_area(image.area, (rgb, truth, labels), cut=cut)
+        limit: Callable[[Any], Any] = partial(black_outside, area=image.area)
+        if cut and image.area.rotation is None:
+            limit = PanoramaArea.on_canvas(image.area, len(rgb)).cut
+        rgb, truth, labels = map(limit, (rgb, truth, labels))
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
     part = slice(step // 2, None, step)
     return rgb[part, part], truth[part, part], labels[part, part]
-
-
-def _of_area(area: SphereArea, arrays: Sequence[NDArray[Any]], *, cut: bool) -> list[NDArray[Any]]:
-    """Return arrays ``(H, W[, C])``, cut to an area or 0 outside of it."""
-    shape = arrays[0].shape[0], arrays[0].shape[1]
-    canvas = PanoramaArea.on_canvas(area, shape[0])
-    if area.rotation is not None:
-        inside = area.contains(equirect_directions(shape))
-        return [(array.T * inside.T).T for array in arrays]
-    parts = map(canvas.cut, arrays)
-    return list(parts if cut else map(canvas.place, parts))
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -17,8 +17,11 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import (
     SphereArea,
     equirect_directions,
+    equirect_latitudes,
+    equirect_longitudes,
     equirect_shape,
     lonlat_to_equirect,
+    lonlat_to_xyz,
     random_rotation,
     xyz_to_lonlat,
 )
@@ -272,19 +275,27 @@ def _find_window(area: SphereArea, rows: int, size: tuple[int, int] | None = Non
         rows: Rows of the image.
         size: Rows and columns of the window.
     """
-    step, beyond = 1, 0
-    if area.rotation is not None:  # found in steps, to save time
-        step = max((k for k in range(1, rows // _FINE_ROWS + 1) if rows % k == 0), default=1)
-        beyond = step
-    seen = area.contains(equirect_directions((rows // step, 2 * rows // step)))
-    if not seen.any():  # smaller than a pixel
-        corner = lonlat_to_equirect(xyz_to_lonlat(area.lattice(180)[0][0]), seen.shape)
-        column, row = corner.round().astype(int)
-        seen[row % len(seen), column % seen.shape[1]] = True
-    runs = [
-        _run(seen.sum(axis=1 - axis).repeat(step), beyond, math.gcd(rows, _STRIDE), length, axis)
-        for axis, length in enumerate(size or (None, None))
-    ]
+    middle = np.radians((area.west + area.width_deg / 2, (area.south + area.north) / 2))
+    shape, beyond = (rows, 2 * rows), 0
+    if area.rotation is None:
+        latitudes, longitudes = equirect_latitudes(rows), equirect_longitudes(2 * rows)
+        lines = (
+            np.broadcast_arrays(middle[0], latitudes),
+            np.broadcast_arrays(longitudes, middle[1]),
+        )
+        counts = [area.contains(lonlat_to_xyz(np.stack(line, -1))).astype(int) for line in lines]
+        center = middle
+    else:  # found in steps, to save time
+        beyond = max((k for k in range(1, rows // _FINE_ROWS + 1) if rows % k == 0), default=1)
+        seen = area.contains(equirect_directions((rows // beyond, 2 * rows // beyond)))
+        counts = [seen.sum(axis=axis).repeat(beyond) for axis in (1, 0)]
+        center = xyz_to_lonlat(area.rotation @ lonlat_to_xyz(middle))
+    pixel = lonlat_to_equirect(center, shape)[::-1].round().astype(int) % shape
+    runs = []
+    for axis, of_axis in enumerate(counts):
+        of_axis[pixel[axis]] += 1  # areas may be smaller than a pixel
+        length = None if size is None else size[axis]
+        runs.append(_run(of_axis, beyond, math.gcd(rows, _STRIDE), length, axis))
     (top, height), (first, width) = runs
     return _Window(min(max(top, 0), rows - height), height, first, width)
 

@@ -164,7 +164,8 @@ def test_the_estimate_of_up_does_not_see_the_fill(
     judged: list[Any] = []
     native = np.full((427, 2048, 3), 200, np.uint8)
     judge: Any = lambda of, _: judged.append(of)  # noqa: E731
-    EstimatedUp(60, lambda _: native, rotated, judge, area)(panorama, 0, files)
+    upright = EstimatedUp(60, lambda _: native, rotated, judge, area)(panorama, 0, files)
+    assert upright.rgb.min() == 200
     ((rgb, _, judge),) = seen
     judge(None)
     assert len(rgb) == max(512, rows)
