@@ -44,8 +44,8 @@ _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
 
-_VIEWS = "tangent"
-"""Views of panoramas for imported photo networks, see `view_settings`."""
+_VIEWS = "ring_wide"
+"""Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
 
 _BASE_LEVEL = 1
 """For networks trained on photos (paper, section 5: transfer uses b = 1)."""
@@ -202,7 +202,7 @@ class PhotoViews:
 
 
 def wide_levels(side: int) -> list[int]:
-    """Return the levels of the wide views that photo networks get by default.
+    """Return the levels of wide tangent images for photo networks.
 
     At level s and base level 0, 2^s pixels span 95.8°. The first level has the power of two nearest
     to the side. The second is the next lower level, at which the same number of pixels spans twice
@@ -273,12 +273,14 @@ def photo_network_settings(
         levels: See `Levels`; None for `wide_levels` of tangent images, and for the first of these
             of other views.
         base_level: Base level b of tangent images; None for the fewest images.
-        views: See `ViewChoice`; None for the default.
+        views: See `ViewChoice`; None for `ring_wide`, or tangent images if levels or base level are
+            given.
 
     Raises:
         SettingError: The views do not have these settings.
     """
-    settings = view_settings(views or (_VIEWS if base_level is None else "tangent"))
+    is_default = levels is None and base_level is None
+    settings = view_settings(views or (_VIEWS if is_default else "tangent"))
     is_tangent = settings["_target_"] == _TANGENT
     chosen = (
         wide_levels(side)[: 2 if is_tangent else 1] if levels is None else level_list(levels, 0)

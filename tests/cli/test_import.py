@@ -177,7 +177,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
     trained = load_trained(here / "net.ckpt")
-    assert (trained.image_size, trained.representation["levels"]) == ((520, 520), [9, 8])
+    assert (trained.image_size, trained.level) == ((520, 520), 9)
     photo = torch.randint(0, 256, (3, 520, 520), dtype=torch.uint8)
     mean, std = (torch.tensor(v)[:, None, None] for v in vars(trained.normalization).values())
     with torch.no_grad():
@@ -217,10 +217,13 @@ def test_an_onnx_file_of_any_size_gets_wide_views(
     run: Run,
     capsys: Capture,
 ) -> None:
-    """Two levels at base level 0, with the longer side of the network's images."""
+    """With the longer side of its images: level views, or tangent images of two levels."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
-    trained = load_trained(here / "ours.onnx")
+    assert f"panoramas: 16 views of {side} × {side} (130° wide" in capsys.readouterr().out
+    assert load_trained(here / "ours.onnx").level == levels[0]
+    run("import", *OF_ONNX, "output=tangent.onnx", "views=tangent")
+    trained = load_trained(here / "tangent.onnx")
     section = trained.representation
     assert (section["base_level"], section["levels"], section["dim"]) == (0, levels, side)
     assert trained.level == levels[0]
@@ -257,14 +260,14 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
     """Stored by the import, or chosen later: in a command and in Python, with the same labels."""
     run("import", *OF_ONNX, "output=plain.onnx")
     run("import", *OF_ONNX, "output=level.onnx", "views=ring_economy")
-    assert "panoramas: 14 views of 32 × 32 (100° wide, 0.2 pixels" in capsys.readouterr().out
+    assert "panoramas: 12 views of 32 × 32 (130° wide, 0.1 pixels" in capsys.readouterr().out
     trained = load_trained(here / "level.onnx")
     assert (trained.level, trained.photo_side, trained.image_size) == (5, 32, (32, 32))
     assert trained.representation["dim"] == 32
     rgb = _write_room()
     expected = tt.load("level.onnx").labels(rgb)
     predict(checkpoint="plain.onnx", input="room.png", output="out", views="ring_economy")
-    assert "labeled in 14 views of 32 × 32" in capsys.readouterr().out
+    assert "labeled in 12 views of 32 × 32" in capsys.readouterr().out
     found = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(found, expected)
     np.testing.assert_array_equal(tt.load("plain.onnx", views="ring_economy").labels(rgb), expected)
@@ -313,9 +316,10 @@ def test_an_unknown_size_is_512(here: Path, run: Run) -> None:
     run("import", *given, "output=net.ckpt")
     trained = load_trained(here / "net.ckpt")
     assert (trained.fixed_size, trained.image_size) == (None, (512, 512))
-    assert trained.representation["levels"] == [9, 8]
+    assert (trained.level, trained.representation["dim"]) == (9, 512)
     run("import", *given, "image_size=256", "output=small.ckpt")
-    assert load_trained(here / "small.ckpt").representation["levels"] == [8, 7]
+    assert load_trained(here / "small.ckpt").level == 8
+    assert sum(map(len, PanoramaViews(trained).representation.view_sets())) == 16
     for settings, (count, side) in {
         (None, None): (40, 512),
         (9, None): (20, 512),
@@ -323,7 +327,7 @@ def test_an_unknown_size_is_512(here: Path, run: Run) -> None:
         (10, None): (80, 512),
         (None, 1): (160, 512),
     }.items():
-        views = PanoramaViews(trained, *settings)
+        views = PanoramaViews(trained, *settings, views="tangent")
         assert sum(map(len, views.representation.view_sets())) == count
         assert views.image_size == (side, side)
 
@@ -366,27 +370,32 @@ def test_photos_keep_their_angular_resolution(
     assert round(math.degrees(2 * math.atan(half))) == photo_deg
 
 
-def test_labels_without_settings_are_those_of_both_levels(
+def test_labels_without_settings_are_those_of_wide_rings(
     here: Path, run: Run, predict: Predict, capsys: Capture
 ) -> None:
-    """The same in tangent-predict and in Python; one setting halves the number of views."""
+    """The same in tangent-predict and in Python; tangent images of two levels, or of one."""
     run("import", *OF_ONNX, "output=ours.onnx")
     rgb = _write_room()
     labels: dict[str, Any] = {}
     settings: dict[str, dict[str, Any]] = {
         "default": {},
-        "both": {"levels": "[5,4]", "base_level": 0, "blend": "feather", "rotations": 1},
-        "half": {"levels": 5},
+        "wide": {"views": "ring_wide", "blend": "feather", "rotations": 1},
+        "both": {"views": "tangent", "levels": "[5,4]", "base_level": 0},
+        "two": {"views": "tangent"},
+        "half": {"views": "tangent", "levels": 5},
     }
+    counts = {"default": 16, "wide": 16, "both": 40, "two": 40, "half": 20}
     for name, given in settings.items():
         capsys.readouterr()
         predict(checkpoint="ours.onnx", input="room.png", output=name, **given)
-        count = 20 if name == "half" else 40
-        assert f"A panorama is labeled in {count} views of 32 × 32" in capsys.readouterr().out
+        assert (
+            f"A panorama is labeled in {counts[name]} views of 32 × 32" in capsys.readouterr().out
+        )
         labels[name] = cv2.imread(f"{name}/labels/room.png", cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(labels["default"], labels["both"])
+    np.testing.assert_array_equal(labels["default"], labels["wide"])
+    np.testing.assert_array_equal(labels["two"], labels["both"])
     np.testing.assert_array_equal(labels["default"], tt.load("ours.onnx").labels(rgb))
-    assert (labels["default"] != labels["half"]).any()
+    assert (labels["two"] != labels["half"]).any()
 
 
 @pytest.mark.parametrize(

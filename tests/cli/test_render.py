@@ -200,7 +200,7 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
     colors = _read(tmp_path / "colors" / "room.png").astype(int)
     assert np.abs(colors - smooth(64)).max() <= 12
     content = json.loads((tmp_path / "level" / "room" / "cameras.json").read_text())
-    assert len(content["images"]) == 14
+    assert len(content["images"]) == 12
     (tmp_path / "features").mkdir()
     focal = content["camera"]["matrix"][0][0] / 2
     x, y = np.meshgrid((np.arange(28) - 13.5) / focal, (np.arange(20) - 9.5) / focal)

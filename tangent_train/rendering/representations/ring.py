@@ -73,6 +73,7 @@ class RingRepresentation(PinholeRepresentation):
                 "representation.blend",
                 found="nearest, with rings of different fov",
                 expected="feather, or the same fov for all rings",
+                remedy="Views such as ring or tangent have the same.",
             )
         checked = checked_rings([ring for part in by_fov.values() for ring in part])
         self.symmetry_deg = 360 / max(ring.views for ring in checked)

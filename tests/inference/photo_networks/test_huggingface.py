@@ -42,7 +42,7 @@ def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
     network, processor = networks.saved(networks.segformer, tmp_path, **settings)
     trained = networks.imported(tmp_path)
     assert trained.class_names == ("unknown", *networks.NAMES)
-    assert (trained.image_size, trained.representation["levels"]) == ((64, 64), [6, 5])
+    assert (trained.image_size, trained.level) == ((64, 64), 6)
     expected = networks.own_scores(network, processor)
     scores = networks.imported_scores(trained)
     networks.assert_same(scores, expected)
@@ -167,7 +167,7 @@ def test_an_image_processor_without_a_type_is_that_of_the_network(folder: Path) 
     assert (found.normalization, found.image_size) == (expected.normalization, expected.image_size)
     networks.change_json(folder / "preprocessor_config.json", do_resize=False)
     imported = networks.imported(folder)
-    assert (imported.image_size, imported.representation["levels"]) == ((512, 512), [9, 8])
+    assert (imported.image_size, imported.level) == ((512, 512), 9)
 
 
 def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
