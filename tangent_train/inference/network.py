@@ -51,7 +51,7 @@ def load(
     blend: Blend = "feather",
     rotations: int = 1,
     views: ViewChoice = None,
-    fill: Fill = "black",
+    fill: Fill = "mean",
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
