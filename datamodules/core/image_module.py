@@ -202,7 +202,7 @@ class PanoramaDataModule(ImageDataModule):
 
     panoramas_per_step: int = 4
     area: Sequence[float] | None = None
-    fill: Fill = "black"
+    fill: Fill = "mean"
     mask: Mask = None
     test_rotation: TestRotation = None
     upright: Upright = None

@@ -88,7 +88,8 @@ def pages() -> dict[Path, str]:
 def _protocol(name: str) -> str:
     entry = protocols()[name]
     run = f"\n\n`experiment={entry['experiment']}`" if "experiment" in entry else ""
-    listed = [f"| `{fact}` | {value} |" for fact, value in facts(name).items()]
+    ordered = sorted(facts(name).items(), key=lambda fact: fact[0] not in ("data", "classes"))
+    listed = [f"| `{fact}` | {value} |" for fact, value in ordered]
     lines = [line for line in published_lines() if line["protocol"] == name and line["mean"]]
     columns = ("method", "stage", "trained_on", "level", "inputs", "fold", "score", "mean")
     shown = [column for column in columns if any(line[column] for line in lines)]

@@ -51,7 +51,7 @@ def load(
     blend: Blend = "feather",
     rotations: int = 1,
     views: ViewChoice = None,
-    fill: Fill = "black",
+    fill: Fill = "mean",
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
@@ -73,7 +73,7 @@ def load(
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over; 1 for photos.
         views: Views of panoramas: an option of ``representation=``, such as ``ring``; or with
-            changed settings, ``{"option": "ring", "fov": 90}``. None as trained.
+            changed settings, ``{"option": "ring", "fov": 110}``. None as trained.
         fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
             color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``).
         images_per_forward: Number of images per call of the network, which limits memory; None for

@@ -103,7 +103,7 @@ class PanoramaViews:
         blend: Blend = "feather",
         rotations: int = 1,
         views: ViewChoice = None,
-        fill: Fill = "black",
+        fill: Fill = "mean",
     ) -> None:
         settings = panorama_settings(trained, levels, base_level, views)
         settings["rotations"] = rotations
