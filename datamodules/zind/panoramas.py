@@ -111,6 +111,7 @@ class Zind(PanoramaDataModule):
     """
 
     class_names = ("unknown", *CLASSES)
+    fact_settings = ("doors",)
 
     inputs: Sequence[Input] = ("rgb",)
     doors: Doors = "class"

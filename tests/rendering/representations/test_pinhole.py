@@ -238,7 +238,7 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
 
 @pytest.mark.parametrize(
     ("option", "counts", "step_deg"),
-    [("ring", [18], 22.5), ("ring_economy", [14], 30), ("ring_wide", [6, 10], 30)],
+    [("ring", [18], 22.5), ("ring_economy", [12], 30), ("ring_wide", [6, 10], 30)],
 )
 def test_options_of_rings_cover_the_sphere_and_turn_by_half_a_view(
     option: str, counts: list[int], step_deg: float
