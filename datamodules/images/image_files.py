@@ -184,17 +184,25 @@ def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:
     return found[0]
 
 
-def short_names(paths: Sequence[Path]) -> list[str]:
-    """Return a name for every image: its path below their common folder, without suffix.
+def short_names(paths: Sequence[Path], pattern: str | Path = "") -> list[str]:
+    """Return a name for every image: its path below a folder, without suffix.
 
     Images that would share a name keep their suffix.
+
+    Args:
+        paths: Paths of the images.
+        pattern: Argument of `image_paths`. If it is not a folder, the folder is that of all images.
 
     >>> short_names([Path("a/x/1.jpg"), Path("a/1.jpg"), Path("a/1.png")])
     ['x/1', '1.jpg', '1.png']
     """
     # Without "..", which would lead out of the output folder.
     absolute = [Path(os.path.abspath(path)) for path in paths]  # noqa: PTH100
-    shared = len(Path(os.path.commonpath([path.parent for path in absolute])).parts)
+    if pattern and Path(pattern).is_dir():
+        folder = os.path.abspath(pattern)  # noqa: PTH100
+    else:
+        folder = os.path.commonpath([path.parent for path in absolute])
+    shared = len(Path(folder).parts)
     whole = [Path(*path.parts[shared:]) for path in absolute]
     short = [path.with_suffix("") for path in whole]
     # Upper and lower case are the same file on some disks; "1.jpg.png" without suffix is "1.jpg".

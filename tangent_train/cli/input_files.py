@@ -64,7 +64,7 @@ class Inputs:
         files = {
             # Frames get a folder with the name of their video, which may also be one of images.
             name + path.suffix if is_video(path) and path.with_suffix("").is_dir() else name: path
-            for name, path in zip(short_names(paths), paths, strict=True)
+            for name, path in zip(short_names(paths, settings.input or ""), paths, strict=True)
         }
         videos = {name: Job(name, path) for name, path in files.items() if is_video(path)}
         return cls(files, {name: job.then(size) for name, job in videos.items()}, every)

@@ -35,6 +35,14 @@ def test_names_are_short_and_unlike(paths: list[str], names: list[str]) -> None:
     assert short_names([Path(path) for path in paths]) == names
 
 
+def test_names_are_relative_to_a_folder(tmp_path: Path) -> None:
+    """With images in one subfolder only, too; of a pattern, to the common folder."""
+    (tmp_path / "train" / "berlin").mkdir(parents=True)
+    paths = [tmp_path / "train" / "berlin" / f"{n}.png" for n in (1, 2)]
+    assert short_names(paths, tmp_path / "train" / ".." / "train") == ["berlin/1", "berlin/2"]
+    assert short_names(paths, tmp_path / "train" / "*" / "*.png") == ["1", "2"]
+
+
 def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
     """By data=folder and mask_classes=: they had kept the last of its labels."""
     names = ("unknown", "door", "wall", "door", "u\u0308", "unknown", "Wall", "ü")
