@@ -85,7 +85,15 @@ class Schedule:
         monitored = self.monitor or monitor[0]
         if self._is_null("mode"):
             filled["mode"] = "min" if monitored.endswith("loss") else monitor[1]
-        scheduler = self.build(optimizer, **filled)
+        try:
+            scheduler = self.build(optimizer, **filled)
+        except ZeroDivisionError as error:
+            raise SettingError(
+                "scheduler.total_steps",
+                found=filled.get("total_steps", "a number"),
+                expected="another number: the warm-up would end in the first step",
+                remedy="Set scheduler.pct_start=0.3, or another trainer.max_epochs.",
+            ) from error
         if isinstance(scheduler, ReduceLROnPlateau) and self.interval == "step":
             expected = "epoch for ReduceLROnPlateau: a resumed run has no value of the last step"
             raise SettingError("scheduler.interval", found="step", expected=expected)

@@ -219,6 +219,12 @@ def test_a_schedule_shorter_than_the_training_is_refused(build: Any, tmp_path: P
         _train(tmp_path, schedule, max_epochs=2)
 
 
+def test_a_warm_up_that_ends_in_the_first_step_is_refused(tmp_path: Path) -> None:
+    one_cycle: Any = partial(lr_scheduler.OneCycleLR, max_lr=LR, total_steps=None, pct_start=1 / 6)
+    with pytest.raises(SettingError, match=r"scheduler\.total_steps: found 6; .*pct_start=0\.3"):
+        _train(tmp_path, Schedule(one_cycle, "step"), max_epochs=2)
+
+
 def test_the_length_of_an_endless_training_is_not_made_up(tmp_path: Path) -> None:
     endless = Schedule(partial(warmup_cosine, total_steps=_NULL), "step")
     with pytest.raises(SettingError, match=r"trainer\.max_epochs: found no end"):
