@@ -47,7 +47,7 @@ def _main(command: str) -> None:
     from tangent_train.cli.help import annotate
     from tangent_train.cli.processes import end_with_first_process, ended_by_sigterm
     from tangent_train.cli.run_folder import folders
-    from tangent_train.cli.setting_names import probable_setting
+    from tangent_train.cli.setting_names import probable_name
     from tangent_train.cli.stored import stored_run
     from tangent_train.files import config_folder
 
@@ -87,8 +87,7 @@ def _main(command: str) -> None:
                 run()
         except (HydraException, OmegaConfBaseException) as error:
             cause = str(error.__cause__ or "").partition("\n")[0]
-            if unknown := re.fullmatch(r"Key '(\w+)' is not in struct", cause):
-                cause = f"{cause}. {probable_setting(command, unknown[1])}".strip()
+            cause = f"{cause}. {probable_name(command, str(error))}".strip(". ")
             sys.exit(printable(f"tangent-{command}: {error}" + f"\n{cause}" * bool(cause)))
         finally:
             sys.argv[1:] = typed_arguments

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
+from difflib import get_close_matches
 from functools import cache
 from typing import Any
 
@@ -60,22 +61,45 @@ def check_names(command: str, settings: Mapping[str, Any], references: str) -> N
                 name,
                 found=f"{value}, which tangent-{command} does not read",
                 expected=f"a setting that tangent-{command} --help lists",
-                remedy=f"{nearest(name, known)}Remove it.",
+                remedy=f"{_other_command(command, name) or nearest(name, known)}Remove it.",
             )
 
 
-def probable_setting(command: str, name: str) -> str:
-    """Return a question with the setting that a refused name probably means, or "".
+def probable_name(command: str, message: str) -> str:
+    """Return a question with the setting, option or command that is probably meant, or "".
 
     Args:
         command: Name of the command.
-        name: Refused name, e.g. ``levels``, which is ``representation.levels`` of a run.
+        message: Hydra's message, which contains the refused name: e.g. ``levels``, which is
+            ``representation.levels`` of a run, or ``experiment/demo`` of ``rooms/demo``.
     """
-    declared = declared_settings(command)
-    views = yaml.safe_load((config_folder() / "representation/tangent.yaml").read_text("utf-8"))
-    if "representation" in declared and name in views:
-        return f"Is representation.{name} meant? "
-    return nearest(name, _names(declared))
+    if option := re.search(r"Could not find '(\w+)/([^']+)'", message):
+        group, name = config_folder() / option[1], option[2]
+        options = [f.relative_to(group).with_suffix("").as_posix() for f in group.rglob("*.yaml")]
+        near = [one for one in sorted(options) if name in one] or get_close_matches(name, options)
+        return f"Is {' or '.join(near[:3])} meant? " if near else ""
+    setting = re.search(r"Could not override '(?:\w+@)?([\w.]+)'", message)
+    if setting is None:
+        return ""
+    name, declared = setting[1], list(_names(declared_settings(command)))
+    inner = [
+        f"{section}.{key}"
+        for section in declared
+        for file in sorted((config_folder() / section.rpartition(".")[2]).glob("*.yaml"))
+        for key in yaml.safe_load(file.read_text("utf-8")) or ()
+    ]
+    if name in inner:  # a setting of another option
+        return ""
+    for one in inner:
+        if one.endswith(f".{name}"):
+            return f"Is {one} meant? "
+    return _other_command(command, name) or nearest(name, [*declared, *inner])
+
+
+def _other_command(command: str, name: str) -> str:
+    """Return a question with the command that reads a setting, if there is only one, or ""."""
+    readers = [c for c in SETTINGS if name.partition(".")[0] in declared_settings(c)]
+    return f"Is tangent-{readers[0]} meant? " if len(readers) == 1 and readers != [command] else ""
 
 
 def _undeclared(

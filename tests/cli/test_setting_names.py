@@ -64,6 +64,7 @@ def test_options_of_groups_set_what_is_read(group: str) -> None:
         ("transfer", ["+photos.foo=1"], r"^photos\.foo: found 1.*lists\. (?!Is photos meant)"),
         ("transfer", ["+photos.data.root=x"], r"^photos\.data\.root: found x"),
         ("transfer", ["+study.levels=[5]"], r"^study: .*"),
+        ("train", ["experiment=zero_shot"], r"^fine_tuning: .*\. Is tangent-transfer meant\?"),
         ("train", ["+checkpoint=x"], r"^checkpoint: found x, which tangent-train does not read"),
     ],
 )  # fmt: skip
