@@ -64,6 +64,9 @@ class DatasetIndex(Generic[_Item]):
         kind: Named tuple of arrays that `read` returns.
         store: Prepared store, if any.
         in_parallel: Function that applies a function to each item and yields results as they come.
+
+    Raises:
+        SettingError: The splits have other names.
     """
 
     noun: str
@@ -72,6 +75,11 @@ class DatasetIndex(Generic[_Item]):
     kind: type[Any]
     store: Store | None = None
     in_parallel: Callable[[Callable[[_Item], Any], Sequence[_Item]], Generator[Any]] = in_threads
+
+    def __post_init__(self) -> None:
+        if set(self.splits) != set(SPLITS):
+            expected = f"{', '.join(SPLITS)}; a split may be empty"
+            raise SettingError("splits", found=", ".join(self.splits), expected=expected)
 
     def of(self, splits: Sequence[Split] = SPLITS) -> list[_Item]:
         """Return the items of the given splits."""

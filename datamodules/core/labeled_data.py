@@ -267,10 +267,18 @@ class LabeledData(ABC, Generic[_Item]):
     def _find_all(self, problems: Problems) -> DatasetIndex[_Item]:
         """Return the index of all items; refuse invalid class names and an empty data set."""
         self.check_classes()
-        index = self.find(problems)
+        found = f"no {self.noun}" if self.root.is_dir() else "no such folder"
+        try:
+            index = self.find(problems)
+        except DataError as error:
+            if self.root.is_dir():
+                raise
+            raise DataError(
+                self.root, found=found, expected=error.expected, remedy=error.remedy
+            ) from error
         if not index.of() and not problems.items:
             expected = f"{self.noun}, as docs and the docstring of the data set describe them"
-            raise DataError(self.root, found=f"no {self.noun}", expected=expected)
+            raise DataError(self.root, found=found, expected=expected)
         return index
 
     def _find_checked(self, problems: Problems) -> DatasetIndex[_Item]:

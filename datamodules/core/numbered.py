@@ -74,7 +74,8 @@ class NumberedReader(ImageReader):
                 files.labels,
                 found=f"numbers {', '.join(map(str, strange[:5]))}",
                 expected=f"{', '.join(map(str, known))}",
-                remedy="Use the label images as released; do not convert them.",
+                remedy="Use the label images of a release unconverted; your own data set may name "
+                "further numbers in its number_table.",
             )
         return labels if shape is None else resize_nearest(labels, shape)
 

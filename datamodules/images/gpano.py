@@ -220,11 +220,13 @@ def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaAr
     width, height = area.width_deg, area.north - area.south
     pixels_deg = width / size[1], height / size[0]
     if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
+        fit = pixels_deg[0] * size[0]
         raise SettingError(
             "area",
             found=f"{list(angles)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
             f"in an image of {width_height(size)}",
-            expected="angles that make them square",
+            expected=f"angles that make them square: {fit:.2f}° high"
+            + f", e.g. {-fit / 2:.2f} to {fit / 2:.2f}" * (fit <= 180),
         )
     across, down = ((area.west + 180) / 360, width / 360), ((90 - area.north) / 180, height / 180)
     return _area(f"area={list(angles)}", size, across, down)

@@ -107,6 +107,7 @@ def test_other_label_images_are_refused(root: Path) -> None:
     texts = [str(problem.error) for problem in photos(root).check()[0].listed()]
     assert len(texts) == 2
     assert "found numbers 34; expected 0, 1, 2" in texts[0]
+    assert "further numbers in its number_table" in texts[0]
     assert "found 8-bit RGB; expected 8-bit gray or palette" in texts[1]
 
 

@@ -70,6 +70,13 @@ def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:
     assert count == 3
 
 
+def test_other_names_of_splits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    splits: Any = {"train": [], "valid": [], "test": []}
+    monkeypatch.setattr(Toy, "find_images", lambda *_: (ToyReader(), splits))
+    with pytest.raises(SettingError, match="splits: found train, valid, test; expected train, val"):
+        _toy(tmp_path).prepare_data()
+
+
 def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
     _write(tmp_path, 4)
     data = _toy(tmp_path)
@@ -114,6 +121,6 @@ def test_names_of_classes_are_lines_of_text(
 
 def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:
     data = _toy(tmp_path / "nowhere")
-    with pytest.raises(DataError, match="nowhere: found no panoramas"):
+    with pytest.raises(DataError, match="nowhere: found no such folder; expected panoramas"):
         data.prepare_data()
     assert data.check()[0]

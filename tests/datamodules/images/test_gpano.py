@@ -328,6 +328,7 @@ def test_edges_are_at_the_angles(seed: int) -> None:
         ((0, 90, 20, 20), "south below north"),
         ((180, -180, 0, 10), "east other than west"),
         ((0, 40, 0, 10), r"pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square"),
+        ((0, 40, 0, 10), r"make them square: 40\.00° high, e\.g\. -20\.00 to 20\.00"),
     ],
 )
 def test_impossible_areas_are_refused(angles: tuple[float, ...], message: str) -> None:

@@ -126,6 +126,8 @@ def test_both_sets_are_read_and_stored(root: Path, erp: Any, tmp_path: Path) -> 
 def test_broken_files_are_refused(tmp_path: Path, erp: Any) -> None:
     with pytest.raises(DataError, match=r"no panoramas of scene_.*Request Structured3D"):
         Structured3D(tmp_path, erp).setup()
+    with pytest.raises(DataError, match=r"nowhere: found no such folder; .*Request Structured3D"):
+        Structured3D(tmp_path / "nowhere", erp).setup()
     root = write_structured3d(tmp_path, scenes=(1, 3001, 3251), photos=True)
     rooms = sorted(root.glob("scene_*/2D_rendering/*"))
     write_indices(rooms[0] / "panorama/full/semantic.png", np.full((32, 64), 41, np.uint8))
