@@ -90,7 +90,7 @@ class RingGrid(PinholeGrid):
             )
         resting = PinholeGrid(axes, (rows, columns), pitch)
         if is_complete:
-            check_coverage(resting, area, by_owners=by_owners)
+            check_coverage([resting], area, by_owners=by_owners)
         overlapping = not is_complete or overlaps(resting, area)
         super().__init__(axes, resting.size, pitch, rotation, is_overlapping=overlapping)
         vars(self).update(rings=checked)

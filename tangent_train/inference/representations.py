@@ -116,12 +116,12 @@ class PanoramaViews:
         self.blend = self.representation.blend
         self._trained, self._fill = trained, fill or trained.fill
 
-    def __str__(self) -> str:
-        """Number and size of the views; of pinhole images also their angle and resolution."""
-        return self.described()
+    def description(self, area: Sequence[float] | None = None) -> str:
+        """Return number and size of the views; of pinhole images also their angle and resolution.
 
-    def described(self, area: Sequence[float] | None = None) -> str:
-        """Return the text of `__str__` for panoramas of an area, see `SphereArea.of`."""
+        Args:
+            area: Area that the panoramas show, see `SphereArea.of`.
+        """
         limited = self.representation.limited_to(SphereArea.of(area))
         rows, columns = limited.image_size
         text = f"{sum(map(len, limited.view_sets()))} views of {columns} × {rows}"
