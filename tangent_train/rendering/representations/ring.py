@@ -108,8 +108,8 @@ class RingRepresentation(PinholeRepresentation):
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:
-    across, *rest = [fov] if isinstance(fov, int | float) else fov
-    return across, rest[0] if rest else across
+    pair: Any = (fov, fov) if isinstance(fov, int | float) else tuple(fov)
+    return pair  # checked by `half_extents`
 
 
 def ring_size(
