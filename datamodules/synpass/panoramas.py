@@ -108,8 +108,7 @@ class SynPASS(PanoramaDataModule):
             expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
             raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
         if self._weathers == WEATHERS:
-            counts = {str(split): len(images) for split, images in splits.items()}
-            problems.compare_counts(counts, _PUBLISHED)
+            problems.compare_counts(splits, *_PUBLISHED)
         given = self.test_split, self.validation_fraction, self.seed
         splits = published_splits(splits, *given)
         self._times = {time: self._read_list(time) for time in ("day", "night")}

@@ -82,7 +82,7 @@ def test_a_check_counts_and_finds_strays_and_missing_labels(root: Path) -> None:
     assert count == 3
     assert [problem.file for problem in problems.listed()] == [str(missing)]
     assert sorted(problems.warnings) == [
-        "found 3 train, 1 test; published are 2975 train, 500 test",
+        "found 3 train, 1 val; published are 2975 train, 500 val",
         f"label images: 1 without an image, e.g. {root}/gtFine/train/ulm/ulm_9_gtFine_labelIds.png",
     ]
 
