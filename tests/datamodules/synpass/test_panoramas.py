@@ -90,6 +90,18 @@ def test_a_check_names_what_lists_and_files_disagree_on(root: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(
+    ("settings", "listed"), [({"validation_fraction": 0}, 1), ({"weather": "fog"}, 0)]
+)
+def test_points_outside_the_chosen_splits_and_weathers_are_not_missing(
+    shared: Path, settings: dict[str, Any], listed: int
+) -> None:
+    warnings = panoramas(shared, **settings).check()[0].warnings
+    assert [text for text in warnings if text.startswith("all_map")] == [
+        "all_map_night_val.txt: 1 without an image, e.g. MAP_7_point99"
+    ] * listed
+
+
 def test_lists_that_cannot_be_used_are_refused(root: Path) -> None:
     with pytest.raises(DataError, match=r"all_map_day_val\.txt: found no point of test"):
         panoramas(root, time="day").setup()
