@@ -32,7 +32,7 @@ DIRECTION = (0.45, -0.2, -0.87)
 
 
 def wide_views() -> list[Row]:
-    """Return the views that `tangent-import` stores, by the side of the network's images."""
+    """Return the views that `views=tangent` stores, by the side of the network's images."""
     rows: list[Row] = []
     for side in SIDES:
         levels = wide_levels(side)

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.images.gpano import Fill
 from models.onnx_network import OnnxNetwork, graph_checksum
 from tangent_train.checkpoints.content import (
     GROUPS,
@@ -72,6 +73,7 @@ class TrainedNetwork:
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
         score_kind: Kind of the output of `inner`.
+        fill: Colors outside the area of partial panoramas in the training.
         settings: Complete section of the config that builds `inner`; None if only the computation
             is known (ONNX).
         source: File that `representation` and `settings` come from.
@@ -89,6 +91,7 @@ class TrainedNetwork:
     photo_level: int | None = None
     groups: Groups | None = None
     score_kind: ScoreKind = "logits"
+    fill: Fill = "mean"
     settings: Mapping[str, Any] | None = None
     source: SettingsFile | None = None
 
@@ -165,6 +168,7 @@ _KINDS = {
     "photo_level": int | None,
     "groups": GROUPS,
     "score_kind": ScoreKind,
+    "fill": Fill | None,
     "settings": dict | None,
 }
 """Fields in the metadata of an exported network, with their kinds."""
@@ -329,6 +333,8 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     kinds = {"network": dict, "representation": dict, "level": int}
     described = check_fields(path, content["config"], kinds, _TRAINED, "its config")
     described["settings"] = described.pop("network")
+    fill = (content["config"].get("data") or {}).get("fill")
+    described["fill"] = fill if fill in get_args(Fill) else None
     of_network = "class_names", "inputs", "normalization", "groups", "score_kind"
     names = (*of_network, "fixed_size", "photo_level")
     described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
@@ -383,6 +389,7 @@ def _build_trained(
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),
         "image_size": (rows, columns),
         "fixed_size": None if fixed is None else (fixed[0], fixed[1]),
+        "fill": described["fill"] or "mean",  # older exports have none
         "source": source,
     }
     return TrainedNetwork(**{**described, **known})

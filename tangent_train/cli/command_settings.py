@@ -112,7 +112,7 @@ class PredictSettings(InputSettings):
     base_level: int | None
     blend: Literal["feather", "nearest"]
     rotations: int
-    fill: Literal["black", "mean", "edge", "reflect"]
+    fill: Literal["black", "mean", "edge", "reflect"] | None
     upright: Literal["pose", "auto"] | None
     max_tilt_deg: float
     mask: float | Path | None = field(metadata=_EXISTS)

@@ -31,6 +31,7 @@ from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
+from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
 from tangent_train.registry import SettingsFile
@@ -38,7 +39,7 @@ from tangent_train.setting_rules import differing_settings, flat_settings, from_
 
 
 def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> float | None:
-    """Train, then evaluate the best epoch on the test fold.
+    """Train, then evaluate the best epoch on the test fold, if it is not empty.
 
     The best epoch is that with the best validation score, or the last epoch without validation.
 
@@ -71,7 +72,11 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
             trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
         # Written before the test, whose errors must not cost a sweep the score.
         score = _best_validation_score(trainer, best, run.folder)
-        run.test(trainer, _tested_checkpoint(trainer, best, last.path))
+        tested = _tested_checkpoint(trainer, best, last.path)
+        if len(run.data.source("test")):
+            run.test(trainer, tested)
+        else:
+            rank_zero_only(print_text)(f"No {run.data.noun} to test: no results are written.")
     return score
 
 

@@ -124,6 +124,7 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
         with _naming_stage(stage):
             data.make_files()
             data.setup()
+            data.test_dataloader()  # refuses an empty split: every stage is tested
 
 
 @contextmanager

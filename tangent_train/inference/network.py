@@ -51,7 +51,7 @@ def load(
     blend: Blend = "feather",
     rotations: int = 1,
     views: ViewChoice = None,
-    fill: Fill = "mean",
+    fill: Fill | None = None,
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
     trust: str | Sequence[str] = (),
@@ -75,7 +75,8 @@ def load(
         views: Views of panoramas: an option of ``representation=``, such as ``ring``; or with
             changed settings, ``{"option": "ring", "fov": 110}``. None as trained.
         fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
-            color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``).
+            color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``). None
+            as trained.
         images_per_forward: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
         min_confidence: Pixels with a lower confidence get the label 0.
@@ -86,7 +87,7 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
-    check_choice("fill", fill, get_args(Fill))
+    check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
     if class_map is not None:

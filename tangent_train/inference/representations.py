@@ -86,7 +86,8 @@ class PanoramaViews:
         blend: Blending of overlapping views.
         rotations: Number of rotations about the vertical to average over.
         views: See `ViewChoice`.
-        fill: Colors outside the area of a partial panorama, in views that leave it.
+        fill: Colors outside the area of a partial panorama, in views that leave it; None as
+            trained.
 
     Attributes:
         representation: Representation of upright panoramas.
@@ -103,7 +104,7 @@ class PanoramaViews:
         blend: Blend = "feather",
         rotations: int = 1,
         views: ViewChoice = None,
-        fill: Fill = "mean",
+        fill: Fill | None = None,
     ) -> None:
         settings = panorama_settings(trained, levels, base_level, views)
         settings["rotations"] = rotations
@@ -113,7 +114,7 @@ class PanoramaViews:
         self.representation = _built(trained, settings, None if views else trained.source)
         self.image_size = self.representation.image_size
         self.blend = self.representation.blend
-        self._trained, self._fill = trained, fill
+        self._trained, self._fill = trained, fill or trained.fill
 
     def __str__(self) -> str:
         """Number and size of the views; of pinhole images also their angle and resolution."""

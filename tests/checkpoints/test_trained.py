@@ -25,7 +25,7 @@ PHOTOS = ["data=synthrooms_perspective", "representation=perspective", "represen
     ("overrides", "size", "multiple"),
     [
         (SMALL_UNET, (16, 16), 4),
-        ([*SMALL_UNET, "representation=erp_crops"], (32, 64), 4),
+        ([*SMALL_UNET, "representation=erp_crops", "+data.fill=edge"], (32, 64), 4),
         ([*SMALL_UNET, *PHOTOS], (12, 20), 4),
         (["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "level=5"], (32, 32), 1),
     ],
@@ -45,6 +45,7 @@ def test_a_network_computes_what_its_task_does(
     assert trained.image_size == size
     assert (trained.size_multiple, trained.fixed_size) == (multiple, None)
     assert trained.class_names == task.class_names
+    assert trained.fill == ("edge" if "+data.fill=edge" in overrides else "mean")
     assert trained.level == (5 if "level=5" in overrides else 4)
     assert trained.normalization.channels == 2 + len(trained.inputs)
     assert trained.representation["_target_"].startswith("tangent_train.rendering.")

@@ -23,6 +23,7 @@ import pytest
 import torch
 from torch import nn
 
+from datamodules import SynthRooms
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
@@ -152,6 +153,26 @@ def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path,
     run("train", "resume=run", rooms, "trainer.max_epochs=2")
     assert first != (checkpoints / "best.ckpt").read_bytes()
     assert results(tmp_path / "run")["images"] == 2
+
+
+def test_without_test_images_training_ends_without_results(
+    rooms: str,
+    tmp_path: Path,
+    run: Run,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    find = SynthRooms.find_images
+
+    def without_test(data: SynthRooms, problems: Any) -> Any:
+        reader, splits = find(data, problems)
+        return reader, {**splits, "test": []}
+
+    monkeypatch.setattr(SynthRooms, "find_images", without_test)
+    run("train", *SETTINGS, rooms, "trainer.max_epochs=1", "hydra.run.dir=run")
+    assert "No panoramas to test: no results are written." in capsys.readouterr().out
+    assert (tmp_path / "run" / "checkpoints" / "best.ckpt").is_file()
+    assert not list((tmp_path / "run").glob("results.*"))
 
 
 def test_an_evaluation_repeats_the_figures_exactly(

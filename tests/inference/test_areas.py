@@ -137,10 +137,10 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         batch.rotation[0].numpy(),
         area=SphereArea.of_numbers(batch.area[0].numpy()),
     )
-    trained = trained_network(KINDS[of], inner=network)
-    views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"), fill="reflect")
+    trained = trained_network(KINDS[of], inner=network, fill="reflect")
+    views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"))
     if "rotations" in KINDS[of]:
-        views = PanoramaViews(trained, None, None, views.blend, 2, fill="reflect")
+        views = PanoramaViews(trained, None, None, views.blend, 2)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)
     labels = Predictor(trained, views).predict(image).labels()

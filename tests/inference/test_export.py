@@ -69,7 +69,7 @@ def test_everything_known_of_a_network_comes_back(
 ) -> None:
     path, again = files[suffix], load_trained(files[suffix])
     known = ("class_names", "inputs", "normalization", "level", "representation", "image_size")
-    for name in (*known, "size_multiple", "fixed_size"):
+    for name in (*known, "size_multiple", "fixed_size", "fill"):
         assert getattr(again, name) == getattr(trained, name)
     assert isinstance(again.inner, OnnxNetwork) == (suffix == ".onnx")
     assert not again.network.training
@@ -86,6 +86,7 @@ def test_everything_known_of_a_network_comes_back(
         "photo_level": None,
         "groups": None,
         "score_kind": "logits",
+        "fill": "edge",
         "settings": UNET if suffix == ".safetensors" else None,
         "tangent_train_version": version("tangent-train"),
     }

@@ -48,6 +48,7 @@ def small_trained(
         image_size=image_size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else image_size,
+        fill="edge",
         settings=settings,
         source=SettingsFile(Path("x.ckpt"), trust={settings["_target_"]}),
     )

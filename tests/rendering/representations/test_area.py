@@ -137,7 +137,7 @@ def test_the_part_of_an_equirectangular_image_shows_the_area(
     (views,) = limited.view_sets()
     image = equirect_directions(SHAPE).astype(np.float32)
     rendered = views.render(image, "bilinear")
-    assert rendered.shape[1:3] == (views.height, views.width or 2 * rows)
+    assert rendered.shape[1:3] == (views.window.height, views.window.width)
     assert rendered.shape[1] % 32 == rendered.shape[2] % 32 == 0
     scores, _ = views.placed(torch.from_numpy(rendered).movedim(-1, 1), SHAPE)
     back = scores[0, :, 1:-1, 1:-1].movedim(0, -1).numpy()
@@ -152,7 +152,7 @@ def test_averaged_rotations_of_a_narrow_part_are_one_view() -> None:
     averaged = EquirectRepresentation(5, rotations=3)
     assert len(averaged.limited_to(SphereArea(-60, 60, -30, 30)).view_sets()) == 1
     around = averaged.limited_to(SphereArea(-180, 180, -30, 30))
-    assert [views.first for views in around.view_sets()] == [0, 43, 85]
+    assert [views.window.first for views in around.view_sets()] == [0, 43, 85]
     assert around.image_size == (32, 128)
 
 
