@@ -13,7 +13,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from datamodules.core.index import Item
+    from datamodules.core.index import Item, Split
 
 
 _Item = TypeVar("_Item", bound="Item")
@@ -86,14 +86,15 @@ class Problems:
         self._noted += others._noted
 
     def compare_counts(
-        self, found: Mapping[str, int], published: Sequence[Mapping[str, int]]
+        self, splits: Mapping[Split, Sequence[Item]], *published: Mapping[str, int]
     ) -> None:
         """Warn if the numbers of images of the splits are not published ones.
 
         Args:
-            found: Number of images of each split.
-            published: Published numbers, one or several.
+            splits: Images of each split.
+            published: Published numbers of images of these splits.
         """
+        found = {str(split): len(images) for split, images in splits.items()}
         if not any(found == numbers for numbers in published):
             counts, *others = (
                 ", ".join(f"{count} {split}" for split, count in numbers.items())

@@ -81,13 +81,24 @@ def test_a_map_names_published_classes(name: str) -> None:
     assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
 
 
-@pytest.mark.parametrize("data", [datamodules.Cityscapes, datamodules.SynPASS])
-def test_a_map_to_13_classes_maps_a_network_as_the_labels(data: Any) -> None:
-    labels = data.class_sets["13"]
-    names = f"{data.__name__.lower()}_to_densepass13"
+@pytest.mark.parametrize(
+    ("data", "classes", "target"),
+    [
+        (datamodules.Cityscapes, "13", "densepass13"),
+        (datamodules.SynPASS, "13", "densepass13"),
+        (datamodules.Stanford2D3DS, "8", "span8"),
+        (datamodules.Structured3D, "8", "span8"),
+    ],
+)
+def test_a_map_maps_a_network_as_a_set_of_classes_the_labels(
+    data: Any, classes: str, target: str
+) -> None:
+    labels = data.class_sets[classes]
+    names = f"{data.__name__.lower()}_to_{target}"
     mapped = map_classes(_trained(labels.of), load_class_map(names))
     key = labels.key[1 : 1 + len(labels.of)].tolist()
-    groups = [[k for k, to in enumerate(key) if to == label] for label in (*range(1, 14), 0)]
+    order = (*range(1, 1 + len(labels.names)), 0)
+    groups = [[k for k, to in enumerate(key) if to == label] for label in order]
     assert mapped.trained.groups == groups
 
 

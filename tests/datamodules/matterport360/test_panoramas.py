@@ -113,14 +113,13 @@ def test_lists_of_the_release_are_compared(tmp_path: Path, erp: Any) -> None:
     (root / "test.txt").write_text(f"{SCENES[3]} 0{SCENES[3]}\n{SCENES[3]} nothing\n")
     problems, _ = Matterport360(root, erp, release="sfss").check()
     lists = problems.warnings[3:]
-    rest = "without a panorama in a scene of"
+    rest, unlisted = "without a panorama in a scene of", "of these scenes are not in it"
     assert [
         text.removeprefix(f"{root}/").removesuffix(". Scenes define the splits.") for text in lists
     ] == [
-        f"train.txt: 0 names; 0 {rest} train; 6 panoramas of these scenes are not in it",
-        f"validation.txt: 2 names; {SCENES[4]}/0{SCENES[4]} more than once; 0 {rest} val; "
-        "0 panoramas of these scenes are not in it",
-        f"test.txt: 2 names; 1 {rest} test; 1 panoramas of these scenes are not in it",
+        f"train.txt: 0 names, 0 of them repeated, 0 {rest} train; 6 panoramas {unlisted}",
+        f"validation.txt: 3 names, 1 of them repeated, 0 {rest} val; 0 panoramas {unlisted}",
+        f"test.txt: 2 names, 0 of them repeated, 1 {rest} test; 1 panoramas {unlisted}",
     ]
 
 
