@@ -10,7 +10,7 @@ import pytest
 from datamodules import Matterport360
 from datamodules.core.index import SPLITS
 from datamodules.matterport360.panoramas import CLASSES, read_table
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tests.datamodules.data_files import names_of, write_png
 from tests.datamodules.matterport360.matterport_format import SCENES, write_matterport
 
@@ -123,11 +123,9 @@ def test_lists_of_the_release_are_compared(tmp_path: Path, erp: Any) -> None:
     ]
 
 
-def test_other_files_and_settings_are_refused(root: Path, erp: Any, tmp_path: Path) -> None:
+def test_other_files_are_refused(erp: Any, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no panoramas of release=360fv; expected <scene>/rgb"):
         Matterport360(tmp_path, erp).setup()
-    with pytest.raises(SettingError, match=r"data\.classes: found 360bev; expected 41"):
-        Matterport360(root, erp, release="sfss", classes="360bev")
     root = write_matterport(tmp_path, SCENES[:3])
     write_png(root / SCENES[2] / f"semantic/0{SCENES[2]}.png", np.full((32, 64), 42, np.uint8))
     write_png(root / SCENES[0] / f"depth/1{SCENES[0]}.png", np.full((32, 64), 42, np.uint8))

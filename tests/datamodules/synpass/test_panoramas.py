@@ -10,7 +10,7 @@ import pytest
 
 from datamodules import SynPASS
 from datamodules.core.index import SPLITS
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.cityscapes import street_format as streets
 from tests.datamodules.data_files import names_of, write_png
@@ -64,14 +64,6 @@ def test_weather_and_time_are_settings_and_groups(shared: Path) -> None:
     assert {name.split("/")[1] for s in SPLITS for name in names_of(sun, s)} == {"sun"}
     night = names_of(panoramas(shared, time="night", test_split="val"), "test")
     assert {name.split("/")[0] for name in night} == {"MAP_6_point11"}
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"weather": "snow"}, {"weather": []}, {"time": "dawn"}, {"test_split": "train"}]
-)
-def test_other_settings_are_refused(tmp_path: Path, wrong: dict[str, Any]) -> None:
-    with pytest.raises(SettingError, match=rf"data\.{next(iter(wrong))}"):
-        panoramas(tmp_path, **wrong)
 
 
 def test_a_check_names_what_lists_and_files_disagree_on(root: Path) -> None:
