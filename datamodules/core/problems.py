@@ -42,11 +42,13 @@ class Problems:
 
     Attributes:
         warnings: Warnings about usable files.
+        incomplete: Number of images found and published, "2 of 100", by split, if they differ.
     """
 
     def __init__(self) -> None:
         self._noted: list[Problem] = []
         self.warnings: list[str] = []
+        self.incomplete: dict[str, str] = {}
 
     @contextmanager
     def noted(self, item: str | None = None, file: Path | None = None) -> Iterator[None]:
@@ -101,6 +103,10 @@ class Problems:
                 for numbers in (found, *published)
             )
             self.warnings.append(f"found {counts}; published are {' or '.join(others)}")
+        for split, count in found.items():
+            allowed = [numbers[split] for numbers in published]
+            if count not in allowed:
+                self.incomplete[split] = f"{count} of {' or '.join(map(str, allowed))}"
 
     def note_strays(self, labels: Iterable[Path], images: Iterable[Item]) -> None:
         """Warn of label images that belong to none of the images."""

@@ -51,6 +51,7 @@ def test_both_spellings_are_read_and_all_are_for_the_test(shared: Path, tmp_path
         problems, count = data.check()
         assert (count, problems.listed()) == (3, [])
         assert problems.warnings == ["found 3 test; published are 100 test"]
+        assert data.facts["images"] == "3 of 100"
 
 
 def test_the_horizon_row_is_at_latitude_0(shared: Path) -> None:
