@@ -37,7 +37,6 @@ WRITERS: Mapping[str, Callable[[Path], Path]] = {
 
 SMALL = (
     *("network=unet_small", "network.widths=[4,8]"),
-    *("~network.weights", "~network.frozen_statistics"),  # of the network of all experiments
     *("trainer.max_epochs=1", "trainer.accelerator=cpu", "data.num_workers=0", "panels=0"),
 )
 SIZES = {"DensePASS": ("level=6", "photos.representation.dim=[16,32]")}
