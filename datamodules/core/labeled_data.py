@@ -366,10 +366,14 @@ class LabeledData(ABC, Generic[_Item]):
         if kind != "none":
             source = self.source("train")
             for labels in in_threads(source.labels, range(len(source))):
-                counts += np.bincount(labels.ravel(), minlength=len(counts))
+                counts += np.bincount(self.recorded(labels).ravel(), minlength=len(counts))
             for doubt in label_doubts("train", counts, self.class_names):
                 print_on_rank_zero(f"Warning: {doubt}")
         return class_weights(counts[1:], kind)
+
+    def recorded(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the labels of one training image that its file contains."""
+        return labels
 
 
 def _fact(value: Any) -> str:
