@@ -274,7 +274,9 @@ def _check_taken(
         raise DataError(file.path, found=f"{place}: {found}", expected=expected)
     remedy = "Remove it."
     if not _is_typed(name):
-        remedy = f"Remove it with ~{name}, or choose an option of {place}=."
+        removed = " ".join(f"~{place}.{name}" for name in unknown)
+        remedy = f"Remove {'it' if len(unknown) == 1 else 'them'} with {removed}, "
+        remedy += f"or choose an option of {place}=."
         if place == "data":
             remedy += " An experiment is for its data set; recipe=small is for other panoramas."
     remedy = nearest(unknown[0], known) + remedy

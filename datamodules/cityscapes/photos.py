@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from datamodules.cityscapes.classes import CLASS_SETS
 from datamodules.core.image_module import PhotoDataModule
-from datamodules.core.index import Split, draw_groups
+from datamodules.core.index import Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
@@ -44,7 +44,7 @@ _GET_IT = (
     "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
     "https://www.cityscapes-dataset.com and point data.root at the folder that holds them."
 )
-_PUBLISHED = ({"train": 2975, "test": 500},)
+_PUBLISHED = {"train": 2975, "val": 500}
 _IDS = (7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33)
 _TABLE = number_table(_IDS, [*range(34), 255])  # 255: license plates, id -1
 _CAMERA = '{"intrinsic": {"fx": …, "fy": …, "u0": …, "v0": …}}, in pixels'
@@ -118,22 +118,18 @@ class Cityscapes(PhotoDataModule):
 
     def find_images(
         self, problems: Problems
-    ) -> tuple[CityscapesReader, dict[Split, list[ImageFiles]]]:
+    ) -> tuple[CityscapesReader, dict[Split, Sequence[ImageFiles]]]:
         """See `ImageDataModule`."""
-        train, test = self._list_images("train"), self._list_images("val")
-        cities = [files.name.partition("/")[0] for files in train]
-        held: set[str] = set()
-        if self.validation_fraction:
-            held = draw_groups(cities, self.validation_fraction, self.seed)
-        problems.compare_counts({"train": len(train), "test": len(test)}, _PUBLISHED)
-        for split, images in (("train", train), ("val", test)):
+        published: dict[Split, list[ImageFiles]] = {
+            "train": self._list_images("train"),
+            "val": self._list_images("val"),
+        }
+        problems.compare_counts(published, _PUBLISHED)
+        for split, images in published.items():
             labels = (self.root / "gtFine" / split).glob("*/[!.]*_labelIds.png")
             problems.note_strays(labels, images)
-        return CityscapesReader(_TABLE, self.fov), {
-            "train": [f for f, city in zip(train, cities, strict=True) if city not in held],
-            "val": [f for f, city in zip(train, cities, strict=True) if city in held],
-            "test": test,
-        }
+        splits = published_splits(published, "val", self.validation_fraction, self.seed)
+        return CityscapesReader(_TABLE, self.fov), splits
 
     def _list_images(self, split: str) -> list[ImageFiles]:
         """Return the images of a published split, in the order of their names."""

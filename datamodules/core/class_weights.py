@@ -59,7 +59,7 @@ def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[st
     if missing:
         more = f" and {len(missing) - _MOST_NAMED} more" if len(missing) > _MOST_NAMED else ""
         doubts.append(
-            f"No pixel for {split} is of {len(missing)} of {len(class_names) - 1} classes: "
-            f"{', '.join(missing[:_MOST_NAMED])}{more}."
+            f"Classes without a pixel for {split}: {', '.join(missing[:_MOST_NAMED])}{more} "
+            f"({len(missing)} of {len(class_names) - 1})."
         )
     return doubts

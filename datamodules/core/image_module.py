@@ -10,6 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -277,6 +279,10 @@ class PanoramaDataModule(ImageDataModule):
                 EstimatedUp(self.max_tilt_deg, read, rotated, judge, self.sphere_area)
             )
         return transforms
+
+    def recorded(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """See `LabeledData`: those in the area."""
+        return self.canvas.cut(labels)
 
     def panoramas(self, split: Split) -> LabeledImages:
         """Return the whole panoramas of a split as arrays, masked and rotated as set."""

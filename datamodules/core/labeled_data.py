@@ -98,7 +98,7 @@ class LabeledData(ABC, Generic[_Item]):
             self.require(name, getattr(self, name) >= 0, "0 or more")
         self.label_counts: dict[Split, NDArray[np.int64]] = {}
         self._index: DatasetIndex[_Item] | None = None
-        self._left_out = 0
+        self._test_images = ""
         self._readers: dict[Split, SplitReader[_Item, Any]] = {}
 
     # --- defined by subclasses ---------------------------------------------------------------
@@ -299,6 +299,7 @@ class LabeledData(ABC, Generic[_Item]):
         """
         problems = Problems()
         index = self._find_checked(problems)
+        self._test_images = problems.incomplete.get(getattr(self, "test_split", "test"), "")
         for warning in problems.warnings if self._index is None else ():  # once
             print_on_rank_zero(f"Warning: {warning}")
         if not self.skip_broken:
@@ -308,7 +309,9 @@ class LabeledData(ABC, Generic[_Item]):
             return index
         index.read_all(index.of(), problems, whole=whole)
         usable = index.without(problems)
-        self._left_out = len(index.splits["test"]) - len(usable.splits["test"])
+        count, of = len(usable.splits["test"]), len(index.splits["test"])
+        if count < of:
+            self._test_images = f"{count} of {of}"
         for split in SPLITS:
             if index.splits[split] and not usable.splits[split]:
                 raise DataError(
@@ -332,7 +335,7 @@ class LabeledData(ABC, Generic[_Item]):
         """Facts that scores on the test split depend on, see `tangent_train.results.published`.
 
         They are the data set, the number or set of classes, the `fact_settings` of all classes, and
-        the number of broken test items that were left out, if any.
+        the number of test images ("2 of 100") if some are missing or were left out as broken.
         """
         kind = type(self)
         is_here = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
@@ -340,8 +343,8 @@ class LabeledData(ABC, Generic[_Item]):
         settings = chain.from_iterable(vars(k).get("fact_settings", ()) for k in kind.__mro__[::-1])
         classes = str(getattr(self, "classes", None) or self.num_classes)
         of_settings = {setting: _fact(getattr(self, setting)) for setting in settings}
-        left_out = {"left_out": str(self._left_out)} if self._left_out else {}
-        return {"data": name, "classes": classes, **of_settings, **left_out}
+        images = {"images": self._test_images} if self._test_images else {}
+        return {"data": name, "classes": classes, **of_settings, **images}
 
     @property
     def num_classes(self) -> int:
@@ -371,10 +374,14 @@ class LabeledData(ABC, Generic[_Item]):
         if kind != "none":
             source = self.source("train")
             for labels in in_threads(source.labels, range(len(source))):
-                counts += np.bincount(labels.ravel(), minlength=len(counts))
+                counts += np.bincount(self.recorded(labels).ravel(), minlength=len(counts))
             for doubt in label_doubts("train", counts, self.class_names):
                 print_on_rank_zero(f"Warning: {doubt}")
         return class_weights(counts[1:], kind)
+
+    def recorded(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the labels of one training image that its file contains."""
+        return labels
 
 
 def _fact(value: Any) -> str:

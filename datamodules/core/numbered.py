@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import ImageFiles, ImageReader, resize_nearest, units_to_steps
-from datamodules.images.pixel_files import read_image_size, read_pixels, read_rgb
-from datamodules.images.png import check_png
+from datamodules.core.panoramas import ImageFiles, PngReader, resize_nearest, units_to_steps
+from datamodules.images.pixel_files import read_image_size, read_pixels
 from tangent_train.errors import DataError
 
+_FORMATS = {"labels": (8, ("gray", "palette")), "depth": (16, ("gray",))}
 _STRANGE = 255
 """Label of numbers that a data set does not have."""
 
@@ -35,7 +35,7 @@ def number_table(classes: Sequence[int], unknown: Iterable[int]) -> NDArray[np.u
 
 
 @dataclass(frozen=True, eq=False)
-class NumberedReader(ImageReader):
+class NumberedReader(PngReader):
     """Decoder of color images and of 8-bit label images, gray or with a palette.
 
     Attributes:
@@ -46,22 +46,16 @@ class NumberedReader(ImageReader):
     table: NDArray[np.uint8]
     units_per_m: int = field(default=0, kw_only=True)
 
+    formats = _FORMATS
+
     @property
     def settings(self) -> dict[str, str]:
         """See `ImageReader`: the label of every number."""
         return {"table": self.table.tobytes().hex()}
 
     def size(self, part: str, path: Path) -> tuple[int, int]:
-        """See `ImageReader`."""
-        if part == "rgb":
-            return read_image_size(path)
-        is_depth = part == "depth"
-        header = check_png(path, 16 if is_depth else 8, ("gray", *["palette"] * (not is_depth)))
-        return header.height, header.width
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Return the colors without alpha."""
-        return read_rgb(files.rgb)
+        """See `ImageReader`; colors may be JPEG files."""
+        return read_image_size(path) if part == "rgb" else super().size(part, path)
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See `ImageReader`; a palette is ignored."""

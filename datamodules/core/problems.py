@@ -13,7 +13,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from datamodules.core.index import Item
+    from datamodules.core.index import Item, Split
 
 
 _Item = TypeVar("_Item", bound="Item")
@@ -42,11 +42,13 @@ class Problems:
 
     Attributes:
         warnings: Warnings about usable files.
+        incomplete: Number of images found and published, "2 of 100", by split, if they differ.
     """
 
     def __init__(self) -> None:
         self._noted: list[Problem] = []
         self.warnings: list[str] = []
+        self.incomplete: dict[str, str] = {}
 
     @contextmanager
     def noted(self, item: str | None = None, file: Path | None = None) -> Iterator[None]:
@@ -86,20 +88,25 @@ class Problems:
         self._noted += others._noted
 
     def compare_counts(
-        self, found: Mapping[str, int], published: Sequence[Mapping[str, int]]
+        self, splits: Mapping[Split, Sequence[Item]], *published: Mapping[str, int]
     ) -> None:
         """Warn if the numbers of images of the splits are not published ones.
 
         Args:
-            found: Number of images of each split.
-            published: Published numbers, one or several.
+            splits: Images of each split.
+            published: Published numbers of images of these splits.
         """
+        found = {str(split): len(images) for split, images in splits.items()}
         if not any(found == numbers for numbers in published):
             counts, *others = (
                 ", ".join(f"{count} {split}" for split, count in numbers.items())
                 for numbers in (found, *published)
             )
             self.warnings.append(f"found {counts}; published are {' or '.join(others)}")
+        for split, count in found.items():
+            allowed = [numbers[split] for numbers in published]
+            if count not in allowed:
+                self.incomplete[split] = f"{count} of {' or '.join(map(str, allowed))}"
 
     def note_strays(self, labels: Iterable[Path], images: Iterable[Item]) -> None:
         """Warn of label images that belong to none of the images."""

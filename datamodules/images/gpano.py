@@ -114,16 +114,19 @@ class PanoramaArea:
         """Return a panorama ``(H, W[, C])`` with its colors outside the area replaced."""
         if self.is_whole or fill == "black":
             return whole
-        sides = zip((self.rows, self.columns), self.full_shape, strict=True)
+        (top, bottom), (left, right) = self.rows, self.columns
+        height, width = self.full_shape
+        columns = np.arange(left, right) % width
+        shown = whole[top:bottom, columns]
         if fill == "mean":
-            inside = self.place(np.ones(self.image_shape, np.bool_))
-            mean = whole[inside].mean(axis=0).round().astype(whole.dtype)
-            return np.where(inside[..., None] if whole.ndim > 2 else inside, whole, mean)
-        rows, columns = (
-            _sources(*side, length, fill, wraps=wraps)
-            for (side, length), wraps in zip(sides, (False, True), strict=True)
-        )
-        return whole[rows[:, None], columns]
+            filled = np.empty_like(whole)
+            filled[:] = shown.mean(axis=(0, 1)).round()
+            filled[top:bottom, columns] = shown
+            return filled
+        gap = width - (right - left)  # half of it is filled from either edge
+        around = ((top, height - bottom), (gap // 2, gap - gap // 2), (0, 0))[: whole.ndim]
+        padded = np.pad(shown, around, "edge" if fill == "edge" else "symmetric")
+        return np.roll(padded, left - gap // 2, axis=1)
 
     def cut(self, whole: NDArray[_Pixel]) -> NDArray[_Pixel]:
         """Cut the image ``(h, w[, C])`` out of a panorama ``(H, W[, C])``; inverse of `place`.
@@ -358,24 +361,3 @@ def _area(
     height = min(height, full_height)
     top = min(round(down[0] * full_height), full_height - height)
     return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
-
-
-def _sources(start: int, stop: int, length: int, fill: Fill, *, wraps: bool) -> NDArray[np.intp]:
-    """Return the row or column inside an area whose pixels fill each one of the panorama.
-
-    Args:
-        start: First row or column of the area.
-        stop: The one after its last.
-        length: Rows or columns of the panorama.
-        fill: ``edge`` or ``reflect``.
-        wraps: True for columns: half of the gap is filled from either edge of the area.
-    """
-    count, lines = stop - start, np.arange(length)
-    inside = (lines - start) % length if wraps else lines - start
-    if wraps:
-        inside = np.where(inside >= (count + length) / 2, inside - length, inside)
-    if fill == "edge":
-        inside = inside.clip(0, count - 1)
-    else:
-        inside = np.minimum(inside % (2 * count), ~inside % (2 * count))
-    return (start + inside) % length

@@ -26,19 +26,16 @@ Y. Zhang: "Matterport3D: Learning from RGB-D Data in Indoor Environments", 3DV 2
 from __future__ import annotations
 
 import csv
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
-import numpy as np
-
 from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.index import SPLITS, Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.labels import ClassSet
-from datamodules.core.numbered import NumberedReader
+from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
@@ -77,18 +74,18 @@ _GET_IT = (
 )
 _FOLDERS = {
     "360fv": ("rgb", "semantic", "depth"),
-    "sfss": tuple(
-        f"panorama/{name}"
-        for name in (
-            "undistorted_color_images",
-            "segmentation_maps_classes",
-            "undistorted_depth_images",
-        )
+    "sfss": (
+        "panorama/undistorted_color_images",
+        "panorama/segmentation_maps_classes",
+        "panorama/undistorted_depth_images",
     ),
 }
 """Folders of a scene: color, classes, depth."""
 
-_PUBLISHED: Mapping[str, Mapping[str, int]] = {"360fv": {"train": 7829, "val": 772, "test": 2014}}
+_TABLES = {"360fv": number_table(range(42), ()), "sfss": number_table(range(1, 42), [0])}
+_PUBLISHED = {"train": 7829, "val": 772, "test": 2014}
+"""Panoramas of `360fv`."""
+
 _LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
 
 
@@ -145,16 +142,13 @@ class Matterport360(PanoramaDataModule):
             expected = f"{'/<uuid>.png, <scene>/'.join(_FOLDERS[self.release])}/<uuid>.png"
             found = f"no panoramas of release={self.release}"
             raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
-        if self.release in _PUBLISHED:
-            counts: dict[str, int] = {split: len(images) for split, images in splits.items()}
-            problems.compare_counts(counts, [_PUBLISHED[self.release]])
+        if self.release == "360fv":
+            problems.compare_counts(splits, _PUBLISHED)
         else:
             self._compare_lists(splits, problems)
         given = self.test_split, self.validation_fraction, self.seed
-        numbers = len(CATEGORIES)
-        table = np.full(256, 255, np.uint8)
-        table[:numbers] = np.arange(numbers) + (self.release == "360fv")
-        return NumberedReader(table, units_per_m=4000), published_splits(splits, *given)
+        reader = NumberedReader(_TABLES[self.release], units_per_m=4000)
+        return reader, published_splits(splits, *given)
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
@@ -173,16 +167,13 @@ class Matterport360(PanoramaDataModule):
             path = self.root / name
             if not path.is_file():
                 continue
-            listed = Counter(
-                "/".join(line.split())
-                for line in path.read_text("utf-8", errors="replace").splitlines()
-                if line.strip()
-            )
-            there = {files.name for files in splits[split]}
-            twice = [entry for entry, count in listed.items() if count > 1]
-            found = [f"{len(listed)} names"]
-            found += [f"{', '.join(twice)} more than once"] if twice else []
-            found += [f"{len(listed.keys() - there)} without a panorama in a scene of {split}"]
-            found += [f"{len(there - listed.keys())} panoramas of these scenes are not in it"]
-            if twice or there != listed.keys():
-                problems.warnings.append(f"{path}: {'; '.join(found)}. Scenes define the splits.")
+            lines = path.read_text("utf-8", errors="replace").splitlines()
+            names = ["/".join(line.split()) for line in lines if line.strip()]
+            listed, there = set(names), {files.name for files in splits[split]}
+            if len(names) > len(there) or listed != there:
+                problems.warnings.append(
+                    f"{path}: {len(names)} names, {len(names) - len(listed)} of them repeated, "
+                    f"{len(listed - there)} without a panorama in a scene of {split}; "
+                    f"{len(there - listed)} panoramas of these scenes are not in it. "
+                    "Scenes define the splits."
+                )

@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import math
 from bisect import bisect
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -53,7 +53,7 @@ _GET_IT = (
     "Request Structured3D at https://structured3d-dataset.org and point data.root at the folder "
     "with scene_00000 and the others."
 )
-_PUBLISHED: Sequence[Mapping[str, int]] = ({"train": 18362, "val": 1776, "test": 1697},)
+_PUBLISHED = {"train": 18362, "val": 1776, "test": 1697}
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
 
@@ -156,7 +156,7 @@ class Structured3DRooms(ImageDataModule):
                 f"{', '.join(sorted(set(invalid)))} (data.invalid_scenes={self.invalid_scenes})"
             )
         if isinstance(self, PanoramaDataModule) and self.invalid_scenes == "keep":
-            problems.compare_counts({s: len(images) for s, images in splits.items()}, _PUBLISHED)
+            problems.compare_counts(splits, _PUBLISHED)
         given = self.test_split, self.validation_fraction, self.seed
         return Structured3DReader(_TABLE, units_per_m=1000), published_splits(splits, *given)
 

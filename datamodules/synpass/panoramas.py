@@ -107,15 +107,14 @@ class SynPASS(PanoramaDataModule):
         if not any(splits.values()):
             expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
             raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
+        self._times = {time: self._read_list(time) for time in ("day", "night")}
         if self._weathers == WEATHERS:
-            counts = {str(split): len(images) for split, images in splits.items()}
-            problems.compare_counts(counts, _PUBLISHED)
+            problems.compare_counts(splits, *_PUBLISHED)
+            known = {_point(files) for images in splits.values() for files in images}
+            for time, points in self._times.items():
+                problems.note_absent(f"all_map_{time}_val.txt", points - known)
         given = self.test_split, self.validation_fraction, self.seed
         splits = published_splits(splits, *given)
-        self._times = {time: self._read_list(time) for time in ("day", "night")}
-        known = {_point(files) for images in splits.values() for files in images}
-        for time, points in self._times.items():
-            problems.note_absent(f"all_map_{time}_val.txt", points - known)
         if self.time != "all":
             named = self._times[self.time]
             splits["test"] = [files for files in splits["test"] if _point(files) in named]

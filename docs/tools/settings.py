@@ -60,7 +60,7 @@ protocols differ. Different data sets are not compared.
 | `test_rotation` | rotation of the test images, see `data.test_rotation` |
 | `classes` | set of classes: their number, or a name, see `data.classes` |
 | `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
-| `left_out` | number of broken test images that `data.skip_broken=true` left out |
+| `images` | number of test images, if some are missing or were left out as broken: `2 of 100` |
 | `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
 
 Further facts are settings of single data sets. Folds are compared separately. "Not stated" is a

@@ -389,7 +389,7 @@ def _build_trained(
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),
         "image_size": (rows, columns),
         "fixed_size": None if fixed is None else (fixed[0], fixed[1]),
-        "fill": described["fill"] or "mean",  # older exports have none
+        "fill": described["fill"] or "mean",  # exports of older versions lack it
         "source": source,
     }
     return TrainedNetwork(**{**described, **known})

@@ -126,7 +126,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -
         f"the network returns {_OUTPUTS[trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
-        f"panoramas: {PanoramaViews(trained)}",
+        f"panoramas: {PanoramaViews(trained).description()}",
     ]
     if trained.source is not None and trained.source.trust:
         trust = ",".join(trained.source.trust)

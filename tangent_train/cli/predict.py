@@ -350,7 +350,7 @@ def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
     views: PanoramaViews | PhotoViews
     if settings.projection == "equirectangular":
         views = PanoramaViews(trained, *how, settings.views, settings.fill)
-        print_text(f"A panorama is labeled in {views.described(settings.area)}.")
+        print_text(f"A panorama is labeled in {views.description(settings.area)}.")
     else:
         views = PhotoViews(trained, *how)
     device, count = settings.device, settings.images_per_forward

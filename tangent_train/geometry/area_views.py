@@ -26,8 +26,8 @@ def views_of_area(
 ) -> list[NDArray[np.int64]]:
     """Return the images that are needed for an area.
 
-    These are all images whose center lies in the area. Others are left out, those with the smallest
-    share of their pixels in the area first, as long as the rest covers all of it.
+    These are all images whose center lies in the area, and the other images without which they do
+    not cover it. Where several would do, those with the largest share of pixels in the area remain.
 
     Args:
         grids: Images that together cover the area, under the same rotation.

@@ -21,38 +21,32 @@ _TOGETHER = 2**15
 """Number of directions that are tested at once."""
 
 
-def check_coverage(grid: PinholeGrid, area: SphereArea | None = None, *, by_owners: bool) -> None:
-    """Refuse images that do not cover the sphere, or an area.
+def check_coverage(
+    grids: Sequence[PinholeGrid], area: SphereArea | None = None, *, by_owners: bool = False
+) -> None:
+    """Refuse images that together do not cover the sphere, or an area.
 
     Args:
-        grid: The images.
+        grids: The images.
         area: Area to cover; None for the sphere.
         by_owners: True if every direction must be shown by its owner, as the blend ``nearest``
-            needs; False if any image may show it.
+            needs, of one grid; False if any image may show it.
 
     Raises:
         SettingError: A direction is more than half a pixel outside the outermost pixel centers.
     """
-    found = _uncovered(grid, area, by_owners)
-    if found is None:
+    missed = _uncovered(grids, area, by_owners)
+    if missed is None:
         return
-    by_nearest = ", each direction by the view with the nearest center (blend=nearest)" * by_owners
-    raise _gap(grid.num_images, found, area, by_nearest)
-
-
-def check_joint_coverage(grids: Sequence[PinholeGrid], area: SphereArea | None = None) -> None:
-    """Refuse several grids whose images together do not cover the sphere, or an area.
-
-    Args:
-        grids: The grids.
-        area: Area to cover; None for the sphere.
-
-    Raises:
-        SettingError: A direction is in none of the images.
-    """
-    missed = _tested(grids, area, by_owners=False, on_edge=True)
-    if missed is not None:
-        raise _gap(sum(grid.num_images for grid in grids), missed, area)
+    longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
+    condition = ", each direction by the view with the nearest center (blend=nearest)" * by_owners
+    raise SettingError(
+        "views",
+        found=f"{sum(grid.num_images for grid in grids)} views that miss longitude {longitude}, "
+        f"latitude {latitude}",
+        expected=f"views that cover {'the sphere' if area is None else 'the area'}{condition}",
+        remedy="Use a larger fov or more views, or limit the views to an area.",
+    )
 
 
 def overlaps(grid: PinholeGrid, area: SphereArea | None = None) -> bool:
@@ -63,30 +57,19 @@ def overlaps(grid: PinholeGrid, area: SphereArea | None = None) -> bool:
         area: The area; None for the sphere.
     """
     borders = cell_borders(grid.centers_xyz)
-    if area is None and borders is not None and _uncovered(grid, None, by_owners=True) is None:
+    if area is None and borders is not None and _uncovered([grid], None, by_owners=True) is None:
         cells, _, middles = borders
         return bool(grid.shown(middles, on_edge=False)[np.arange(len(cells)), cells].all())
     return _tested([grid], area, by_owners=False, on_edge=False) is None
 
 
-def _gap(
-    count: int, missed: NDArray[np.float64], area: SphereArea | None, condition: str = ""
-) -> SettingError:
-    longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
-    return SettingError(
-        "views",
-        found=f"{count} views that miss longitude {longitude}, latitude {latitude}",
-        expected=f"views that cover {'the sphere' if area is None else 'the area'}{condition}",
-        remedy="Use a larger fov or more views, or limit the views to an area.",
-    )
-
-
 def _uncovered(
-    grid: PinholeGrid, area: SphereArea | None, by_owners: bool
+    grids: Sequence[PinholeGrid], area: SphereArea | None, by_owners: bool
 ) -> NDArray[np.float64] | None:
     """Return a direction that is not covered; None if all are."""
-    borders = cell_borders(grid.centers_xyz)
-    if area is None and borders is not None:
+    grid = grids[0]
+    borders = cell_borders(grid.centers_xyz) if len(grids) == 1 and area is None else None
+    if borders is not None:
         # Cells and images are convex: an image covers its cell if it covers its corners.
         cells, corners, _ = borders
         missed = ~grid.shown(corners)[np.arange(len(cells)), cells]
@@ -94,7 +77,7 @@ def _uncovered(
             return None
         if by_owners:
             return np.asarray(corners[missed.argmax()])
-    return _tested([grid], area, by_owners, on_edge=True)
+    return _tested(grids, area, by_owners, on_edge=True)
 
 
 def _tested(

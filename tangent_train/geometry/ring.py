@@ -90,7 +90,7 @@ class RingGrid(PinholeGrid):
             )
         resting = PinholeGrid(axes, (rows, columns), pitch)
         if is_complete:
-            check_coverage(resting, area, by_owners=by_owners)
+            check_coverage([resting], area, by_owners=by_owners)
         overlapping = not is_complete or overlaps(resting, area)
         super().__init__(axes, resting.size, pitch, rotation, is_overlapping=overlapping)
         vars(self).update(rings=checked)
@@ -123,8 +123,9 @@ def half_extents(fov_deg: tuple[float, float]) -> tuple[float, float]:
     Raises:
         SettingError: A field of view is out of range.
     """
-    if not all(0 < angle <= _WIDEST_DEG for angle in fov_deg):
-        raise SettingError("fov", found=list(fov_deg), expected=f"0 to {_WIDEST_DEG:g} degrees")
+    if len(fov_deg) != 2 or not all(0 < angle <= _WIDEST_DEG for angle in fov_deg):
+        expected = f"0 to {_WIDEST_DEG:g} degrees, horizontal and vertical"
+        raise SettingError("fov", found=list(fov_deg), expected=expected)
     across, down = (math.tan(math.radians(angle) / 2) for angle in fov_deg)
     return across, down
 

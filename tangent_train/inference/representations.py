@@ -23,6 +23,7 @@ from tangent_train.rendering import (
     Representation,
 )
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
+from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -116,19 +117,21 @@ class PanoramaViews:
         self.blend = self.representation.blend
         self._trained, self._fill = trained, fill or trained.fill
 
-    def __str__(self) -> str:
-        """Number and size of the views; of pinhole images also their angle and resolution."""
-        return self.described()
+    def description(self, area: Sequence[float] | None = None) -> str:
+        """Return number and size of the views; of pinhole images also their angle and resolution.
 
-    def described(self, area: Sequence[float] | None = None) -> str:
-        """Return the text of `__str__` for panoramas of an area, see `SphereArea.of`."""
+        Args:
+            area: Area that the panoramas show, see `SphereArea.of`.
+        """
         limited = self.representation.limited_to(SphereArea.of(area))
         rows, columns = limited.image_size
-        text = f"{sum(map(len, limited.view_sets()))} views of {columns} × {rows}"
+        sets = limited.view_sets()
+        text = f"{sum(map(len, sets))} views of {columns} × {rows}"
         grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
-            parts = list(dict.fromkeys(map(_described, grids)))
+            needed = (views.grid for views in sets if isinstance(views, PinholeViews))
+            parts = list(dict.fromkeys(map(_described, needed)))
             return f"{text} ({'; '.join(parts)})" if parts else text
         parts = [f"level {level}: {_described(grid)}" for level, grid in tangent.items()]
         if len(parts) > 1:

@@ -27,29 +27,29 @@ from tangent_train.results.record import Record
 from tangent_train.results.rows import Row
 from tangent_train.results.tables import Table, score_text
 
-_KEY = ("protocol", "stage", "method", "trained_on", "level", "base_level", "inputs", "source")
 _NOT_FACTS = ("about", "experiment")
 _MOST_NAMED = 3
 
 
 class Publication(NamedTuple):
-    """The lines of a method in ``published.csv``.
+    """The lines of a method in ``published.csv``; the other attributes are their common columns."""
 
-    Attributes:
-        key: Columns that all lines share.
-        lines: Lines of scores and folds.
-    """
-
-    key: Mapping[str, str]
+    protocol: str
+    stage: str
+    method: str
+    trained_on: str
+    level: str
+    base_level: str
+    inputs: str
+    source: str
     lines: Sequence[Mapping[str, str]]
 
     @property
     def name(self) -> str:
         """Name of the method, with the stage of the transfer and the training data."""
-        stage, method = self.key["stage"], self.key["method"]
-        named = [stage] if stage and method == "tangent images" else [method, stage]
-        trained = self.key["trained_on"]
-        return ", ".join(filter(None, [*named, trained and f"trained on {trained}"]))
+        method = "" if self.stage and self.method == "tangent images" else self.method
+        trained = self.trained_on and f"trained on {self.trained_on}"
+        return ", ".join(filter(None, (method, self.stage, trained)))
 
     @property
     def scores(self) -> list[float]:
@@ -62,16 +62,15 @@ class Publication(NamedTuple):
         """Folds with a score; empty for means over all folds."""
         return tuple(dict.fromkeys(line["fold"] for line in self.lines if line["fold"]))
 
-    def differences(self, record: Record) -> dict[str, tuple[str, str]]:
-        """Return the facts, published and of an evaluation, that differ."""
-        published, found = facts(self.key["protocol"]), dict(record.protocol)
-        if self.key["level"]:
-            published["level"] = self.key["level"]
-            found["level"] = str(record.settings.get("level"))
+    def differences(self, record: Record) -> tuple[str, ...]:
+        """Return the facts that differ from those of an evaluation, with both values."""
+        published, found = facts(self.protocol), dict(record.protocol)
+        if self.level:
+            published["level"], found["level"] = self.level, str(record.settings.get("level"))
         if self.folds and record.fold is not None and str(record.fold) not in self.folds:
             published["fold"], found["fold"] = ", ".join(self.folds), str(record.fold)
         pairs = {n: (published.get(n, "–"), found.get(n, "–")) for n in {**published, **found}}
-        return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+        return tuple(f"{n}: published {p}, this run {r}" for n, (p, r) in pairs.items() if p != r)
 
     def row(self, like: Record, shown: Sequence[str] = ()) -> Row:
         """Return a row with the headings and classes of an evaluation.
@@ -80,16 +79,16 @@ class Publication(NamedTuple):
             like: Evaluation.
             shown: Facts of the protocol that are columns of the tables.
         """
-        folds: dict[str, list[Mapping[str, str]]] = defaultdict(list)
+        folds: dict[str, dict[str, Mapping[str, str]]] = defaultdict(dict)
         for line in self.lines:
-            folds[line["fold"]].append(line)
-        records = tuple(_record(like, fold, lines) for fold, lines in folds.items())
-        protocol = facts(self.key["protocol"])
+            folds[line["fold"]][line["score"]] = line
+        records = tuple(_record(like, fold, by_score) for fold, by_score in folds.items())
+        protocol = facts(self.protocol)
         columns = {
             "data": protocol["data"],
-            "s": self.key["level"] or "–",
-            "input": self.key["inputs"] or "–",
-            "b": self.key["base_level"] or "–",
+            "s": self.level or "–",
+            "input": self.inputs or "–",
+            "b": self.base_level or "–",
             "folds": ", ".join(self.folds) or "–",
             **{name: protocol.get(name, "–") for name in shown},
         }
@@ -118,32 +117,18 @@ class Comparison(NamedTuple):
             transfer: True for scores of networks that were trained on other data.
             shown: Facts of the protocols that are columns of the tables.
         """
-        found: list[Publication] = []
-        others: dict[tuple[str, str], list[Publication]] = defaultdict(list)
-        nearest: dict[tuple[str, str], dict[str, tuple[str, str]]] = {}
+        groups: dict[tuple[str, ...], list[Publication]] = defaultdict(list)
         for publication in publications():
-            key = publication.key
-            on_data = [
-                r for r in records if r.protocol.get("data") == facts(key["protocol"])["data"]
-            ]
-            has_score = any(line["score"] in records[0].headings for line in publication.lines)
-            fits = key["stage"] or key["trained_on"] if transfer else not key["stage"]
-            if not (on_data and has_score and fits):
-                continue
-            differences = min((publication.differences(r) for r in on_data), key=len)
-            if differences:
-                group = key["protocol"], ", ".join(differences)
-                others[group].append(publication)
-                nearest[group] = differences
-            else:
-                found.append(publication)
-        rows = [publication.row(records[0], shown) for publication in found]
-        sources = ", ".join(dict.fromkeys(p.key["source"] for p in found))
-        notes = [f"Published scores of the same protocol: {sources}."] if found else []
-        some = sorted(others, key=lambda group: len(nearest[group]))[:_MOST_NAMED]
-        return Comparison(
-            rows, [*notes, *(_difference(others[group], nearest[group]) for group in some)]
-        )
+            stage, data = publication.stage, facts(publication.protocol)["data"]
+            on_data = [record for record in records if record.protocol.get("data") == data]
+            if on_data and (stage or publication.trained_on if transfer else not stage):
+                groups[min(map(publication.differences, on_data), key=len)].append(publication)
+        same = groups.pop((), [])
+        sources = ", ".join(dict.fromkeys(publication.source for publication in same))
+        notes = [f"Published scores of the same protocol: {sources}."] if same else []
+        nearest = sorted(groups, key=len)[:_MOST_NAMED]
+        notes += [_difference(groups[differences], differences) for differences in nearest]
+        return Comparison([publication.row(records[0], shown) for publication in same], notes)
 
     def tables(self, like: Record) -> list[Table]:
         """Return a table of the rows for one evaluation, or nothing without rows.
@@ -151,10 +136,7 @@ class Comparison(NamedTuple):
         Args:
             like: Evaluation with the headings and the fold.
         """
-        fold, rows = like.fold, self.rows
-        rows = [row.of_fold(fold) if fold and fold in row.folds else row for row in rows]
-        if not rows:
-            return []
+        rows = [row.of_fold(like.fold) if like.fold in row.folds else row for row in self.rows]
         names = [n for n in like.headings if any(r.score(n).mean is not None for r in rows)]
         cells = [
             (
@@ -165,18 +147,16 @@ class Comparison(NamedTuple):
             for row in rows
         ]
         header = ("", "input", *(like.headings[name].column for name in names))
-        return [Table("Published, same protocol", header, cells, text_columns=(0, 1))]
+        table = Table("Published, same protocol", header, cells, text_columns=(0, 1))
+        return [table] if rows else []
 
 
-def _difference(
-    publications: Sequence[Publication], differences: Mapping[str, tuple[str, str]]
-) -> str:
-    """Return a sentence on published scores of another protocol."""
-    best = max(publications, key=lambda publication: fmean(publication.scores or [0.0]))
+def _difference(group: Sequence[Publication], differences: Sequence[str]) -> str:
+    """Return a sentence on published scores with the same differences."""
+    best = max(group, key=lambda publication: fmean(publication.scores or [0.0]))
     text = ", ".join(f"{score:g}" for score in best.scores)
-    more = f" and {len(publications) - 1} more" if len(publications) > 1 else ""
-    named = "; ".join(f"{n}: published {p}, this run {r}" for n, (p, r) in differences.items())
-    return f"Not comparable: {best.name}: {text}{more} ({best.key['protocol']}). {named}."
+    more = f" and {len(group) - 1} more" if len(group) > 1 else ""
+    return f"Not comparable: {best.name}: {text}{more} ({best.protocol}). {'; '.join(differences)}."
 
 
 @cache
@@ -197,10 +177,8 @@ def publications() -> tuple[Publication, ...]:
     """Return the methods of ``published.csv``, in the order of the file."""
     groups: dict[tuple[str, ...], list[dict[str, str]]] = defaultdict(list)
     for line in published_lines():
-        groups[tuple(line[name] for name in _KEY)].append(line)
-    return tuple(
-        Publication(dict(zip(_KEY, key, strict=True)), lines) for key, lines in groups.items()
-    )
+        groups[tuple(line[name] for name in Publication._fields[:-1])].append(line)
+    return tuple(Publication._make([*key, lines]) for key, lines in groups.items())
 
 
 def published_lines() -> Iterator[dict[str, str]]:
@@ -212,17 +190,15 @@ def _read(name: str) -> str:
     return files("tangent_train.results").joinpath(name).read_text(encoding="utf-8")
 
 
-def _record(like: Record, fold: str, lines: Sequence[Mapping[str, str]]) -> Record:
-    by_score = {line["score"]: line for line in lines}
-    means = {name: _share(by_score.get(name, {}).get("mean")) for name in like.means}
-    pairs = like.class_means.items()
+def _record(like: Record, fold: str, by_score: Mapping[str, Mapping[str, str]]) -> Record:
+    def share(score: str, column: str) -> float | None:
+        percent = by_score.get(score, {}).get(column)
+        return round(float(percent) / 100, 6) if percent else None
+
     classes = [
-        {"class": c, **{name: _share(by_score.get(mean, {}).get(c)) for name, mean in pairs}}
+        {"class": c, **{name: share(mean, c) for name, mean in like.class_means.items()}}
         for c in like.class_names
     ]
+    means = {name: share(name, "mean") for name in like.means}
     settings = {"data.fold": int(fold) if fold else None}
     return Record("", 0, like.headings, means, classes, settings=settings)
-
-
-def _share(percent: str | None) -> float | None:
-    return round(float(percent) / 100, 6) if percent else None

@@ -318,7 +318,9 @@ class SegmentationTask(Task):
             classes=class_entries(columns, result.pixels, self.class_names),
             latitude_bands=[
                 {"latitude_deg": [south, north]}
-                | plain_scores(segmentation_scores(band, self.absent_class).means)
+                | plain_scores(
+                    segmentation_scores(band, self.absent_class if band.any() else "skip").means
+                )
                 for (north, south), band in bands
                 if result.solid_angle.any()
             ],

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.singleton import Singleton
 
+from tangent_train.cli import transfer_stages
 from tangent_train.errors import DataError, SettingError
+from tangent_train.results import report
 from tests.cli.rendering import Refused, render_with
 from tests.cli.tiny_runs import SETTINGS, Predict, Run, predicted, run_command, run_in
 from tests.inference.trained import write_checkpoint
@@ -19,6 +24,21 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
     """Runs a command in this process, in an empty folder."""
     monkeypatch.chdir(tmp_path)
     return partial(run_command, monkeypatch)
+
+
+@pytest.fixture
+def stages(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages of transfers, which are within Hydra, run in this process; no chart is drawn."""
+
+    def run_process(line: Sequence[str]) -> int:
+        state = Singleton.get_state()
+        GlobalHydra.instance().clear()
+        run(*line[3:])
+        Singleton.set_state(state)
+        return 0
+
+    monkeypatch.setattr(transfer_stages, "run_process", run_process)
+    monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
 
 
 @pytest.fixture

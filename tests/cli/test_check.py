@@ -46,8 +46,8 @@ def test_shares_and_classes_that_do_not_occur(root: Path, capsys: Capture) -> No
     }
     warnings = [line for line in err.splitlines() if line.startswith("Warning: ")]
     assert warnings == [
-        "Warning: No pixel for train is of 1 of 4 classes: door.",
-        "Warning: No pixel for test is of 2 of 4 classes: door, sofa.",
+        "Warning: Classes without a pixel for train: door (1 of 4).",
+        "Warning: Classes without a pixel for test: door, sofa (2 of 4).",
     ]
     assert "0 problems and 2 warnings; 3 panoramas of" in err
 
@@ -59,7 +59,7 @@ def test_classes_of_other_labels(root: Path, capsys: Capture) -> None:
     _, err = _checked(root, capsys)
     assert "Nothing is wrong" not in err
     assert "Warning: 75.0 % of the pixels for train are unknown." in err
-    assert "No pixel for train is of 3 of 4 classes: door, wall, floor." in err
+    assert "Classes without a pixel for train: door, wall, floor (3 of 4)." in err
     assert "Warning: 100.0 % of the pixels for test are unknown." in err
 
 

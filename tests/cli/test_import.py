@@ -285,7 +285,7 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         views = PanoramaViews(load_trained(here / "plain.onnx"), views=option)
         assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
     twice = PanoramaViews(trained, rotations=2, views={"option": "ring", "fov": [110, 100]})
-    assert str(twice).startswith("36 views of 32 × 32 (110° wide")
+    assert twice.description().startswith("36 views of 32 × 32 (110° wide")
 
 
 @pytest.mark.parametrize(

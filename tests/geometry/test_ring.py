@@ -162,7 +162,7 @@ def test_some_views_can_cover_a_part_of_the_sphere() -> None:
     with pytest.raises(SettingError, match="expected views that cover the area"):
         grid_of(((0, 1),), area=SphereArea(-49, 49, -39, 39))
     front = grid_of(STANDARD).subset([0, 8, 13])
-    check_coverage(front, SphereArea(-20, 20, -80, 80), by_owners=True)
+    check_coverage([front], SphereArea(-20, 20, -80, 80), by_owners=True)
     assert overlaps(front, SphereArea(-20, 20, -80, 80))
     np.testing.assert_array_equal(front.directions(), grid_of(STANDARD).directions([0, 8, 13]))
     assert front != grid_of(STANDARD).subset([0, 8, 12])

@@ -74,7 +74,7 @@ def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanorama
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("rotation", [None, 30, "so3"])
+@pytest.mark.parametrize("rotation", [None, "so3"])
 def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotation: Any) -> None:
     """At the edges, the pixels that a pixel network gets are interpolated with the fill."""
     counts, labels, views = [], [], []
@@ -190,7 +190,9 @@ def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -
 
 
 @pytest.mark.parametrize("rotation", ["none", "so3"])
-def test_batches_are_collated_and_losses_ignore_the_fill(tmp_path: Path, rotation: Any) -> None:
+def test_batches_are_collated_and_losses_ignore_the_fill(
+    tmp_path: Path, rotation: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
     task = _task("tangent", nn.Conv2d(3, 3, 1))
     task.representation = TangentRepresentation(0, 5, random_rotation=rotation)
     losses = []
@@ -204,6 +206,15 @@ def test_batches_are_collated_and_losses_ignore_the_fill(tmp_path: Path, rotatio
             float(task.loss_sum((images,), labels).detach()) / float(task.loss_norm(labels))
         )
         weights = data.class_weights("log")
+    assert capsys.readouterr().out == "", (
+        "a quarter of the area is unknown, two thirds of the sphere"
+    )
     assert losses[0] == pytest.approx(losses[1], rel=0.02)
     stored = [np.bincount(np.asarray(data.source("train").labels(k)).ravel()) for k in range(2)]
     assert torch.equal(weights, class_weights(np.sum(stored, axis=0)[1:], "log"))
+
+
+def test_the_description_has_the_kinds_of_views_that_see_the_area() -> None:
+    views = PanoramaViews(trained_network(RING), views="ring_wide")
+    assert views.description().count("° wide") == 2
+    assert views.description((-180, 180, -30, 30)).count("° wide") == 1

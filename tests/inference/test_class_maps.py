@@ -18,6 +18,7 @@ from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 import datamodules
 from datamodules.cityscapes.classes import CLASSES as CITYSCAPES
 from datamodules.cityscapes.classes import THIRTEEN
+from datamodules.core.labels import ClassSet
 from datamodules.matterport360.panoramas import CLASSES as MATTERPORT
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.stanford2d3ds.files import EIGHT
@@ -81,13 +82,20 @@ def test_a_map_names_published_classes(name: str) -> None:
     assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
 
 
-@pytest.mark.parametrize("data", [datamodules.Cityscapes, datamodules.SynPASS])
-def test_a_map_to_13_classes_maps_a_network_as_the_labels(data: Any) -> None:
-    labels = data.class_sets["13"]
-    names = f"{data.__name__.lower()}_to_densepass13"
-    mapped = map_classes(_trained(labels.of), load_class_map(names))
+@pytest.mark.parametrize(
+    ("name", "labels"),
+    [
+        ("cityscapes_to_densepass13", datamodules.Cityscapes.class_sets["13"]),
+        ("synpass_to_densepass13", datamodules.SynPASS.class_sets["13"]),
+        ("stanford2d3ds_to_span8", datamodules.Stanford2D3DS.class_sets["8"]),
+        ("structured3d_to_span8", datamodules.Structured3D.class_sets["8"]),
+    ],
+)
+def test_a_map_maps_a_network_as_a_set_of_classes_the_labels(name: str, labels: ClassSet) -> None:
+    mapped = map_classes(_trained(labels.of), load_class_map(name))
     key = labels.key[1 : 1 + len(labels.of)].tolist()
-    groups = [[k for k, to in enumerate(key) if to == label] for label in (*range(1, 14), 0)]
+    order = (*range(1, 1 + len(labels.names)), 0)
+    groups = [[k for k, to in enumerate(key) if to == label] for label in order]
     assert mapped.trained.groups == groups
 
 

@@ -89,6 +89,7 @@ def test_csv_and_markdown_hold_the_same_scores(tmp_path: Path) -> None:
     assert "| wall | 60.0 | 90.0 | 60.0 | 90.0 | 50.0 | floor | 10.0 |" in text
     assert "| mean | 35.2 | 46.7 | 35.2 | 46.7 |  |  |  |" in text
     assert "| 0° … 30° | 35.2 | 46.7 |" in text
+    assert "| 30° … 60° | – | – |" in text, "without a labeled pixel"
 
 
 def test_classes_of_no_pixel_are_left_out_of_the_table() -> None:

@@ -107,6 +107,16 @@ def test_a_single_differing_fact_is_named_and_nothing_stands_beside(name: str) -
     assert 1 <= len(others) <= 2
 
 
+def test_published_scores_stand_with_their_own_differences() -> None:
+    """Scores of one protocol at levels 5 and 7 differ from a run at level 6 in other ways."""
+    record = made_record([0.5] * 13, REAL, protocol=PROTOCOL, level=6)
+    five, seven, _ = Comparison.of([record]).notes
+    assert five.startswith("Not comparable: Zhang et al.: 43.3 and 3 more (paper_512). level: ")
+    assert seven.endswith(
+        "tangent images: 44.9 and 2 more (paper_512). level: published 7, this run 6."
+    )
+
+
 def test_a_fold_without_a_published_score_is_named() -> None:
     protocol = facts("stanford2d3ds_trans4pass")
     record = made_record([0.5] * 13, REAL, protocol=protocol, data__fold=2)

@@ -22,7 +22,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.geometry.area_views import best_views, views_of_area
-from tangent_train.geometry.coverage import check_joint_coverage
+from tangent_train.geometry.coverage import check_coverage
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
@@ -181,7 +181,7 @@ class PinholeRepresentation:
         """Return all images of every level in every rotation."""
         rotated = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
         for grids in rotated if self._is_partial else ():
-            check_joint_coverage(grids, self._area)
+            check_coverage(grids, self._area)
         of_rotations = (zip(grids, self._needed(grids), strict=True) for grids in rotated)
         pairs = [pair for of_grid in zip(*of_rotations, strict=True) for pair in of_grid]
         if self._area is not None:

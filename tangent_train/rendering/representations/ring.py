@@ -10,7 +10,7 @@ import numpy as np
 
 from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import PinholeGrid, RingGrid, SphereArea, TangentGrid
-from tangent_train.geometry.coverage import check_joint_coverage
+from tangent_train.geometry.coverage import check_coverage
 from tangent_train.geometry.ring import checked_rings, half_extents
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend
@@ -82,7 +82,7 @@ class RingRepresentation(PinholeRepresentation):
         how = {"by_owners": blend == "nearest", "is_complete": len(by_fov) == 1}
         grids = [RingGrid(part, of, size, None, covered, **how) for of, part in by_fov.items()]
         if len(grids) > 1:
-            check_joint_coverage(grids, covered)
+            check_coverage(grids, covered)
         super().__init__(
             min(grids, key=lambda grid: grid.num_images),
             grids,
@@ -108,8 +108,8 @@ class RingRepresentation(PinholeRepresentation):
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:
-    across, *rest = [fov] if isinstance(fov, int | float) else fov
-    return across, rest[0] if rest else across
+    pair: Any = (fov, fov) if isinstance(fov, int | float) else tuple(fov)
+    return pair  # checked by `half_extents`
 
 
 def ring_size(

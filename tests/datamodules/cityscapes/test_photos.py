@@ -35,18 +35,13 @@ def photos(root: Path, representation: Any = CROPS, **settings: Any) -> Cityscap
     return Cityscapes(root, representation, **settings)
 
 
-@pytest.mark.parametrize("classes", [19, 13])
-def test_every_id_has_its_published_class(shared: Path, classes: int) -> None:
-    data = photos(shared, classes=classes)
+def test_every_id_has_its_published_class(shared: Path) -> None:
+    data = photos(shared)
     labels = data.source("test").read(0).labels
     ids = read_png(next(shared.glob("gtFine/val/lindau/*0_gtFine_labelIds.png")))
     assert set(np.unique(ids)) == set(streets.IDS)
     names = {c.id: c.name for c in Published.classes if not c.ignore_in_eval}
-    if classes == 13:
-        cars = ("truck", "bus", "motorcycle", "bicycle")
-        names |= {k: "car" for k, name in names.items() if name in cars}
-        names = {k: n.replace("rider", "person") for k, n in names.items() if n != "train"}
-    assert len(set(names.values())) == classes == data.num_classes
+    assert len(set(names.values())) == data.num_classes == 19
     for number in streets.IDS:
         expected = data.class_names.index(names.get(number, "unknown"))
         assert set(labels[ids == number]) == {expected}
@@ -82,7 +77,7 @@ def test_a_check_counts_and_finds_strays_and_missing_labels(root: Path) -> None:
     assert count == 3
     assert [problem.file for problem in problems.listed()] == [str(missing)]
     assert sorted(problems.warnings) == [
-        "found 3 train, 1 test; published are 2975 train, 500 test",
+        "found 3 train, 1 val; published are 2975 train, 500 val",
         f"label images: 1 without an image, e.g. {root}/gtFine/train/ulm/ulm_9_gtFine_labelIds.png",
     ]
 
@@ -117,8 +112,6 @@ def test_without_camera_files_a_field_of_view_is_needed(root: Path) -> None:
         photos(root).setup()
     matrix = photos(root, fov=48.7).source("test").read(0).camera_matrix
     np.testing.assert_allclose(np.rad2deg(2 * np.arctan(64 / matrix[0, 0])), 48.7)
-    with pytest.raises(SettingError, match=r"data\.fov: found 180"):
-        photos(root, fov=180)
 
 
 @pytest.mark.parametrize(

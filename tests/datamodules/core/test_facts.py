@@ -56,13 +56,13 @@ def test_a_class_of_another_package_has_its_module_and_its_settings(
     assert (facts["renamed"], facts["unknown"]) == ("yes", "labels")
 
 
-@pytest.mark.parametrize(("area", "left_out"), [("5a", {"left_out": "1"}), ("1", {})])
+@pytest.mark.parametrize(("area", "images"), [("5a", {"images": "4 of 5"}), ("1", {})])
 def test_broken_test_panoramas_that_are_left_out_are_a_fact(
-    area: str, left_out: dict[str, str], tmp_path: Path, erp: Any
+    area: str, images: dict[str, str], tmp_path: Path, erp: Any
 ) -> None:
     root = fabricate(tmp_path)
     next((root / f"area_{area}/pano/rgb").iterdir()).write_bytes(b"broken")
     data = Stanford2D3DS(root, erp, skip_broken=True)
     facts = data.facts
     data.prepare_data()
-    assert data.facts == facts | left_out
+    assert data.facts == facts | images

@@ -9,13 +9,24 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules import (
+    Cityscapes,
+    DensePASS,
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    SynPASS,
+)
 from datamodules.core.image_module import ImageDataModule
 from tangent_train.errors import SettingError
 from tests.conftest import fabricate
 
+STREETS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 11, 12, 12, 12, -1, 12, 12]
+SYNPASS = [2, 4, -1, 11, 5, 0, 0, 1, 8, 12, 3, 7, 10, -1, -1, -1, -1, 6, -1, -1, -1, 9]
 PUBLISHED: list[tuple[type[ImageDataModule], str, list[int]]] = [
     (Stanford2D3DS, "8", [-1, -1, -1, 0, 1, -1, -1, 2, 3, 4, 5, 6, 7]),
+    (Cityscapes, "13", STREETS),
+    (DensePASS, "13", STREETS),
+    (SynPASS, "13", SYNPASS),
 ]
 
 

@@ -241,5 +241,5 @@ def test_labels_of_other_classes_are_warned_of_in_training(
     assert module.class_weights("log")[1] == 0
     assert capsys.readouterr().out == (
         "Warning: 62.5 % of the pixels for train are unknown.\n"
-        "Warning: No pixel for train is of 1 of 2 classes: door.\n"
+        "Warning: Classes without a pixel for train: door (1 of 2).\n"
     )

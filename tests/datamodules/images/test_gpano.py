@@ -320,20 +320,11 @@ def test_edges_are_at_the_angles(seed: int) -> None:
     assert (cut == image).mean() > 0.98
 
 
-@pytest.mark.parametrize(
-    ("angles", "message"),
-    [
-        ((-180, 180, -90), r"found \[-180, 180, -90\]; expected \[west,east,south,north\]"),
-        ((0, 181, -90, 90), "expected .*−180 to 180"),
-        ((0, 90, 20, 20), "south below north"),
-        ((180, -180, 0, 10), "east other than west"),
-        ((0, 40, 0, 10), r"pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square"),
-        ((0, 40, 0, 10), r"make them square: 40\.00° high, e\.g\. -20\.00 to 20\.00"),
-    ],
-)
-def test_impossible_areas_are_refused(angles: tuple[float, ...], message: str) -> None:
-    with pytest.raises(SettingError, match=f"area: found .*{message}|{message}"):
-        area_of_angles((100, 100), angles)
+def test_pixels_that_are_not_square_are_refused() -> None:
+    message = r"area: found .*pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square: "
+    message += r"40\.00° high, e\.g\. -20\.00 to 20\.00"
+    with pytest.raises(SettingError, match=message):
+        area_of_angles((100, 100), (0, 40, 0, 10))
 
 
 # Pose

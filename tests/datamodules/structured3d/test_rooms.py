@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,7 @@ import pytest
 
 from datamodules import Structured3D, Structured3DPerspective
 from datamodules.structured3d.classes import CLASS_SETS, CLASSES
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import names_of, read_png, write_png
 from tests.datamodules.structured3d.structured3d_format import (
@@ -120,9 +119,6 @@ def test_both_sets_are_read_and_stored(root: Path, erp: Any, tmp_path: Path) -> 
     np.testing.assert_array_equal(after[same], before[same])
 
 
-# Files and settings that are refused.
-
-
 def test_broken_files_are_refused(tmp_path: Path, erp: Any) -> None:
     with pytest.raises(DataError, match=r"no panoramas of scene_.*Request Structured3D"):
         Structured3D(tmp_path, erp).setup()
@@ -141,14 +137,3 @@ def test_broken_files_are_refused(tmp_path: Path, erp: Any) -> None:
     photos = Structured3DPerspective(root, PerspectiveRepresentation(level=4, fov_deg=40))
     with pytest.raises(DataError, match=r"1/camera_pose\.txt.*half angles of view in radians"):
         photos.setup()
-
-
-@pytest.mark.parametrize(
-    ("setting", "value", "expected"),
-    [("configuration", "simple", "full or empty"), ("lighting", "raw", "rawlight or")],
-)
-def test_other_settings_are_refused(setting: str, value: Any, expected: str) -> None:
-    with pytest.raises(
-        SettingError, match=re.escape(f"data.{setting}: found {value}; expected {expected}")
-    ):
-        Structured3DPerspective(Path(), **{setting: value})

@@ -186,6 +186,11 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (RingRepresentation, {"faces_per_panorama": 19}, "found 19; expected 1 to 18"),
         (RingRepresentation, {"dim": [32]}, r"dim: found \[32\]"),
         (RingRepresentation, {"fov": 180}, r"fov: found \[180, 180\]; expected 0 to 170"),
+        (
+            RingRepresentation,
+            {"fov": [90, 90, 80]},
+            r"fov: found \[90, 90, 80\]; expected 0 to 170",
+        ),
         (RingRepresentation, {"rings": []}, r"rings: found \[\]; expected one ring"),
         (RingRepresentation, {"rings": [{"pitch": 91, "views": 8}]}, "pitch: -90 to 90"),
         (RingRepresentation, {"rings": [{"pitch": math.nan, "views": 8}]}, "'pitch': nan"),

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.conftest import rooms, run, run_folder  # noqa: F401 - fixtures
+from tests.cli.conftest import rooms, run, run_folder, stages  # noqa: F401 - fixtures
 
 _PLAIN = """
 _target_: torch.nn.Conv2d

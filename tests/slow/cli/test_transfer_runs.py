@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
+from datamodules.cityscapes.classes import CLASSES
+from tangent_train.results.published import facts
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
-from tests.cli.tiny_runs import Run
+from tests.cli.tiny_runs import Run, results
+from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
 
@@ -74,3 +78,28 @@ def test_classes_and_cameras_are_compared_before_training(tmp_path: Path, run: R
     message = r"stage P: my_photos/images/scene_1/new\.png: found no K in cameras\.json"
     with pytest.raises(SystemExit, match=message):
         run("transfer", *_SETTINGS)
+
+
+@pytest.mark.usefixtures("stages")
+def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_path: Path) -> None:
+    """Cityscapes to DensePASS with 13 classes, without training."""
+    from tests.inference.photo_networks import huggingface_networks as networks
+
+    panoramas = write_densepass(tmp_path / "panoramas", names=(1,))
+    photos = write_cityscapes(tmp_path / "photos")
+    size = {"height": 32, "width": 32}
+    networks.saved(partial(networks.segformer, CLASSES), tmp_path / "segformer", size=size)
+    run("import", "network=huggingface", "model=segformer", "output=segformer.ckpt")
+    experiment = "field/cityscapes_densepass_13"
+    arguments = [f"experiment={experiment}", "checkpoint=segformer.ckpt", "level=6"]
+    arguments += [f"data.root={panoramas}", f"photos.data.root={photos}", "panels=0"]
+    arguments += ["data.num_workers=0", "photos.data.num_workers=0", "trainer.accelerator=cpu"]
+    run("transfer", *arguments, "class_map=cityscapes_to_densepass13")
+    folder = tmp_path / "runs" / "transfer" / experiment / "seed_0"
+    assert {path.name for path in folder.iterdir()} == {"P", "S"}
+    assert not list(folder.glob("*/checkpoints"))
+    found = results(folder / "S")
+    assert found["protocol"] == facts("densepass_13") | {"size": "256 × 128"}
+    assert found["class_map"] == "cityscapes_to_densepass13"
+    report = (folder.parent / "transfer.md").read_text()
+    assert "Trans4PASS+ (S), trained on Cityscapes: 51.4 and" in report
