@@ -32,7 +32,7 @@ class SphereArea:
         SettingError: The angles are not those of an area, or the matrix is not a rotation.
 
     >>> area = SphereArea(-180, 180, -30, 30)
-    >>> area.share
+    >>> round(area.share, 4)
     0.5
     >>> area.contains([[1, 0, 0], [0, 0, 1]]).tolist()
     [True, False]
