@@ -254,7 +254,7 @@ def test_earlier_projects_are_kept_without_overwrite(
     tan = project.parent / "tan"
     render_with(input=project.parent, output=tan, base_level=0)
     assert {*tan.rglob("cameras.json")} == {
-        tan / n / "room/cameras.json" for n in ("hall", "kitchen")
+        tan / "in" / n / "room/cameras.json" for n in ("hall", "kitchen")
     }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from tests.cli.test_help import COMMANDS, CONFIGS, OPTIONS, explained
+from tests.running import command_of
 
 CHOICES = [
     ("train", f"{path.parent.name}={path.stem}")
@@ -15,8 +16,7 @@ CHOICES = [
 CHOICES += [("keypoints", f"data={path.stem}") for path in OPTIONS if path.stem.endswith("_pairs")]
 for experiment in sorted((CONFIGS / "experiment").rglob("*.yaml")):
     name = experiment.relative_to(CONFIGS / "experiment").with_suffix("").as_posix()
-    is_transfer = "transfer" in name or name == "zero_shot"
-    CHOICES.append(("transfer" if is_transfer else "train", f"experiment={name}"))
+    CHOICES.append((command_of(name), f"experiment={name}"))
 
 
 @pytest.mark.parametrize("command", [path.stem for path in COMMANDS])
