@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,10 @@ def check_coverage(
     Raises:
         SettingError: A direction is more than half a pixel outside the outermost pixel centers.
     """
-    missed = _uncovered(grids, area, by_owners)
+    if area is None or area.rotation is None:  # the same for every panorama
+        missed = _uncovered_at_rest((*grids,), None if area is None else area.angles, by_owners)
+    else:
+        missed = _uncovered(grids, area, by_owners)
     if missed is None:
         return
     longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
@@ -61,6 +65,13 @@ def overlaps(grid: PinholeGrid, area: SphereArea | None = None) -> bool:
         cells, _, middles = borders
         return bool(grid.shown(middles, on_edge=False)[np.arange(len(cells)), cells].all())
     return _tested([grid], area, by_owners=False, on_edge=False) is None
+
+
+@lru_cache(maxsize=64)
+def _uncovered_at_rest(
+    grids: tuple[PinholeGrid, ...], angles: tuple[float, ...] | None, by_owners: bool
+) -> NDArray[np.float64] | None:
+    return _uncovered(grids, None if angles is None else SphereArea.of(angles), by_owners)
 
 
 def _uncovered(
