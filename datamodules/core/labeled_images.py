@@ -70,5 +70,7 @@ class LabeledImages(Dataset[LabeledImage]):
                 rotation = transform.rotation(index)
                 pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
         distance_m = None if image.depth is None else steps_to_meters(image.depth)
-        matrix, area = (getattr(image, name, None) for name in ("camera_matrix", "area"))
-        return LabeledImage(files.name, image.rgb, image.labels, distance_m, pose, matrix, area)
+        matrix = getattr(image, "camera_matrix", None)
+        return LabeledImage(
+            files.name, image.rgb, image.labels, distance_m, pose, matrix, image.area
+        )

@@ -289,6 +289,7 @@ class Photo(NamedTuple):
         labels: ``(H, W)`` uint8, 0 where unknown.
         camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
         up: None; the up direction of a photo is unknown.
+        area: None; a photo has no area of the sphere.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -298,6 +299,7 @@ class Photo(NamedTuple):
     labels: NDArray[np.uint8]
     camera_matrix: NDArray[np.float64]
     up: None = None
+    area: None = None
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
         """Return the sampler of its crops, which depend on its camera."""

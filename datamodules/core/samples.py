@@ -127,7 +127,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
         target = torch.tensor(image.target(self.representation))
-        area = torch.from_numpy((getattr(image, "area", None) or _WHOLE).numbers)
+        area = torch.from_numpy((image.area or _WHOLE).numbers)
         return EvaluationSample(images, target, torch.from_numpy(rotation), area, index)
 
 

@@ -24,11 +24,8 @@ from tangent_train.rendering.checks import Blend, check_choice
 from tangent_train.rendering.forward import Interpolation, Pixels, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
-from tangent_train.rendering.representations.views import RotationAugmentation, Views
+from tangent_train.rendering.representations.views import STRIDE, RotationAugmentation, Views
 from tangent_train.rendering.resampling import resize
-
-_STRIDE = 32
-"""Parts of panoramas have a multiple of this many rows and columns: the stride of most networks."""
 
 _FINE_ROWS = 128
 
@@ -229,7 +226,7 @@ def _resting_window(area: SphereArea, rows: int) -> Window:
     edges[1, 1] = edges[0, 1] + area.width_deg
     start, stop = np.round(edges * rows / 180).astype(int)
     needed = np.maximum(stop - start, 1)
-    multiple = math.gcd(rows, _STRIDE)
+    multiple = math.gcd(rows, STRIDE)
     height, width = np.minimum(-(-needed // multiple) * multiple, (rows, 2 * rows)).tolist()
     top, first = (start - ((height, width) - needed) // 2).tolist()
     top = min(max(top, 0), rows - height)
@@ -246,7 +243,7 @@ def _rotated_window(area: SphereArea, rows: int, size: tuple[int, int] | None) -
     """
     step = max((k for k in range(1, rows // _FINE_ROWS + 1) if rows % k == 0), default=1)
     seen = area.contains(equirect_directions((rows // step, 2 * rows // step)))
-    multiple, runs = math.gcd(rows, _STRIDE), []
+    multiple, runs = math.gcd(rows, STRIDE), []
     for axis, mode in enumerate(("constant", "wrap")):
         counts = seen.sum(axis=1 - axis)
         # Cells beside those whose center is in the area may contain a bit of it.

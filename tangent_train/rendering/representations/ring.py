@@ -15,10 +15,11 @@ from tangent_train.geometry.ring import checked_rings, half_extents
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
-from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
-
-_STRIDE = 32
-"""Rows are a multiple of this where columns are: the stride of most networks."""
+from tangent_train.rendering.representations.views import (
+    STRIDE,
+    PinholeViews,
+    RotationAugmentation,
+)
 
 
 @registered
@@ -142,5 +143,5 @@ def ring_size(
         step = 2 ** max(0, level - 2)
         dim = max(1, round(2 * across / TangentGrid(0, level).pitch / step)) * step
     columns = at_least("dim", dim, 2)
-    multiple = math.gcd(columns, _STRIDE)
+    multiple = math.gcd(columns, STRIDE)
     return math.ceil(columns * down / across / multiple - 1e-9) * multiple, columns

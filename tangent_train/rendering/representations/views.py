@@ -26,6 +26,9 @@ from tangent_train.rendering.tables import canvas_geometry, find_owned_spans, ow
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
 
+STRIDE = 32
+"""The stride of most networks: sides of views are multiples of it where they can be chosen."""
+
 NO_RAYS: NDArray[np.float32] = np.empty((0, 3, 3), np.float32)
 """The rays of views that are not pinhole images of a sphere."""
 
