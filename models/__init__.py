@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+    from models.icocnn import IcoCNN as IcoCNN
     from models.initialization import initialize as initialize
     from models.shape_classifier import ShapeClassifier as ShapeClassifier
     from models.sphere_attention import SphereAttention as SphereAttention
@@ -23,6 +24,7 @@ _FILES = {
     "FCNResNet": "fcn_resnet",
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
+    "IcoCNN": "icocnn",
     "ShapeClassifier": "shape_classifier",
     "SphereAttention": "sphere_attention",
     "SphereContext": "sphere_context",
