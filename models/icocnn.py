@@ -15,6 +15,7 @@ from torch.nn.functional import conv2d, linear
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import MAX_LEVEL, icosphere
+from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
 from tangent_train.registry import registered
 
 _CORNERS = 12
@@ -181,7 +182,7 @@ class GaugeConv(_OnAtlas):
     ) -> None:
         super().__init__(level, "padded", "pixels", "ring")
         if given == 1:
-            self.padded = self.padded[:1] % (10 * 4**level + 2)
+            self.padded = self.padded[:1] % icosphere_count(level)
         self.returned, bound = returned, (in_channels * given * 7) ** -0.5
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, given, 7))
         self.bias = nn.Parameter(torch.empty(out_channels))
@@ -273,6 +274,7 @@ class IcoCNN(nn.Module):
             raise SettingError(
                 "network.widths", found=list(widths), expected=f"1 to {level + 1} at level {level}"
             )
+        self.level = level
         self.stem = nn.Sequential(
             GaugeConv(in_channels, widths[0], level, given=1),
             nn.BatchNorm2d(widths[0]),
@@ -293,7 +295,12 @@ class IcoCNN(nn.Module):
     def forward(
         self, signals: Float[Tensor, "batch channels 1 vertices"]
     ) -> Float[Tensor, "batch classes 1 vertices"]:
-        """Return scores of every vertex."""
+        """Return scores of every vertex.
+
+        Raises:
+            SettingError: The input is not a signal on the vertices of the network's level.
+        """
+        check_signal(signals.shape, self.level)
         skips = [self.stem(signals)]
         for down in self.downs:
             skips.append(down(skips[-1]))
