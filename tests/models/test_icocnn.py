@@ -13,6 +13,7 @@ from models.icocnn import GaugeConv, atlas
 from studies.rotation_error import icosahedral_rotations, vertices_after
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere
+from tangent_train.geometry.icosphere_signals import icosphere_directions
 
 
 def _signals(level: int) -> Tensor:
@@ -74,23 +75,21 @@ def test_a_filter_is_applied_to_the_neighbors_in_cyclic_order(level: int) -> Non
 
 @pytest.mark.parametrize("level", [1, 3])
 def test_new_vertices_are_between_their_parents(level: int) -> None:
-    vertices = icosphere(level).vertices
-    directions = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
+    directions = icosphere_directions(level)
     coarse = 10 * 4 ** (level - 1) + 2
     parents = atlas(level)["parents"][0].numpy() % coarse
     middle = directions[parents].sum(axis=0)
     _, nearest = cKDTree(directions).query(middle / np.linalg.norm(middle, axis=1, keepdims=True))
-    assert np.array_equal(nearest, np.arange(coarse, len(vertices)))
+    assert np.array_equal(nearest, np.arange(coarse, len(directions)))
 
 
 def test_every_parameter_learns_and_another_signal_is_refused() -> None:
     network = IcoCNN(3, 5, 2, (2, 3, 4))
     network(_signals(2)).square().sum().backward()
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
-    assert not [
-        name
-        for name, _ in network.named_buffers()
-        if name in network.state_dict() and "running" not in name and "tracked" not in name
-    ]
+    names = {name.rpartition(".")[2] for name in network.state_dict()}
+    assert names == {"weight", "bias", "running_mean", "running_var", "num_batches_tracked"}
+    with pytest.raises(SettingError, match="vertices of the icosphere of level 3"):
+        network(_signals(3))
     with pytest.raises(SettingError, match="1 to 3 at level 2"):
         IcoCNN(3, 5, 2, (2, 3, 4, 5))
