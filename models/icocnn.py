@@ -60,9 +60,9 @@ def _charts(level: int) -> _Indices:
 
 
 def _neighbors(level: int) -> tuple[_Indices, _Indices]:
-    """Return ``(V, 6)`` neighbors of vertices, and the turns of their frames.
+    """Return ``(V, 6)`` neighbors of vertices, and the shifts of their frames.
 
-    Orientation k at a vertex is orientation k + turn at its neighbor, transported along the edge.
+    Orientation k at a vertex is orientation k + shift at its neighbor, transported along the edge.
     The sixth neighbor of a corner repeats the first. Values at corners do not depend on the
     orientation.
     """
@@ -71,10 +71,10 @@ def _neighbors(level: int) -> tuple[_Indices, _Indices]:
     neighbors = np.empty((len(vertices), 6), np.int64)
     neighbors[charts[:, 1:, :-1], 0] = charts[:, 1:, 1:]
     neighbors[[0, _CORNERS - 1], 0] = charts[0, 0, 1], charts[0, -1, -2]
-    own = np.arange(len(vertices))
+    here = np.arange(len(vertices))
     for k in range(5):
-        neighbors[:, k + 1] = following(own, neighbors[:, k])
-    back = (neighbors[neighbors] == own[:, None, None]).argmax(axis=-1)
+        neighbors[:, k + 1] = following(here, neighbors[:, k])
+    back = (neighbors[neighbors] == here[:, None, None]).argmax(axis=-1)
     return neighbors, (back + 3 - np.arange(6)) % 6
 
 
@@ -93,21 +93,21 @@ def atlas(level: int) -> dict[str, Tensor]:
         ``pooled``: ``(6, 7, V′)`` vertices of the next coarser level and their neighbors.
         ``parents``: ``(6, 2, V″)`` vertices of the next coarser level beside each new vertex.
     """
-    neighbors, turns = _neighbors(level)
+    neighbors, shifts = _neighbors(level)
     count, fewer = len(neighbors), (len(neighbors) + 6) // 4 if level else 0
     pixels = _charts(level)[:, 1:, :-1]
     _, height, width = pixels.shape
 
-    def indices(vertices: _Indices, turn: _Indices, total: int = count) -> Tensor:
+    def indices(vertices: _Indices, shift: _Indices, total: int = count) -> Tensor:
         orientations = np.arange(6).reshape(6, *[1] * vertices.ndim)
-        return torch.from_numpy((orientations + turn) % 6 * total + vertices)
+        return torch.from_numpy((orientations + shift) % 6 * total + vertices)
 
     padded = np.zeros((2, 5, height + 2, width + 2), np.int64)
     padded[0, :, 1:-1, 1:-1] = pixels
     inside = pixels >= _CORNERS
     for k, (down, across) in enumerate(_STEPS):
         part = padded[:, :, 1 + down :, 1 + across :][:, :, :height, :width]
-        part[:, inside] = neighbors[pixels[inside], k], turns[pixels[inside], k]
+        part[:, inside] = neighbors[pixels[inside], k], shifts[pixels[inside], k]
     places = np.arange(5 * (height + 2) * width).reshape(5, height + 2, width)[:, :height]
     kept, new = np.arange(fewer), np.arange(fewer, count if level else 0)
     first = (neighbors[new, :3] < fewer).argmax(axis=-1)
@@ -117,9 +117,9 @@ def atlas(level: int) -> dict[str, Tensor]:
         "pixels": torch.from_numpy(places.ravel()[np.argsort(pixels.ravel())][_CORNERS - 2 :]),
         "ring": torch.from_numpy(neighbors[:_CORNERS, :5]),
         "pooled": indices(
-            np.vstack([kept, neighbors[kept].T]), np.vstack([0 * kept, turns[kept].T])
+            np.vstack([kept, neighbors[kept].T]), np.vstack([0 * kept, shifts[kept].T])
         ),
-        "parents": indices(neighbors[ends], turns[ends], fewer),
+        "parents": indices(neighbors[ends], shifts[ends], fewer),
     }
 
 
@@ -188,7 +188,7 @@ class GaugeConv(_OnAtlas):
         self.bias = nn.Parameter(torch.empty(out_channels))
         for parameter in (self.weight, self.bias):
             nn.init.uniform_(parameter, -bound, bound)
-        rotated = _rotated_filters(given).unflatten(2, (returned, -1)).mean(dim=3)
+        rotated = _rotated_filters(given).reshape(given, 7, returned, -1, given, 3, 3).mean(dim=3)
         self.register_buffer("rotated", rotated, persistent=False)
 
     def forward(self, x: Tensor) -> Tensor:

@@ -65,8 +65,8 @@ def test_a_filter_is_applied_to_the_neighbors_in_cyclic_order(level: int) -> Non
             )
             start = 0
         else:
-            turns = np.stack([np.roll(ring, -k) for k in range(6)])
-            expected = weight[0] * values[vertex] + turns @ weight[1:] + bias
+            rotated = np.stack([np.roll(ring, -k) for k in range(6)])
+            expected = weight[0] * values[vertex] + rotated @ weight[1:] + bias
             start = int(np.abs(expected - found[0, vertex]).argmin())
         np.testing.assert_allclose(found[:, vertex], np.roll(expected, -start), rtol=0, atol=1e-12)
         starts.add(start)
