@@ -10,6 +10,7 @@ from scipy import sparse
 
 from models.mapped import Table
 from tangent_train.geometry import icosphere
+from tangent_train.geometry.gnomonic_taps import tangent_axes
 from tangent_train.registry import registered
 
 _LEVELS = 9
@@ -64,3 +65,72 @@ def mesh_operators(level: int) -> Table:
     ]
     identity = sparse.eye_array(len(points), format="csr")
     return Table.of_operators([identity, *map(assembled, (laplacian, *derivatives))])
+
+
+@registered
+@lru_cache(_LEVELS)
+def hexagonal_rings(level: int) -> Table:
+    """Return the seven rows of HexConv (Zhang et al. 2019, section 3.2): a vertex and its ring.
+
+    The ring starts in the north and continues counterclockwise, as seen from outside. Its row k is
+    α x[n_k] + (1 − α) x[n_(k+1)] for the neighbors n of the vertex, of which n_0 and n_1 enclose
+    the north; α is the share of their angle between n_1 and the north. The convolution is the
+    paper's α (W¹ * x) + (1 − α) (W² * x), where W² has the ring of W¹ shifted by one.
+
+    The paper leaves out the poles, and pads the ten other vertices with five neighbors. Here, six
+    rows divide the ring of five evenly. A pole has no north: its six rows are the mean of the ring.
+
+    Args:
+        level: Level s of the icosphere.
+    """
+    vertices, faces = icosphere(level)
+    origin, neighbor = faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2).T
+    axes = tangent_axes(vertices)[origin, :2]
+    bearing = np.arctan2(*np.einsum("nij,nj->in", axes, vertices[neighbor])) % (2 * np.pi)
+    order = np.lexsort((bearing, origin))
+    origin, neighbor, bearing = origin[order], neighbor[order], bearing[order]
+
+    valence = np.bincount(origin)
+    end = valence.cumsum()
+    start = end - valence
+    before = 2 * np.pi - bearing[end - 1]  # from the last neighbor to the north
+    north = valence - 1 + before / (before + bearing[start])
+    is_pole = np.hypot(*vertices[:, :2].T) < 1e-9
+    at_pole, of_pole = origin[is_pole[origin]], neighbor[is_pole[origin]]
+    inside = np.flatnonzero(~is_pole)
+    start, valence = start[inside], valence[inside]
+    operators = [sparse.eye_array(len(vertices), format="csr")]
+    for k in range(6):
+        share, first = np.modf(north[inside] + k * valence / 6)
+        ends = [neighbor[start + (first.astype(np.int64) + i) % valence] for i in (0, 1)]
+        values = np.concatenate([1 - share, share, np.full(len(of_pole), 1 / 5)])
+        entries = np.concatenate([inside, inside, at_pole]), np.concatenate([*ends, of_pole])
+        operators.append(sparse.coo_array((values, entries), operators[0].shape).tocsr())
+    return Table.of_operators(operators)
+
+
+@registered
+@lru_cache(_LEVELS)
+def face_neighbors(level: int) -> Table:
+    """Return the ten rows of SpherePHD (Lee et al. 2019, figure 5), for signals on faces.
+
+    They are a face, the three faces across its edges, and the six next to these, in the order of
+    the corners. Corner 0 points to the north in the upward faces of the unfolded icosahedron, to
+    the south in the downward ones: their order is that of the upward ones turned by 180°. Around a
+    vertex with five faces, the ten faces are different too.
+
+    Args:
+        level: Level s of the icosphere.
+    """
+    faces = icosphere(level).faces
+    count = len(faces)
+    edges = faces[:, [[1, 2], [2, 0], [0, 1]]].reshape(-1, 2)  # opposite to corners 0, 1, 2
+    code, reverse = edges @ [count, 1], edges @ [1, count]
+    order = code.argsort()
+    across = order[np.searchsorted(code, reverse, sorter=order)]
+    # Corner 0 of the icosahedron's faces 5 to 9 lies on their upper edge.
+    top = np.repeat([0, 1, 0], [count // 4, count // 4, count // 2])
+    start = across[3 * np.arange(count)[:, None] + (top[:, None] + np.arange(3)) % 3]
+    sides = start[:, :, None] // 3 * 3 + (start[:, :, None] + [1, 2]) % 3
+    rows = np.arange(count)[:, None], start // 3, across[sides].reshape(count, 6) // 3
+    return Table.of_entries(np.concatenate(rows, axis=1)[..., None], np.ones(1), count)
