@@ -8,73 +8,84 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from tangent_train.errors import SettingError, width_height
 from tangent_train.geometry.icosphere import MAX_LEVEL, icosphere
 
-IcosphereCells = Literal["vertices", "faces"]
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+IcosphereElements = Literal["vertices", "faces"]
 """A signal has a value at every vertex or on every face."""
 
 _CHUNK = 2**16
 """Number of directions that are located at once."""
 
-_CELLS_KEPT = 2
+_KEPT = 2
 """Number of signals whose sampling points are kept in memory; 190 MB each at level 8."""
 
 
-def icosphere_count(level: int, on: IcosphereCells = "vertices") -> int:
+def icosphere_count(level: int, elements: IcosphereElements = "vertices") -> int:
     """Return the number of values of a signal.
 
     >>> icosphere_count(5), icosphere_count(5, "faces")
     (10242, 20480)
     """
-    return 10 * 4**level + 2 if on == "vertices" else 20 * 4**level
+    return 10 * 4**level + 2 if elements == "vertices" else 20 * 4**level
 
 
-def icosphere_level(count: int) -> tuple[int, IcosphereCells] | None:
+def icosphere_level(count: int) -> tuple[int, IcosphereElements] | None:
     """Return the level of a signal and what it is on, from its number of values; or None.
 
     >>> icosphere_level(10242), icosphere_level(80), icosphere_level(81)
     ((5, 'vertices'), (1, 'faces'), None)
     """
-    kinds: tuple[IcosphereCells, ...] = "vertices", "faces"
-    known = {icosphere_count(s, on): (s, on) for s in range(MAX_LEVEL + 1) for on in kinds}
+    kinds: tuple[IcosphereElements, ...] = "vertices", "faces"
+    known = {
+        icosphere_count(s, elements): (s, elements)
+        for s in range(MAX_LEVEL + 1)
+        for elements in kinds
+    }
     return known.get(count)
 
 
-def check_signal(shape: Sequence[int], level: int, on: IcosphereCells = "vertices") -> None:
+def check_signal(
+    shape: Sequence[int], level: int, elements: IcosphereElements = "vertices"
+) -> None:
     """Refuse the input of a network that is not a signal on the icosphere of its level.
 
     Args:
         shape: Shape of the input, ``(..., 1, V)`` for V values.
         level: Level s of the network.
-        on: What the network's signals are on.
+        elements: Places of the network's values.
 
     Raises:
         SettingError: The input is another image or signal.
     """
     rows, count = shape[-2:]
-    if rows == 1 and count == icosphere_count(level, on):
+    if rows == 1 and count == icosphere_count(level, elements):
         return
     known = icosphere_level(count) if rows == 1 else None
     found = f"an image of {width_height((rows, count))} pixels"
     if known is not None:
         found = f"a signal on the {count} {known[1]} of the icosphere of level {known[0]}"
+    setting = "" if elements == "vertices" else f" representation.elements={elements}"
     raise SettingError(
         "input of the network",
         found=found,
-        expected=f"a signal on the {icosphere_count(level, on)} {on} of level {level}",
-        remedy=f"Set representation=icosphere representation.level={level} representation.on={on}.",
+        expected=f"a signal on the {icosphere_count(level, elements)} {elements} of level {level}",
+        remedy=f"Set representation=icosphere level={level}{setting}.",
     )
 
 
 @lru_cache(maxsize=4)
-def icosphere_directions(level: int, on: IcosphereCells = "vertices") -> NDArray[np.float64]:
+def icosphere_directions(
+    level: int, elements: IcosphereElements = "vertices"
+) -> NDArray[np.float64]:
     """Return the directions of the vertices or of the faces' centers.
 
     The order is that of `icosphere`: the first vertices are those of the level below, and the
@@ -82,13 +93,13 @@ def icosphere_directions(level: int, on: IcosphereCells = "vertices") -> NDArray
 
     Args:
         level: Level s, 0 to 8.
-        on: ``vertices`` or ``faces``.
+        elements: ``vertices`` or ``faces``.
 
     Returns:
         ``(V, 3)`` unit vectors, read-only.
     """
     vertices, faces = icosphere(level)
-    if on == "faces":
+    if elements == "faces":
         vertices = icosphere_directions(level)[faces].mean(axis=1)
     directions = vertices / np.linalg.norm(vertices, axis=-1, keepdims=True)
     directions.setflags(write=False)
@@ -109,6 +120,8 @@ def faces_of_vertices(level: int) -> NDArray[np.int64]:
 
 @lru_cache(maxsize=2)
 def _vertex_tree(level: int) -> cKDTree:
+    from scipy.spatial import cKDTree  # slow to import
+
     return cKDTree(icosphere_directions(level))
 
 
@@ -166,8 +179,8 @@ class SamplingPoints(NamedTuple):
     weight: NDArray[np.float32]
 
 
-@lru_cache(maxsize=_CELLS_KEPT)
-def sampling_points(level: int, on: IcosphereCells = "vertices") -> SamplingPoints:
+@lru_cache(maxsize=_KEPT)
+def sampling_points(level: int, elements: IcosphereElements = "vertices") -> SamplingPoints:
     """Return points at which an image is averaged over each cell, weighted by solid angle.
 
     The three medians divide a face into six triangles of nearly equal area, with a point in the
@@ -176,7 +189,7 @@ def sampling_points(level: int, on: IcosphereCells = "vertices") -> SamplingPoin
 
     Args:
         level: Level s, 0 to 8.
-        on: ``vertices`` or ``faces``.
+        elements: ``vertices`` or ``faces``.
     """
     faces = icosphere(level).faces
     corners = icosphere_directions(level)[faces]
@@ -192,7 +205,7 @@ def sampling_points(level: int, on: IcosphereCells = "vertices") -> SamplingPoin
             # The solid angle of a small triangle: twice its area, seen from its middle.
             volume = np.abs(np.einsum("pc,pc->p", a, np.cross(middle, center)))
             areas[:, corner, side] = volume / length[:, 0] ** 3
-    cells = np.arange(len(faces))[:, None] if on == "faces" else faces
+    cells = np.arange(len(faces))[:, None] if elements == "faces" else faces
     cell = np.broadcast_to(cells[..., None], areas.shape).ravel()
     order, counts = cell.argsort(kind="stable"), np.bincount(cell)
     slots = np.arange(len(cell)) - (counts.cumsum() - counts).repeat(counts)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere
 from tangent_train.geometry.icosphere_signals import (
-    IcosphereCells,
+    IcosphereElements,
     check_signal,
     faces_of_vertices,
     icosphere_count,
@@ -50,20 +50,20 @@ def test_nearest_vertices_and_faces_around_vertices() -> None:
         assert (around < 0).sum() == (vertex < 12)
 
 
-@pytest.mark.parametrize("on", ["vertices", "faces"])
-def test_directions_are_nested(on: IcosphereCells) -> None:
-    coarse, fine = icosphere_directions(2, on), icosphere_directions(3, on)
-    assert icosphere_level(len(fine)) == (3, on)
-    assert len(fine) == icosphere_count(3, on)
+@pytest.mark.parametrize("elements", ["vertices", "faces"])
+def test_directions_are_nested(elements: IcosphereElements) -> None:
+    coarse, fine = icosphere_directions(2, elements), icosphere_directions(3, elements)
+    assert icosphere_level(len(fine)) == (3, elements)
+    assert len(fine) == icosphere_count(3, elements)
     np.testing.assert_allclose(np.linalg.norm(fine, axis=1), 1, rtol=1e-15)
-    same = fine[: len(coarse)] if on == "vertices" else fine[3::4]
+    same = fine[: len(coarse)] if elements == "vertices" else fine[3::4]
     # Loop subdivision moves vertices a little; the step to the next vertex is 0.15 or more.
     assert np.abs(same - coarse).max() < 0.02
 
 
-@pytest.mark.parametrize("on", ["vertices", "faces"])
-def test_means_over_cells_are_integrals(on: IcosphereCells) -> None:
-    points, source, weight = sampling_points(1, on)
+@pytest.mark.parametrize("elements", ["vertices", "faces"])
+def test_means_over_cells_are_integrals(elements: IcosphereElements) -> None:
+    points, source, weight = sampling_points(1, elements)
     np.testing.assert_allclose(weight.sum(axis=0), 1, rtol=1e-6)
     fine, corners = icosphere_directions(6, "faces"), icosphere_directions(6)[icosphere(6).faces]
     a, b, c = np.moveaxis(corners, 1, 0)
@@ -71,7 +71,7 @@ def test_means_over_cells_are_integrals(on: IcosphereCells) -> None:
     solid_angles = 2 * np.arctan2(np.abs(np.linalg.det(corners)), dots)
     found, shares = locate(1, fine)
     owner = found
-    if on == "vertices":
+    if elements == "vertices":
         owner = np.take_along_axis(icosphere(1).faces[found], shares.argmax(1)[:, None], 1)[:, 0]
 
     def function(at: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -82,7 +82,7 @@ def test_means_over_cells_are_integrals(on: IcosphereCells) -> None:
         [np.bincount(owner, solid_angles * values) / total for values in function(fine).T]
     )
     error = (function(points)[source] * weight[..., None]).sum(axis=0).T - expected
-    error_of_centers = function(icosphere_directions(1, on)).T - expected
+    error_of_centers = function(icosphere_directions(1, elements)).T - expected
     # Level 1 is coarse: a rule with one point per triangle has a sixth of the error of one point.
     assert (error**2).mean() < 0.2**2 * (error_of_centers**2).mean()
 
@@ -90,7 +90,7 @@ def test_means_over_cells_are_integrals(on: IcosphereCells) -> None:
 def test_other_inputs_of_a_network_are_refused_with_the_remedy() -> None:
     check_signal((2, 3, 1, 642), 3)
     check_signal((2, 3, 1, 320), 2, "faces")
-    remedy = "Set representation=icosphere representation.level=3 representation.on=vertices."
+    remedy = "Set representation=icosphere level=3."
     for shape, found in (
         ((2, 3, 16, 32), "an image of 32 × 16"),
         ((2, 3, 1, 643), "an image of 643 × 1"),

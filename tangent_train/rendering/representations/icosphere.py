@@ -28,7 +28,7 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.geometry.icosphere_signals import (
-    IcosphereCells,
+    IcosphereElements,
     faces_of_vertices,
     icosphere_count,
     icosphere_directions,
@@ -68,14 +68,14 @@ class IcosphereViews(Views):
 
     Attributes:
         level: Level s of the icosphere.
-        on: The signal has a value at every vertex or on every face.
+        elements: The signal has a value at every vertex or on every face.
         matrix: ``(3, 3)`` rotation, or reflection, from directions of the icosphere to directions
             of the panorama; None for the identity.
         interpolation: Interpolation of scores to the panorama.
     """
 
     level: int
-    on: IcosphereCells
+    elements: IcosphereElements
     matrix: NDArray[np.float64] | None = None
     interpolation: ScoreInterpolation = "barycentric"
     is_overlapping = False
@@ -130,7 +130,7 @@ class IcosphereViews(Views):
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return scores ``(1, K, 1, V)`` interpolated to the canvas, and the canvas as one view."""
         values = scores[0, :, 0]
-        if self.on == "faces" and self.interpolation == "barycentric":
+        if self.elements == "faces" and self.interpolation == "barycentric":
             values = torch.cat([_at_vertices(values, self.level), values], dim=1)
         source, weight = self._table(("scores", self.interpolation), shape, self._score_taps)
         taps = Taps(*(torch.from_numpy(part).to(scores.device) for part in (source, weight)))
@@ -146,21 +146,21 @@ class IcosphereViews(Views):
     ) -> Value:
         """Return a cached table of this view and a panorama of some shape."""
         matrix = None if self.matrix is None else self.matrix.tobytes()
-        key = "icosphere", self.level, self.on, matrix, *key, shape
+        key = "icosphere", self.level, self.elements, matrix, *key, shape
         return cached(key, lambda: build(shape), is_rotated=matrix is not None)
 
     def _positions(
         self, directions: NDArray[np.floating], shape: tuple[int, int]
     ) -> NDArray[np.float64]:
         """Return columns and rows ``(2, P)`` in a panorama of directions of the icosphere."""
-        turned = directions if self.matrix is None else directions @ self.matrix.T
-        return lonlat_to_equirect(xyz_to_lonlat(turned), shape).T
+        rotated = directions if self.matrix is None else directions @ self.matrix.T
+        return lonlat_to_equirect(xyz_to_lonlat(rotated), shape).T
 
     def _pixels(self, shape: tuple[int, int]) -> NDArray[np.int64]:
         """Return the pixel ``(V,)`` at the direction of each vertex or face."""
 
         def build(shape: tuple[int, int]) -> tuple[NDArray[np.int64]]:
-            u, v = self._positions(icosphere_directions(self.level, self.on), shape)
+            u, v = self._positions(icosphere_directions(self.level, self.elements), shape)
             index = nearest_equirect_index(torch.from_numpy(u), torch.from_numpy(v), shape)
             return (index.numpy(),)
 
@@ -170,7 +170,7 @@ class IcosphereViews(Views):
         """Return the positions of the sampling points in a panorama."""
 
         def build(shape: tuple[int, int]) -> EquirectMap:
-            points = sampling_points(self.level, self.on).directions
+            points = sampling_points(self.level, self.elements).directions
             positions = np.empty((2, len(points)), np.float32)
             for start in range(0, len(points), _CHUNK):
                 part = slice(start, start + _CHUNK)
@@ -192,7 +192,7 @@ class IcosphereViews(Views):
 
     def _averaged(self, values: Tensor) -> Tensor:
         """Return means ``(C, V)`` over cells of values ``(C, P)`` at the sampling points."""
-        _, *taps = sampling_points(self.level, self.on)
+        _, *taps = sampling_points(self.level, self.elements)
         return sample(values, Taps(*(torch.from_numpy(part).to(values.device) for part in taps)))
 
     def _score_taps(self, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
@@ -200,14 +200,14 @@ class IcosphereViews(Views):
         directions = equirect_directions(shape).reshape(-1, 3)
         if self.matrix is not None:
             directions = directions @ self.matrix
-        if self.interpolation == "nearest" and self.on == "vertices":
+        if self.interpolation == "nearest" and self.elements == "vertices":
             sources = nearest_vertices(self.level, directions)[None]
             return sources, np.ones(sources.shape, np.float32)
         found, weights = locate(self.level, directions)
         if self.interpolation == "nearest":
             return found[None], np.ones((1, len(found)), np.float32)
         sources = icosphere(self.level).faces[found]
-        if self.on == "faces":
+        if self.elements == "faces":
             # Linear between the middle of the face and its vertices, which have means of faces.
             least = weights.min(axis=1, keepdims=True)
             sources = np.column_stack([sources, found + icosphere_count(self.level)])
@@ -232,7 +232,7 @@ class IcosphereRepresentation:
 
     Args:
         level: Level s of the panorama and of the icosphere.
-        on: The signal has a value at every vertex, 10·4^s + 2, or on every face, 20·4^s.
+        elements: The signal has a value at every vertex, 10·4^s + 2, or on every face, 20·4^s.
         random_rotation: Rotation of the icosphere in training.
         mirror: True to mirror half of the training samples left to right.
         interpolation: Interpolation of the network's scores to the panorama: ``barycentric`` is
@@ -250,19 +250,19 @@ class IcosphereRepresentation:
     def __init__(
         self,
         level: int,
-        on: IcosphereCells = "vertices",
+        elements: IcosphereElements = "vertices",
         random_rotation: RotationAugmentation = "none",
         mirror: bool = False,
         interpolation: ScoreInterpolation = "barycentric",
         erp_height: int | None = None,
         rotations: int = 1,
     ) -> None:
-        check_choice("representation.on", on, ("vertices", "faces"))
+        check_choice("representation.elements", elements, ("vertices", "faces"))
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
         check_choice("representation.interpolation", interpolation, ("barycentric", "nearest"))
         icosphere(level)  # refuses other levels
-        self.level, self.on = level, on
+        self.level, self.elements = level, elements
         self.random_rotation = random_rotation
         self.mirror = mirror
         self.interpolation = interpolation
@@ -273,7 +273,7 @@ class IcosphereRepresentation:
     @property
     def image_size(self) -> tuple[int, int]:
         """One row, and a column for each value of the signal."""
-        return 1, icosphere_count(self.level, self.on)
+        return 1, icosphere_count(self.level, self.elements)
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
         """Return the same representation in rotated directions R·d."""
@@ -302,4 +302,6 @@ class IcosphereRepresentation:
         return [self._views(self._rotation @ rotation) for rotation in self._rotations]
 
     def _views(self, matrix: NDArray[np.float64]) -> IcosphereViews:
-        return IcosphereViews(self.level, self.on, unless_identity(matrix), self.interpolation)
+        return IcosphereViews(
+            self.level, self.elements, unless_identity(matrix), self.interpolation
+        )

@@ -18,7 +18,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.geometry.icosphere_signals import (
-    IcosphereCells,
+    IcosphereElements,
     icosphere_count,
     icosphere_directions,
 )
@@ -26,8 +26,8 @@ from tangent_train.rendering import IcosphereRepresentation
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.icosphere import IcosphereViews, ScoreInterpolation
 
-ON: list[IcosphereCells] = ["vertices", "faces"]
-on_both = pytest.mark.parametrize("on", ON)
+ELEMENTS: list[IcosphereElements] = ["vertices", "faces"]
+both_elements = pytest.mark.parametrize("elements", ELEMENTS)
 
 
 def smooth(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -52,9 +52,9 @@ def mean_reference(
         total, weight = np.zeros(image.shape[2:]), 0.0
         for face, corner in [
             (f, c)
-            for f in ([cell] if views.on == "faces" else range(len(faces)))
+            for f in ([cell] if views.elements == "faces" else range(len(faces)))
             for c in range(3)
-            if views.on == "faces" or faces[f, c] == cell
+            if views.elements == "faces" or faces[f, c] == cell
         ]:
             a = vertices[faces[face, corner]]
             center = vertices[faces[face]].mean(axis=0)
@@ -79,18 +79,18 @@ def mean_reference(
     return np.array(means)
 
 
-@on_both
+@both_elements
 @pytest.mark.parametrize("seed", [None, 0])
-def test_colors_are_means_over_cells(on: IcosphereCells, seed: int | None) -> None:
+def test_colors_are_means_over_cells(elements: IcosphereElements, seed: int | None) -> None:
     image = np.random.default_rng(5).uniform(0, 255, (8, 16, 3))
     matrix = None if seed is None else random_rotation(np.random.default_rng(seed))
-    views = IcosphereViews(2, on, matrix)
+    views = IcosphereViews(2, elements, matrix)
     cells = [0, 11, 5, 100]  # both poles and a corner among the vertices
     expected = mean_reference(image, views, cells)
     for dtype in (np.float64, np.float32, np.uint8):
         rendered = views.render(image.astype(dtype), "bilinear")
         assert rendered.dtype == dtype
-        assert rendered.shape == (1, 1, icosphere_count(2, on), 3)
+        assert rendered.shape == (1, 1, icosphere_count(2, elements), 3)
         error = rendered[0, 0, cells] - expected
         assert np.sqrt((error**2).mean()) < 0.2 * expected.std(), "of noise, with few points"
     exact = views.render(image, "bilinear")[0, 0]
@@ -100,9 +100,9 @@ def test_colors_are_means_over_cells(on: IcosphereCells, seed: int | None) -> No
     np.testing.assert_allclose(fine, exact, err_msg="a finer panorama is reduced first")
 
 
-@on_both
-def test_constants_stay_constants(on: IcosphereCells) -> None:
-    views = IcosphereRepresentation(3, on, "so3").sample(np.random.default_rng(0))
+@both_elements
+def test_constants_stay_constants(elements: IcosphereElements) -> None:
+    views = IcosphereRepresentation(3, elements, "so3").sample(np.random.default_rng(0))
     for dtype in (np.uint8, np.uint16):
         for value in (1, 200, np.iinfo(dtype).max):
             assert (views.render(np.full((16, 32), value, dtype), "bilinear") == value).all()
@@ -116,8 +116,8 @@ def test_a_tensor_has_a_gradient_through_the_means() -> None:
     assert torch.autograd.gradcheck(lambda x: views.render(x, "bilinear"), image)
 
 
-@on_both
-def test_samples_are_the_panorama_in_rotated_directions(on: IcosphereCells) -> None:
+@both_elements
+def test_samples_are_the_panorama_in_rotated_directions(elements: IcosphereElements) -> None:
     shape = 64, 128
     pixels = np.arange(shape[0] * shape[1], dtype=np.int32).reshape(shape)
     image = smooth(equirect_directions((16, 32)))
@@ -126,7 +126,7 @@ def test_samples_are_the_panorama_in_rotated_directions(on: IcosphereCells) -> N
     seen = set()
     for kind in kinds:
         for seed in range(4):
-            fixed = IcosphereRepresentation(3, on, kind, mirror=True).with_rotation(tilt)
+            fixed = IcosphereRepresentation(3, elements, kind, mirror=True).with_rotation(tilt)
             views = fixed.sample(np.random.default_rng(seed))
             matrix = np.eye(3) if views.matrix is None else views.matrix
             inner = tilt.T @ matrix
@@ -137,7 +137,7 @@ def test_samples_are_the_panorama_in_rotated_directions(on: IcosphereCells) -> N
                 np.testing.assert_allclose(inner, np.eye(3), atol=1e-14)
             if kind == "yaw":
                 np.testing.assert_allclose(inner[2], (0, 0, 1), atol=1e-14)
-            directions = icosphere_directions(3, on) @ matrix.T
+            directions = icosphere_directions(3, elements) @ matrix.T
             # A label is that of the pixel at the direction; colors are means around it.
             nearest = views.render(pixels, "nearest")[0, 0]
             found = equirect_directions(shape).reshape(-1, 3)[nearest]
@@ -150,15 +150,15 @@ def test_samples_are_the_panorama_in_rotated_directions(on: IcosphereCells) -> N
     assert len(seen) == 6
 
 
-@on_both
+@both_elements
 @pytest.mark.parametrize(("interpolation", "most"), [("barycentric", 0.02), ("nearest", 0.16)])
 @pytest.mark.parametrize("seed", [None, 3])
 def test_round_trip_of_a_smooth_function(
-    on: IcosphereCells, interpolation: ScoreInterpolation, most: float, seed: int | None
+    elements: IcosphereElements, interpolation: ScoreInterpolation, most: float, seed: int | None
 ) -> None:
     shape = 31, 66  # not the size of a level
     matrix = None if seed is None else random_rotation(np.random.default_rng(seed))
-    views = IcosphereViews(4, on, matrix, interpolation)
+    views = IcosphereViews(4, elements, matrix, interpolation)
     expected = smooth(equirect_directions(shape)).astype(np.float32)
     signal = views.render(expected, "bilinear")[0]
     scores = torch.from_numpy(signal).movedim(-1, 0)[None]
@@ -169,26 +169,28 @@ def test_round_trip_of_a_smooth_function(
     torch.testing.assert_close(views.placed(exactly, shape)[0], torch.full_like(canvas, 3.5))
 
 
-@on_both
-def test_scores_at_the_directions_of_a_signal_are_kept(on: IcosphereCells) -> None:
+@both_elements
+def test_scores_at_the_directions_of_a_signal_are_kept(elements: IcosphereElements) -> None:
     # A canvas of one row and column per direction does not exist: the nearest pixels of a fine one.
-    views, shape = IcosphereViews(1, on), (512, 1024)
-    values = torch.rand(1, 2, 1, icosphere_count(1, on))
+    views, shape = IcosphereViews(1, elements), (512, 1024)
+    values = torch.rand(1, 2, 1, icosphere_count(1, elements))
     canvas, _ = views.placed(values, shape)
     there = views.render(canvas[0], "nearest")[0]
     assert (there - values[0]).abs().max() < 0.02
 
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])
-@on_both
-def test_labels_of_large_cells_come_back_through_a_mosaic(on: IcosphereCells, backend: Any) -> None:
+@both_elements
+def test_labels_of_large_cells_come_back_through_a_mosaic(
+    elements: IcosphereElements, backend: Any
+) -> None:
     shape = 64, 128
     directions = equirect_directions(shape)
     corners = icosphere_directions(0)
     label = (directions @ corners.T).argmax(axis=-1).astype(np.uint8)
     ordered = np.sort(directions @ corners.T, axis=-1)
     inside = np.arccos(ordered[..., -2]) - np.arccos(ordered[..., -1]) > 0.12
-    representation = IcosphereRepresentation(5, on, rotations=2)
+    representation = IcosphereRepresentation(5, elements, rotations=2)
     mosaic = ScoreMosaic(shape, 12, "nearest", averaged=True, backend=backend)
     for views in representation.with_rotation(rotation_about((1, 0, 0), 0.3)).view_sets():
         signal = torch.from_numpy(views.render(label, "nearest").astype(np.int64))
@@ -200,8 +202,8 @@ def test_labels_of_large_cells_come_back_through_a_mosaic(on: IcosphereCells, ba
 
 def test_labels_are_never_averaged() -> None:
     label = np.where(np.arange(64)[None] < 32, 1, 9).astype(np.uint8).repeat(32, 0)
-    for on in ON:
-        assert set(np.unique(IcosphereViews(4, on).render(label, "nearest"))) == {1, 9}
+    for elements in ELEMENTS:
+        assert set(np.unique(IcosphereViews(4, elements).render(label, "nearest"))) == {1, 9}
 
 
 def test_rotations_and_settings() -> None:
@@ -214,7 +216,7 @@ def test_rotations_and_settings() -> None:
     assert IcosphereRepresentation(2).erp_height == 8
     bad: dict[str, Any]
     for bad, name in (
-        ({"on": "edges"}, "representation.on"),
+        ({"elements": "edges"}, "representation.elements"),
         ({"interpolation": "linear"}, "representation.interpolation"),
         ({"random_rotation": "all"}, "representation.random_rotation"),
         ({"level": 9}, "icosphere level"),
