@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from models.sphere_attention import SphereAttention as SphereAttention
     from models.sphere_context import SphereContext as SphereContext
     from models.stem import widen_stem as widen_stem
+    from models.tables import face_neighbors as face_neighbors
+    from models.tables import hexagonal_rings as hexagonal_rings
     from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
 
@@ -34,6 +36,8 @@ _FILES = {
     "SphereContext": "sphere_context",
     "Table": "mapped",
     "UNet": "unet",
+    "face_neighbors": "tables",
+    "hexagonal_rings": "tables",
     "initialize": "initialization",
     "mesh_operators": "tables",
     "widen_stem": "stem",

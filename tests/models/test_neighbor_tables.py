@@ -9,16 +9,17 @@ import pytest
 from numpy.typing import NDArray
 
 from models.mapped import Table
-from models.tables import face_neighbors, hexagonal_rings, unit_vertices
+from models.tables import face_neighbors, hexagonal_rings
 from tangent_train.geometry import icosphere, rotation_about
 from tangent_train.geometry.gnomonic_taps import tangent_axes
+from tangent_train.geometry.icosphere_signals import icosphere_directions
 
 _TABLES = [hexagonal_rings, face_neighbors]
 _POLES = [0, 11]
 
 
 def _face_centers(level: int) -> NDArray[np.float64]:
-    centers = unit_vertices(level)[icosphere(level).faces].mean(axis=1)
+    centers = icosphere_directions(level)[icosphere(level).faces].mean(axis=1)
     return np.asarray(centers / np.linalg.norm(centers, axis=1, keepdims=True))
 
 
@@ -41,7 +42,7 @@ def test_a_rotation_by_72_degrees_about_the_poles_permutes_the_rows(
     build: Callable[[int], Table],
 ) -> None:
     table = build(3)
-    cells = _face_centers(3) if build is face_neighbors else unit_vertices(3)
+    cells = _face_centers(3) if build is face_neighbors else icosphere_directions(3)
     rotated = cells @ rotation_about([0, 0, 1], 2 * np.pi / 5).T
     target = (rotated @ cells.T).argmax(axis=1)
     np.testing.assert_allclose(cells[target], rotated, atol=1e-12)
@@ -80,7 +81,7 @@ def test_rings_mix_two_hexagonal_filters() -> None:
 
 
 def test_rings_lie_at_fixed_angles_to_the_north() -> None:
-    points = unit_vertices(4)
+    points = icosphere_directions(4)
     taps = _values(hexagonal_rings(4), points)
     np.testing.assert_allclose(taps[:, 0], points)
     east, north = np.einsum("vij,vkj->ivk", tangent_axes(points)[:, :2], taps[:, 1:])
