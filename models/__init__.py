@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+    from models.icocnn import IcoCNN as IcoCNN
     from models.icosphere_unet import IcosphereUNet as IcosphereUNet
     from models.initialization import initialize as initialize
     from models.mapped import MappedConv as MappedConv
@@ -29,6 +30,7 @@ _FILES = {
     "FCNResNet": "fcn_resnet",
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
+    "IcoCNN": "icocnn",
     "IcosphereUNet": "icosphere_unet",
     "MappedConv": "mapped",
     "ShapeClassifier": "shape_classifier",

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from models.mapped import Table
-from tangent_train.geometry import icosphere
-from tangent_train.geometry.gnomonic_taps import tangent_axes
-from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.geometry import icosphere, vertex_resolution
+from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
+from tangent_train.geometry.icosphere_signals import icosphere_directions, locate
 from tangent_train.registry import registered
 
 _LEVELS = 9
@@ -144,3 +144,33 @@ def vertex_parents(level: int) -> Table:
     parents = np.tile(np.arange(len(icosphere(level).vertices))[:, None], 2)
     parents[icosphere(level).faces[3::4]] = coarse.faces[:, [[1, 2], [2, 0], [0, 1]]]
     return Table.of_entries(parents[:, None], np.array(0.5), len(coarse.vertices))
+
+
+@registered
+@lru_cache(_LEVELS)
+def gnomonic_taps(level: int) -> Table:
+    """Return nine taps: a 3 × 3 grid on the tangent plane of each vertex, aligned to the north.
+
+    Their distance on the plane is the tangent of the mean angle between neighboring vertices (Coors
+    et al. 2018 and Tateno et al. 2018 use that of neighboring pixels). Rows are from north to
+    south, columns from west to east, as in a convolution of images.
+
+    Args:
+        level: Level s of the icosphere.
+    """
+    pitch = float(np.tan(vertex_resolution(level)))
+    return mapped_samples(level, gnomonic_taps_xyz(icosphere_directions(level), 3, pitch))
+
+
+def mapped_samples(level: int, directions_xyz: NDArray[np.float64]) -> Table:
+    """Return a mapped convolution of signals on vertices (Eder et al. 2019): any taps.
+
+    Args:
+        level: Level s of the icosphere.
+        directions_xyz: ``(V_out, K, 3)`` unit vectors. Values there are interpolated between the
+            three vertices of a face, with barycentric weights.
+    """
+    found, weights = locate(level, directions_xyz.reshape(-1, 3))
+    vertices, faces = icosphere(level)
+    shape = (*directions_xyz.shape[:2], 3)
+    return Table.of_entries(faces[found].reshape(shape), weights.reshape(shape), len(vertices))

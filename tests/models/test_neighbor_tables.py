@@ -9,18 +9,13 @@ import pytest
 from numpy.typing import NDArray
 
 from models.mapped import Table
-from models.tables import face_neighbors, hexagonal_rings
-from tangent_train.geometry import icosphere, rotation_about
-from tangent_train.geometry.gnomonic_taps import tangent_axes
+from models.tables import face_neighbors, gnomonic_taps, hexagonal_rings, mapped_samples
+from tangent_train.geometry import icosphere, rotation_about, vertex_resolution
+from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 
-_TABLES = [hexagonal_rings, face_neighbors]
+_TABLES = [hexagonal_rings, face_neighbors, gnomonic_taps]
 _POLES = [0, 11]
-
-
-def _face_centers(level: int) -> NDArray[np.float64]:
-    centers = icosphere_directions(level)[icosphere(level).faces].mean(axis=1)
-    return np.asarray(centers / np.linalg.norm(centers, axis=1, keepdims=True))
 
 
 def _values(table: Table, signal: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -42,12 +37,14 @@ def test_a_rotation_by_72_degrees_about_the_poles_permutes_the_rows(
     build: Callable[[int], Table],
 ) -> None:
     table = build(3)
-    cells = _face_centers(3) if build is face_neighbors else icosphere_directions(3)
+    cells = icosphere_directions(3, "faces" if build is face_neighbors else "vertices")
     rotated = cells @ rotation_about([0, 0, 1], 2 * np.pi / 5).T
     target = (rotated @ cells.T).argmax(axis=1)
     np.testing.assert_allclose(cells[target], rotated, atol=1e-12)
     signal = np.random.default_rng(0).normal(size=table.inputs)
     before, after = _values(table, signal[target]), _values(table, signal)[target]
+    if build is gnomonic_taps:  # the grid at a pole is aligned to longitude 0
+        before, after = (np.delete(values, _POLES, axis=0) for values in (before, after))
     np.testing.assert_allclose(before, after, atol=1e-12)
 
 
@@ -105,7 +102,7 @@ def test_ten_different_faces_share_an_edge_or_a_vertex(level: int) -> None:
 
 
 def test_order_of_faces_is_that_of_the_unfolded_icosahedron() -> None:
-    centers = _face_centers(4)
+    centers = icosphere_directions(4, "faces")
     offsets = _values(face_neighbors(4), centers) - centers[:, None]
     middle = np.arange(len(centers)).reshape(20, 4, 4, 4, 4)[:, 3, 3, 3, 3]  # face in the middle
     # The middle of a base face points as the face does at even levels: five up, five down, twice.
@@ -116,3 +113,24 @@ def test_order_of_faces_is_that_of_the_unfolded_icosahedron() -> None:
     cosine /= np.linalg.norm(offsets[middle, 1:], axis=-1)
     cosine /= np.linalg.norm(offsets[beside, 1:], axis=-1)
     np.testing.assert_array_less(cosine, -0.95)  # turned by 180° beside it
+
+
+def test_taps_interpolate_at_the_directions_of_the_grid() -> None:
+    points = icosphere_directions(3)
+    expected = gnomonic_taps_xyz(points, 3, float(np.tan(vertex_resolution(3))))
+    taps = _values(gnomonic_taps(3), points)
+    np.testing.assert_allclose(
+        taps / np.linalg.norm(taps, axis=-1, keepdims=True), expected, atol=1e-12
+    )
+    np.testing.assert_allclose(taps[:, 4], points, atol=1e-12)
+
+
+def test_mapped_samples_interpolate_anywhere() -> None:
+    directions = np.random.default_rng(0).normal(size=(5, 2, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    table = mapped_samples(2, directions)
+    assert (table.outputs, table.taps, table.inputs) == (5, 2, 162)
+    values = _values(table, icosphere_directions(2))
+    np.testing.assert_allclose(
+        values / np.linalg.norm(values, axis=-1, keepdims=True), directions, atol=1e-12
+    )
