@@ -55,8 +55,8 @@ class _Unpool(nn.Module):
 class IcosphereUNet(ResidualUNet):
     """UNet of Jiang et al. (2019) on icospheres of decreasing levels, for any table.
 
-    With `mesh_operators`, it is theirs (appendix, "Network architecture"): 5,180,239 trainable
-    parameters with four inputs and 15 outputs. Like `UNet`, it pools before the first 1×1
+    With `mesh_operators`, four inputs and 15 outputs, it has the 5,180,239 trainable parameters of
+    the article's network. Like `UNet`, it pools before the first 1×1
     convolution of a block instead of after it: the values are the same, except for statistics of
     batch normalization, which see the coarser level.
 

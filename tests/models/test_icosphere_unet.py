@@ -8,6 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from models import IcosphereUNet, face_neighbors, mesh_operators
+from models.icosphere_unet import Pooling, Unpooling
 from models.tables import vertex_parents
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, rotation_about
@@ -28,13 +29,13 @@ def test_parameters_of_the_published_networks(
 
 
 @pytest.mark.parametrize("unpooling", ["zeros", "ones", "mean"])
-def test_scores_turn_with_the_icosphere_and_every_parameter_learns(unpooling: str) -> None:
+def test_scores_turn_with_the_icosphere_and_every_parameter_learns(unpooling: Unpooling) -> None:
     """North stays north in a rotation of 72° about the vertical, which permutes the vertices."""
-    network = IcosphereUNet(3, 5, 2, mesh_operators, (6, 8, 8), unpooling=unpooling)
-    network = with_statistics(network.double())
+    network = IcosphereUNet(3, 5, 2, mesh_operators, (6, 8, 8), unpooling=unpooling).double()
+    with_statistics(network)
     directions = icosphere_directions(2)
-    turned = directions @ rotation_about((0, 0, 1), np.radians(72)).T
-    distance, order = cKDTree(directions).query(turned)
+    rotated = directions @ rotation_about((0, 0, 1), np.radians(72)).T
+    distance, order = cKDTree(directions).query(rotated)
     assert distance.max() < 1e-9
     signals = torch.randn(2, 3, 1, 162, dtype=torch.double)
     network.eval()
@@ -47,10 +48,11 @@ def test_scores_turn_with_the_icosphere_and_every_parameter_learns(unpooling: st
 
 
 @pytest.mark.parametrize("pooling", ["mean", "max"])
-def test_faces_are_pooled_with_their_siblings(pooling: str) -> None:
+def test_faces_are_pooled_with_their_siblings(pooling: Pooling) -> None:
     network = IcosphereUNet(3, 5, 1, face_neighbors, (4, 6), pooling, "repeat")
     assert network(torch.randn(2, 3, 1, 80)).shape == (2, 5, 1, 80)
-    pool, unpool = network.downs[0][0], network.ups[0].up[0]  # type: ignore[index,union-attr]
+    layers = dict(network.named_modules())
+    pool, unpool = layers["downs.0.0"], layers["ups.0.up.0"]
     x = torch.arange(80.0).reshape(1, 1, 1, 80)
     expected = torch.arange(20.0) * 4 + (1.5 if pooling == "mean" else 3)
     torch.testing.assert_close(pool(x).ravel(), expected)
