@@ -9,25 +9,35 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
     from models.fcn_resnet import FCNResNet as FCNResNet
+    from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+    from models.icocnn import IcoCNN as IcoCNN
     from models.initialization import initialize as initialize
+    from models.mapped import MappedConv as MappedConv
+    from models.mapped import Table as Table
     from models.shape_classifier import ShapeClassifier as ShapeClassifier
     from models.sphere_attention import SphereAttention as SphereAttention
     from models.sphere_context import SphereContext as SphereContext
     from models.stem import widen_stem as widen_stem
+    from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
 
 _FILES = {
     "AuxiliaryHead": "auxiliary_head",
     "FCNResNet": "fcn_resnet",
+    "HarmonicNetwork": "harmonic_network",
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
+    "IcoCNN": "icocnn",
+    "MappedConv": "mapped",
     "ShapeClassifier": "shape_classifier",
     "SphereAttention": "sphere_attention",
     "SphereContext": "sphere_context",
+    "Table": "mapped",
     "UNet": "unet",
     "initialize": "initialization",
+    "mesh_operators": "tables",
     "widen_stem": "stem",
 }
 
