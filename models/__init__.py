@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
     from models.fcn_resnet import FCNResNet as FCNResNet
+    from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
     from models.icocnn import IcoCNN as IcoCNN
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 _FILES = {
     "AuxiliaryHead": "auxiliary_head",
     "FCNResNet": "fcn_resnet",
+    "HarmonicNetwork": "harmonic_network",
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
     "IcoCNN": "icocnn",
