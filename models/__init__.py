@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
+    from models.distortion_aware import make_distortion_aware as make_distortion_aware
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
@@ -28,6 +29,7 @@ _FILES = {
     "SphereContext": "sphere_context",
     "UNet": "unet",
     "initialize": "initialization",
+    "make_distortion_aware": "distortion_aware",
     "widen_stem": "stem",
 }
 
