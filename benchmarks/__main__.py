@@ -2,6 +2,7 @@
 
 python -m benchmarks                        all benchmarks (make bench)
 python -m benchmarks images labels          some of them
+python -m benchmarks methods                methods by level, see docs/results/prior_methods.md
 python -m benchmarks compare                measure, then compare with the baseline
 python -m benchmarks compare results.json   compare an earlier run with the baseline
 python -m benchmarks baseline results.json  write the baseline, preferably from several runs
@@ -28,9 +29,12 @@ from torch.utils.collect_env import get_pretty_env_info
 from benchmarks.measuring import DEVICE, FAILURES, Table, attempted
 from tangent_train.results.tables import Table as TextTable
 
-MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels", "area")}
+MEASURED = {name: f"benchmarks.{name}" for name in ("images", "labels", "area", "methods")}
 MEASURED |= dict.fromkeys(("loader", "step", "evaluation"), "benchmarks.training")
 """Module of each benchmark; it has a function of the same name."""
+
+LONG = ("methods",)
+"""Benchmarks that run only by name."""
 
 ON_A_GPU = {name: f"benchmarks.gpu.{name}" for name in ("render", "step", "predict", "fed")}
 """Module of each benchmark of ``gpu``."""
@@ -62,7 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if unknown := sorted({*names} - {*measured}):
             parser.error(f"unknown: {', '.join(unknown)}")
         quick = options.quick or (command == "gpu" and DEVICE.type == "cpu")
-        files = [run({n: measured[n] for n in names or measured}, options.output, quick=quick)]
+        chosen = names or [name for name in measured if name not in LONG]
+        files = [run({n: measured[n] for n in chosen}, options.output, quick=quick)]
     if command == "baseline":
         write_baseline([read(file) for file in files])
     elif command == "compare":

@@ -45,7 +45,7 @@ _HYDRA = {
 }
 """Names in a section that are not arguments, with the kinds of value that are allowed in files."""
 
-_CALLED_LATER = ("mixer", "optimizer", "scheduler")
+_CALLED_LATER = ("mixer", "optimizer", "scheduler", "table")
 """Sections of a file that may be ``_partial_``: functions that take further arguments later."""
 
 

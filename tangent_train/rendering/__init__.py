@@ -18,6 +18,7 @@ from tangent_train.rendering.camera_files import (
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent, rotate_equirect
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
+from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
@@ -32,6 +33,7 @@ __all__ = [
     "CameraFile",
     "CubemapRepresentation",
     "EquirectRepresentation",
+    "IcosphereRepresentation",
     "Interpolation",
     "PerspectiveRepresentation",
     "Representation",

@@ -110,8 +110,13 @@ def set_table_cache_limit(nbytes: int) -> None:
     _ROTATED.set_limit(nbytes // _ROTATED_SHARE)
 
 
+def cached(key: Hashable, build: Callable[[], Value], *, is_rotated: bool) -> Value:
+    """Return the table of a key from one of the two caches, see `TableCache.get`."""
+    return (_ROTATED if is_rotated else TABLES).get(key, build)
+
+
 def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Value]) -> Value:
-    return (TABLES if grid.rotation is None else _ROTATED).get((grid, *key), build)
+    return cached((grid, *key), build, is_rotated=grid.rotation is not None)
 
 
 def forward_map(

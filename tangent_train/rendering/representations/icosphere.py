@@ -1,0 +1,307 @@
+"""Signals on the vertices or faces of an icosphere as a representation.
+
+A signal with V values is an image of one row and V columns, so that networks, losses and data sets
+need no other shapes.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from tangent_train.geometry import (
+    FLIP_Y,
+    SphereArea,
+    equirect_directions,
+    equirect_shape,
+    icosphere,
+    lonlat_to_equirect,
+    random_rotation,
+    rotation_about,
+    xyz_to_lonlat,
+)
+from tangent_train.geometry.icosphere_signals import (
+    IcosphereElements,
+    faces_of_vertices,
+    icosphere_count,
+    icosphere_directions,
+    locate,
+    nearest_vertices,
+    sampling_points,
+)
+from tangent_train.registry import registered
+from tangent_train.rendering.checks import Blend, check_choice, check_panorama
+from tangent_train.rendering.forward import Interpolation, Pixels
+from tangent_train.rendering.representations.perspective import PhotoCrops
+from tangent_train.rendering.representations.pinhole import unless_identity, vertical_rotations
+from tangent_train.rendering.representations.views import RotationAugmentation, Views
+from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.sampling import (
+    EquirectMap,
+    Taps,
+    bilinear_equirect_taps,
+    nearest_equirect_index,
+    sample,
+    sample_map,
+)
+from tangent_train.rendering.tables import Value, cached
+
+ScoreInterpolation = Literal["barycentric", "nearest"]
+
+_SYMMETRY_DEG = 72.0
+"""Rotation about the vertical after which an icosphere is the same."""
+
+_CHUNK = 2**18
+"""Number of points whose positions or taps are computed at once."""
+
+
+@dataclass(frozen=True, eq=False)
+class IcosphereViews(Views):
+    """A signal on an icosphere, one view.
+
+    Attributes:
+        level: Level s of the icosphere.
+        elements: The signal has a value at every vertex or on every face.
+        matrix: ``(3, 3)`` rotation, or reflection, from directions of the icosphere to directions
+            of the panorama; None for the identity.
+        interpolation: Interpolation of scores to the panorama.
+    """
+
+    level: int
+    elements: IcosphereElements
+    matrix: NDArray[np.float64] | None = None
+    interpolation: ScoreInterpolation = "barycentric"
+    is_overlapping = False
+
+    def __len__(self) -> int:
+        return 1
+
+    def __getitem__(self, part: slice) -> Self:
+        """Return the view itself."""
+        return self
+
+    def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
+        """Render the signal, with the dtype of the image.
+
+        ``bilinear`` averages over the cell of each vertex or face, see `sampling_points`; an image
+        of more rows than the level has is reduced first. ``nearest`` takes the pixel at the
+        direction of each vertex or face.
+
+        Args:
+            image: An array ``(H, W[, C])``, or a tensor ``(C, H, W)``.
+            interpolation: ``bilinear`` or ``nearest``.
+
+        Returns:
+            An array ``(1, 1, V[, C])``, or a tensor ``(1, C, 1, V)``.
+        """
+        check_panorama(image, interpolation)
+        rows = image.shape[-2] if isinstance(image, Tensor) else image.shape[0]
+        if interpolation == "bilinear" and rows > equirect_shape(self.level)[0]:
+            image = resize(image, equirect_shape(self.level), interpolation)
+        result: Any
+        if isinstance(image, Tensor):
+            shape = image.shape[-2], image.shape[-1]
+            source = image.flatten(-2)
+            if interpolation == "nearest":
+                result = source[..., torch.from_numpy(self._pixels(shape)).to(image.device)]
+            else:
+                result = self._averaged(self._at_points(source, shape))
+            return result[None, ..., None, :]
+        shape = image.shape[0], image.shape[1]
+        if interpolation == "nearest":
+            result = image.reshape(-1, *image.shape[2:])[self._pixels(shape)]
+            return result[None, None]
+        at: EquirectMap = self._map(shape)
+        points = np.empty((*at.u.shape, *image.shape[2:]), image.dtype)
+        sample_map(at, np.ascontiguousarray(image), interpolation, points)
+        wide = np.promote_types(image.dtype, np.float32)
+        values = torch.from_numpy(points.reshape(at.u.size, -1).T.astype(wide))
+        result = self._averaged(values).numpy().T
+        result = np.rint(result) if image.dtype.kind in "ui" else result
+        return result.astype(image.dtype).reshape(1, 1, -1, *image.shape[2:])
+
+    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
+        """Return scores ``(1, K, 1, V)`` interpolated to the canvas, and the canvas as one view."""
+        values = scores[0, :, 0]
+        if self.elements == "faces" and self.interpolation == "barycentric":
+            values = torch.cat([_at_vertices(values, self.level), values], dim=1)
+        source, weight = self._table(("scores", self.interpolation), shape, self._score_taps)
+        taps = Taps(*(torch.from_numpy(part).to(scores.device) for part in (source, weight)))
+        canvas = sample(values, taps).reshape(1, -1, *shape)
+        box = np.array([[0.0, 0.0, shape[1], shape[0]]])
+        return canvas, PhotoCrops(box, shape, is_overlapping=False)
+
+    def _table(
+        self,
+        key: tuple[Any, ...],
+        shape: tuple[int, int],
+        build: Callable[[tuple[int, int]], Value],
+    ) -> Value:
+        """Return a cached table of this view and a panorama of some shape."""
+        matrix = None if self.matrix is None else self.matrix.tobytes()
+        key = "icosphere", self.level, self.elements, matrix, *key, shape
+        return cached(key, lambda: build(shape), is_rotated=matrix is not None)
+
+    def _positions(
+        self, directions: NDArray[np.floating], shape: tuple[int, int]
+    ) -> NDArray[np.float64]:
+        """Return columns and rows ``(2, P)`` in a panorama of directions of the icosphere."""
+        rotated = directions if self.matrix is None else directions @ self.matrix.T
+        return lonlat_to_equirect(xyz_to_lonlat(rotated), shape).T
+
+    def _pixels(self, shape: tuple[int, int]) -> NDArray[np.int64]:
+        """Return the pixel ``(V,)`` at the direction of each vertex or face."""
+
+        def build(shape: tuple[int, int]) -> tuple[NDArray[np.int64]]:
+            u, v = self._positions(icosphere_directions(self.level, self.elements), shape)
+            index = nearest_equirect_index(torch.from_numpy(u), torch.from_numpy(v), shape)
+            return (index.numpy(),)
+
+        return self._table(("pixels",), shape, build)[0]
+
+    def _map(self, shape: tuple[int, int]) -> EquirectMap:
+        """Return the positions of the sampling points in a panorama."""
+
+        def build(shape: tuple[int, int]) -> EquirectMap:
+            points = sampling_points(self.level, self.elements).directions
+            positions = np.empty((2, len(points)), np.float32)
+            for start in range(0, len(points), _CHUNK):
+                part = slice(start, start + _CHUNK)
+                positions[:, part] = self._positions(points[part].astype(np.float64), shape)
+            u, v = positions.reshape(2, 20 * 2**self.level, -1)
+            return EquirectMap.of(u, v, shape)
+
+        return self._table(("points",), shape, build)
+
+    def _at_points(self, source: Tensor, shape: tuple[int, int]) -> Tensor:
+        """Return values ``(C, P)`` of an image ``(C, H W)`` at the sampling points."""
+        at = self._map(shape)
+        parts = []
+        for start in range(0, at.u.size, _CHUNK):
+            lines = at.in_panorama(slice(start, start + _CHUNK))
+            u, v = (torch.from_numpy(line).to(source.device) for line in lines)
+            parts.append(sample(source, bilinear_equirect_taps(u, v, shape)))
+        return torch.cat(parts, dim=1)
+
+    def _averaged(self, values: Tensor) -> Tensor:
+        """Return means ``(C, V)`` over cells of values ``(C, P)`` at the sampling points."""
+        _, *taps = sampling_points(self.level, self.elements)
+        return sample(values, Taps(*(torch.from_numpy(part).to(values.device) for part in taps)))
+
+    def _score_taps(self, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return sources and weights ``(T, H W)`` of the scores at each pixel of a canvas."""
+        directions = equirect_directions(shape).reshape(-1, 3)
+        if self.matrix is not None:
+            directions = directions @ self.matrix
+        if self.interpolation == "nearest" and self.elements == "vertices":
+            sources = nearest_vertices(self.level, directions)[None]
+            return sources, np.ones(sources.shape, np.float32)
+        found, weights = locate(self.level, directions)
+        if self.interpolation == "nearest":
+            return found[None], np.ones((1, len(found)), np.float32)
+        sources = icosphere(self.level).faces[found]
+        if self.elements == "faces":
+            # Linear between the middle of the face and its vertices, which have means of faces.
+            least = weights.min(axis=1, keepdims=True)
+            sources = np.column_stack([sources, found + icosphere_count(self.level)])
+            weights = np.column_stack([weights - least, 3 * least])
+        return np.ascontiguousarray(sources.T), weights.T.astype(np.float32)
+
+
+def _at_vertices(values: Tensor, level: int) -> Tensor:
+    """Return the mean ``(K, V)`` of values ``(K, F)`` of the faces around each vertex."""
+    around = torch.tensor(faces_of_vertices(level).T).to(values.device)
+    is_face = around >= 0
+    weight = is_face / is_face.sum(dim=0).to(values.dtype)
+    return sample(values, Taps(around.clamp(min=0), weight))
+
+
+@registered
+class IcosphereRepresentation:
+    """A signal on the vertices or faces of an icosphere, for networks on its mesh.
+
+    The view is always the whole sphere. Of a partial panorama, the pixels outside its area are
+    black, and their labels unknown.
+
+    Args:
+        level: Level s of the panorama and of the icosphere.
+        elements: The signal has a value at every vertex, 10·4^s + 2, or on every face, 20·4^s.
+        random_rotation: Rotation of the icosphere in training.
+        mirror: True to mirror half of the training samples left to right.
+        interpolation: Interpolation of the network's scores to the panorama: ``barycentric`` is
+            linear in the triangle around a pixel; ``nearest`` takes the nearest vertex, or the face
+            that contains the pixel.
+        erp_height: Rows of the panorama, default `equirect_shape(level)`.
+        rotations: Number of rotations about the vertical, within 72°, to average over.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    blend: Blend = "nearest"
+
+    def __init__(
+        self,
+        level: int,
+        elements: IcosphereElements = "vertices",
+        random_rotation: RotationAugmentation = "none",
+        mirror: bool = False,
+        interpolation: ScoreInterpolation = "barycentric",
+        erp_height: int | None = None,
+        rotations: int = 1,
+    ) -> None:
+        check_choice("representation.elements", elements, ("vertices", "faces"))
+        choices = ("none", "yaw", "so3")
+        check_choice("representation.random_rotation", random_rotation, choices)
+        check_choice("representation.interpolation", interpolation, ("barycentric", "nearest"))
+        icosphere(level)  # refuses other levels
+        self.level, self.elements = level, elements
+        self.random_rotation = random_rotation
+        self.mirror = mirror
+        self.interpolation = interpolation
+        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self._rotations = vertical_rotations(rotations, _SYMMETRY_DEG)
+        self._rotation: NDArray[np.float64] = np.eye(3)
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """One row, and a column for each value of the signal."""
+        return 1, icosphere_count(self.level, self.elements)
+
+    def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
+        """Return the same representation in rotated directions R·d."""
+        rotated = copy.copy(self)
+        rotated._rotation = rotation
+        return rotated
+
+    def limited_to(self, area: SphereArea | None) -> Self:
+        """Return the representation itself: a signal always covers the sphere."""
+        del area
+        return self
+
+    def sample(self, rng: np.random.Generator) -> IcosphereViews:
+        """Return the signal, optionally rotated and mirrored."""
+        matrix = self._rotation
+        if self.random_rotation == "so3":
+            matrix = matrix @ random_rotation(rng)
+        elif self.random_rotation == "yaw":
+            matrix = matrix @ rotation_about((0, 0, 1), rng.uniform(0, 2 * np.pi))
+        if self.mirror and rng.random() < 0.5:
+            matrix = matrix @ FLIP_Y
+        return self._views(matrix)
+
+    def view_sets(self) -> list[IcosphereViews]:
+        """Return the signal in every rotation about the vertical."""
+        return [self._views(self._rotation @ rotation) for rotation in self._rotations]
+
+    def _views(self, matrix: NDArray[np.float64]) -> IcosphereViews:
+        return IcosphereViews(
+            self.level, self.elements, unless_identity(matrix), self.interpolation
+        )
