@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
+    from models.distortion_aware import make_distortion_aware as make_distortion_aware
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
     from models.hexunet import HexUNet as HexUNet
@@ -43,6 +44,7 @@ _FILES = {
     "face_neighbors": "tables",
     "hexagonal_rings": "tables",
     "initialize": "initialization",
+    "make_distortion_aware": "distortion_aware",
     "mesh_operators": "tables",
     "widen_stem": "stem",
 }
