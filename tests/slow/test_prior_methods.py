@@ -11,8 +11,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
-import yaml
 
+from tangent_train.checkpoints.content import read_settings
 from tests.cli.tiny_runs import SMALL_ROOMS, results, run_in
 
 
@@ -53,7 +53,7 @@ def test_trains_resumes_evaluates_and_exports(
     small = "level=4", "trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"
     settings = "experiment=rooms/methods", f"network={name}", *rooms, *small, *method.settings
     run_in(tmp_path, "train", *settings)
-    config = yaml.safe_load((tmp_path / "run/config.yaml").read_text())
+    config = read_settings(tmp_path / "run" / "config.yaml")
     assert config["representation"]["_target_"].endswith(f".{method.representation}")
     last = tmp_path / "run/checkpoints/last.ckpt"
     before = torch.load(last, weights_only=True)["state_dict"]
