@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from models.sphere_context import SphereContext as SphereContext
     from models.stem import widen_stem as widen_stem
     from models.tables import face_neighbors as face_neighbors
+    from models.tables import gnomonic_taps as gnomonic_taps
     from models.tables import hexagonal_rings as hexagonal_rings
+    from models.tables import mapped_samples as mapped_samples
     from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
 
@@ -42,9 +44,11 @@ _FILES = {
     "Table": "mapped",
     "UNet": "unet",
     "face_neighbors": "tables",
+    "gnomonic_taps": "tables",
     "hexagonal_rings": "tables",
     "initialize": "initialization",
     "make_distortion_aware": "distortion_aware",
+    "mapped_samples": "tables",
     "mesh_operators": "tables",
     "widen_stem": "stem",
 }

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.mapped import MappedConv, Table, collect
-from models.tables import vertex_parents
+from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere_signals import IcosphereElements, check_signal
@@ -21,16 +21,22 @@ Pooling = Literal["first", "mean", "max"]
 Unpooling = Literal["zeros", "ones", "mean", "repeat"]
 
 
+def _resampled(x: Tensor, table: Table) -> Tensor:
+    return collect(x, table).transpose(1, 2).unsqueeze(2)
+
+
 class _Pool(nn.Module):
     """Signals on the next coarser icosphere."""
 
-    def __init__(self, pooling: Pooling, positions: int) -> None:
+    def __init__(self, pooling: Pooling, level: int, positions: int) -> None:
         super().__init__()
-        self.pooling, self.positions = pooling, positions
+        self.pooling, self.level, self.positions = pooling, level, positions
 
     def forward(self, x: Tensor) -> Tensor:
         if self.pooling == "first":
             return x[..., : self.positions]
+        if x.shape[-1] != 4 * self.positions:  # not faces
+            return _resampled(x, vertex_means(self.level + 1))
         children = x.reshape(*x.shape[:-1], self.positions, 4)
         return children.mean(-1) if self.pooling == "mean" else children.amax(-1)
 
@@ -46,7 +52,7 @@ class _Unpool(nn.Module):
         if self.unpooling == "repeat":
             return x.repeat_interleave(4, -1)
         if self.unpooling == "mean":
-            return collect(x, vertex_parents(self.level)).transpose(1, 2).unsqueeze(2)
+            return _resampled(x, vertex_parents(self.level))
         new = 0, self.positions - x.shape[-1]
         return functional.pad(x, new, value=float(self.unpooling == "ones"))
 
@@ -66,11 +72,12 @@ class IcosphereUNet(ResidualUNet):
         level: Level s of the icosphere.
         table: Makes the table of a level. Its positions are the vertices or faces.
         widths: Channels at each level, from s down.
-        pooling: Signals of a coarser level: the `first` vertices, which it has too, or for faces
-            the `mean` or `max` of four.
+        pooling: Signals of a coarser level: the `first` vertices, which it has too, or the `mean`
+            of each and its ring. For faces, the `mean` or `max` of four.
         unpooling: Values of the new vertices of a finer level, before a convolution: `zeros` (the
             article), `ones` (its released code) or the `mean` of the two vertices of the edge. For
             faces: `repeat`.
+        normalized_ups: True to normalize and rectify after that convolution.
 
     Raises:
         SettingError: There are more widths than levels, or a kind of pooling is not for the
@@ -92,6 +99,7 @@ class IcosphereUNet(ResidualUNet):
         widths: Sequence[int] = (32, 64, 128, 256, 512, 512),
         pooling: Pooling = "first",
         unpooling: Unpooling = "zeros",
+        normalized_ups: bool = False,
     ) -> None:
         if len(widths) > level + 1:
             raise SettingError(
@@ -102,7 +110,7 @@ class IcosphereUNet(ResidualUNet):
         tables = [table(level - k) for k in range(len(widths))]
         positions = [one.inputs for one in tables]
         elements: IcosphereElements = "vertices"
-        choices = {"pooling": ("first",), "unpooling": ("zeros", "ones", "mean")}
+        choices = {"pooling": ("first", "mean"), "unpooling": ("zeros", "ones", "mean")}
         if positions[0] == 20 * 4**level:
             elements = "faces"
             choices = {"pooling": ("mean", "max"), "unpooling": ("repeat",)}
@@ -114,14 +122,17 @@ class IcosphereUNet(ResidualUNet):
 
         def up(channels: int, k: int) -> nn.Module:
             unpool = _Unpool(unpooling, level - k, positions[k])
-            return nn.Sequential(unpool, convolutions[k](channels, channels))
+            layers = [unpool, convolutions[k](channels, channels)]
+            if normalized_ups:
+                layers += [nn.BatchNorm2d(channels), nn.ReLU(inplace=True)]
+            return nn.Sequential(*layers)
 
         super().__init__(
             in_channels,
             num_classes,
             widths,
             convolutions,
-            pools=[_Pool(pooling, number) for number in positions[1:]],
+            pools=[_Pool(pooling, level - k, positions[k]) for k in range(1, len(widths))],
             ups=[partial(up, k=k) for k in range(len(widths) - 1)],
         )
         self.level, self.elements = level, elements

@@ -174,3 +174,18 @@ def mapped_samples(level: int, directions_xyz: NDArray[np.float64]) -> Table:
     vertices, faces = icosphere(level)
     shape = (*directions_xyz.shape[:2], 3)
     return Table.of_entries(faces[found].reshape(shape), weights.reshape(shape), len(vertices))
+
+
+@lru_cache(_LEVELS)
+def vertex_means(level: int) -> Table:
+    """Return the table that halves the resolution of signals on vertices, with one value each.
+
+    It is the mean of the seven rows of `hexagonal_rings`: a vertex and the neighbors around it.
+
+    Args:
+        level: Level of the signals, at least 1.
+    """
+    rings = hexagonal_rings(level)
+    count = len(icosphere(level - 1).vertices)
+    means = sparse.kron(sparse.eye_array(count), np.full((1, rings.taps), 1 / rings.taps), "csr")
+    return Table.of_operators([means @ rings.matrix[: count * rings.taps]])

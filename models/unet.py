@@ -73,7 +73,7 @@ class Down(nn.Sequential):
 class _Up(nn.Module):
     """A finer resolution, merged with the encoder's features of that resolution."""
 
-    def __init__(self, up: nn.Module, merge: Residual) -> None:
+    def __init__(self, up: nn.Module, merge: nn.Module) -> None:
         super().__init__()
         self.up = up
         self.merge = merge
@@ -94,6 +94,7 @@ class ResidualUNet(nn.Module):
         pools: Layers that lead from each resolution but the coarsest to the next.
         ups: Make the layers that lead to each resolution but the coarsest from the next, from their
             number of channels.
+        block: Makes a block from its numbers of input and output channels and the convolution.
     """
 
     def __init__(
@@ -104,11 +105,12 @@ class ResidualUNet(nn.Module):
         convolutions: Sequence[Convolution],
         pools: Sequence[nn.Module],
         ups: Sequence[Callable[[int], nn.Module]],
+        block: Callable[[int, int, Convolution], nn.Module] = Residual,
     ) -> None:
         super().__init__()
         self.stem = convolutions[0](in_channels, widths[0])
         self.downs = nn.ModuleList(
-            nn.Sequential(pool, Residual(*channels, convolution))
+            nn.Sequential(pool, block(*channels, convolution))
             for pool, channels, convolution in zip(
                 pools, pairwise(widths), convolutions[1:], strict=True
             )
@@ -118,7 +120,7 @@ class ResidualUNet(nn.Module):
         for i in reversed(range(len(widths) - 1)):
             out_channels = widths[max(i - 1, 0)]
             merge = below + widths[i], out_channels, convolutions[i]
-            self.ups.append(_Up(ups[i](below), Residual(*merge)))
+            self.ups.append(_Up(ups[i](below), block(*merge)))
             below = out_channels
         self.head = convolutions[0](below, num_classes)
 
