@@ -32,6 +32,9 @@ class PriorMethod(NamedTuple):
 
 NETWORKS = {
     "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    "spherenet_unet": PriorMethod(
+        ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
+    ),
 }
 
 
