@@ -14,11 +14,13 @@ from tangent_train.cli.run import build
 from tangent_train.files import config_folder
 from tangent_train.inference.export import SUFFIXES, export_network
 from tests.running import composed_settings
+from tests.slow.test_prior_methods import NETWORKS as PRIOR_METHODS
 from tests.tasks.odd_networks import assert_same, scores_of, some_images
 from tests.tasks.small_networks import save_checkpoint
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
 NETWORKS -= {"fcn_resnet_coco"}  # fcn_resnet with weights from the internet
+NETWORKS -= PRIOR_METHODS.keys()
 OF_SHAPES = {"shape_classifier", "shape_classifier_16"}
 ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
 """Of the same parts as others."""
