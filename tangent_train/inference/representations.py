@@ -46,6 +46,9 @@ _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
 _ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
 
+_NOT_VIEWS = "icosphere", "perspective"
+"""Options of the configs of representations that are not views for networks of photos."""
+
 _VIEWS = "ring_wide"
 """Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
 
@@ -273,7 +276,7 @@ def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
     changes = {"option": views} if isinstance(views, str) else dict(views)
     folder, option = config_folder() / "representation", changes.pop("option", None)
     files = sorted(folder.glob("*.yaml"))
-    known = {file.stem: file for file in files if file.stem not in ("icosphere", "perspective")}
+    known = {file.stem: file for file in files if not file.stem.startswith(_NOT_VIEWS)}
     if option not in known:
         raise SettingError("views", found=views, expected=f"an option: {', '.join(known)}")
     section: Any = OmegaConf.to_container(OmegaConf.load(known[option]))

@@ -357,5 +357,6 @@ def test_a_network_on_an_icosphere_takes_only_its_signals() -> None:
             PanoramaViews(trained, base_level=1)
         with pytest.raises(SettingError, match="projection: found perspective"):
             PhotoViews(trained)
-    with pytest.raises(SettingError, match="views: found icosphere; expected an option"):
-        PanoramaViews(trained_network(TANGENT), views="icosphere")
+    for views in ("icosphere", "icosphere_faces"):
+        with pytest.raises(SettingError, match=f"views: found {views}; expected an option"):
+            PanoramaViews(trained_network(TANGENT), views=views)
