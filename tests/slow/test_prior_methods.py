@@ -30,8 +30,12 @@ class PriorMethod(NamedTuple):
     has_onnx: bool = True
 
 
+_NARROW = ("network.widths=[4,8,8]",)
 NETWORKS = {
-    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    "ugscnn": PriorMethod(_NARROW),
+    "hexrunet": PriorMethod(_NARROW),
+    "spherephd": PriorMethod(_NARROW),
+    "spherenet_icosphere": PriorMethod(_NARROW),
 }
 
 
