@@ -36,6 +36,9 @@ NETWORKS = {
     "hexrunet": PriorMethod(_NARROW),
     "spherephd": PriorMethod(_NARROW),
     "spherenet_icosphere": PriorMethod(_NARROW),
+    "spherenet_unet": PriorMethod(
+        ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
+    ),
 }
 
 
