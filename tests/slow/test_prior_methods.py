@@ -30,8 +30,15 @@ class PriorMethod(NamedTuple):
     has_onnx: bool = True
 
 
+_NARROW = ("network.widths=[4,8,8]",)
 NETWORKS = {
-    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    "ugscnn": PriorMethod(_NARROW),
+    "hexrunet": PriorMethod(_NARROW),
+    "spherephd": PriorMethod(_NARROW),
+    "spherenet_icosphere": PriorMethod(_NARROW),
+    "spherenet_unet": PriorMethod(
+        ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
+    ),
 }
 
 
