@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from models.stem import widen_stem as widen_stem
     from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
+    from models.zonal import ZonalClassifier as ZonalClassifier
 
 _FILES = {
     "AuxiliaryHead": "auxiliary_head",
@@ -36,6 +37,7 @@ _FILES = {
     "SphereContext": "sphere_context",
     "Table": "mapped",
     "UNet": "unet",
+    "ZonalClassifier": "zonal",
     "initialize": "initialization",
     "mesh_operators": "tables",
     "widen_stem": "stem",

@@ -7,6 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor
 
@@ -20,6 +22,7 @@ from tests.tasks.small_networks import save_checkpoint
 torch_harmonics = pytest.importorskip("torch_harmonics")
 
 from models.harmonic_network import HarmonicNetwork, use_pixel_rows  # noqa: E402
+from models.zonal import ZonalClassifier, ZonalConvolution  # noqa: E402
 
 NETWORKS = {"spherical_unet": 444_045, "spherical_segformer": 393_677, "sfno": 591_936}
 """Parameters with four channels and 13 classes."""
@@ -90,3 +93,63 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     monkeypatch.setitem(sys.modules, "torch_harmonics.examples", None)
     with pytest.raises(SettingError, match=r"network=SphericalUNet: .*'\.\[spectral\]'"):
         HarmonicNetwork("SphericalUNet", 3, 5, 3, {})
+
+
+def band_limited(coefficients: NDArray[np.complex128], rotation: Rotation) -> Tensor:
+    """Panoramas ``(…, 64, 128)`` of real functions, rotated, from coefficients ``(…, l, m)``."""
+    x, y, z = np.moveaxis(equirect_directions((64, 128)) @ rotation.as_matrix(), -1, 0)
+    angles = np.arccos(z.clip(-1, 1)), np.arctan2(y, x)
+    degrees = range(coefficients.shape[-1])
+    basis = np.stack([[sph_harm_y(k, m, *angles) for m in degrees] for k in degrees])
+    return torch.tensor(np.einsum("...lm,lmhw->...hw", coefficients, basis).real).float()
+
+
+def test_zonal_convolution_is_the_integral_over_the_sphere() -> None:
+    """(f * h)(x) = 2π ∫ h(x·y) f(y) dy, with Gauss–Legendre quadrature in float64."""
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(size=(2, 6, 6)) + 1j * rng.normal(size=(2, 6, 6))
+    convolution = ZonalConvolution(2, 3, (64, 128), anchors=4, rows=64)
+    filters = convolution.weight.detach().double().numpy()
+    spectrum = np.apply_along_axis(
+        lambda h: np.interp(np.linspace(0, 3, 32), np.arange(4), h), -1, filters
+    )
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    longitudes = np.arange(80) * np.pi / 40
+    z, turn = np.meshgrid(nodes, longitudes, indexing="ij")
+    across = np.sqrt(1 - z**2)
+    points = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
+    orders = [[sph_harm_y(k, m, np.arccos(z), turn) for m in range(6)] for k in range(6)]
+    signal = np.einsum("clm,lmij->cij", coefficients, np.array(orders)).real
+    results = convolution(band_limited(coefficients, Rotation.identity())[None])[0]
+    places = [(0, 0), (13, 40), (32, 63), (63, 5)]
+    for row, column in places:
+        direction = equirect_directions((64, 128))[row, 2 * column]
+        scaled = spectrum * np.sqrt((2 * np.arange(32) + 1) / (4 * np.pi))
+        kernels = np.polynomial.legendre.legval(points @ direction, np.moveaxis(scaled, -1, 0))
+        integral = np.einsum("dcij,cij,i->d", kernels, signal, weights) * np.pi / 40
+        torch.testing.assert_close(
+            results[:, row, column].double(), torch.tensor(2 * np.pi * integral), rtol=0, atol=1e-5
+        )
+
+
+def test_scores_of_the_zonal_classifier_do_not_change_under_rotation() -> None:
+    """Inputs are band-limited; what remains is aliasing of the nonlinearity."""
+    torch.manual_seed(0)
+    network = ZonalClassifier(2, 40, 5)
+    assert sum(p.numel() for p in network.parameters()) == 487_592
+    rng = np.random.default_rng(0)
+    coefficients = rng.normal(size=(4, 2, 4, 4)) + 1j * rng.normal(size=(4, 2, 4, 4))
+    turns = Rotation.random(2, random_state=1)
+    upright, *rotated = (
+        band_limited(coefficients, r)[:, None] for r in (Rotation.identity(), *turns)
+    )
+    with torch.no_grad():
+        network.train()(upright)
+        scores, *others = (network.eval()(images) for images in (upright, *rotated))
+    spread = (scores - scores.mean(dim=0)).norm()
+    assert spread > 1
+    for other in others:
+        assert (other - scores).norm() / spread < 1e-3
+    network.zero_grad()
+    network(upright).square().sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
