@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from models.auxiliary_head import AuxiliaryHead as AuxiliaryHead
+    from models.distortion_aware import make_distortion_aware as make_distortion_aware
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
     from models.hexunet import HexUNet as HexUNet
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
     from models.icocnn import IcoCNN as IcoCNN
+    from models.icosphere_unet import IcosphereUNet as IcosphereUNet
     from models.initialization import initialize as initialize
     from models.mapped import MappedConv as MappedConv
     from models.mapped import Table as Table
@@ -20,6 +22,10 @@ if TYPE_CHECKING:
     from models.sphere_attention import SphereAttention as SphereAttention
     from models.sphere_context import SphereContext as SphereContext
     from models.stem import widen_stem as widen_stem
+    from models.tables import face_neighbors as face_neighbors
+    from models.tables import gnomonic_taps as gnomonic_taps
+    from models.tables import hexagonal_rings as hexagonal_rings
+    from models.tables import mapped_samples as mapped_samples
     from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
     from models.zonal import ZonalClassifier as ZonalClassifier
@@ -31,6 +37,7 @@ _FILES = {
     "HexUNet": "hexunet",
     "HuggingFaceNetwork": "huggingface",
     "IcoCNN": "icocnn",
+    "IcosphereUNet": "icosphere_unet",
     "MappedConv": "mapped",
     "ShapeClassifier": "shape_classifier",
     "SphereAttention": "sphere_attention",
@@ -38,7 +45,12 @@ _FILES = {
     "Table": "mapped",
     "UNet": "unet",
     "ZonalClassifier": "zonal",
+    "face_neighbors": "tables",
+    "gnomonic_taps": "tables",
+    "hexagonal_rings": "tables",
     "initialize": "initialization",
+    "make_distortion_aware": "distortion_aware",
+    "mapped_samples": "tables",
     "mesh_operators": "tables",
     "widen_stem": "stem",
 }

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
-from itertools import pairwise, product
+from functools import lru_cache, partial
+from itertools import product
 
 import numpy as np
 import torch
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
+from models.unet import Convolution, ResidualUNet
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import MAX_LEVEL, icosphere
 from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
@@ -217,13 +218,25 @@ class _Pool(_OnAtlas):
         return torch.cat([corners, most[..., _CORNERS:]], dim=-1)
 
 
-class _Residual(nn.Module):
-    """A convolution and a shortcut, batch-normalized with statistics of all orientations."""
+class _Unpool(_OnAtlas):
+    """The next finer level: new vertices are the mean of two."""
 
-    def __init__(self, in_channels: int, out_channels: int, level: int) -> None:
+    def forward(self, x: Tensor) -> Tensor:
+        """Return ``(n, C, 6, V)``."""
+        return torch.cat([x, _take(x, self.parents).mean(dim=3)], dim=-1)
+
+
+def _unpool(_channels: int, level: int) -> nn.Module:
+    return _Unpool(level, "parents")
+
+
+class _Block(nn.Module):
+    """A convolution and a shortcut; orientations share statistics of batch normalization."""
+
+    def __init__(self, in_channels: int, out_channels: int, convolution: Convolution) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            GaugeConv(in_channels, out_channels, level), nn.BatchNorm2d(out_channels)
+            convolution(in_channels, out_channels), nn.BatchNorm2d(out_channels)
         )
         self.shortcut = nn.Conv2d(in_channels, out_channels, 1)
 
@@ -232,25 +245,12 @@ class _Residual(nn.Module):
         return torch.relu(self.body(x) + self.shortcut(x))
 
 
-class _Up(_OnAtlas):
-    """The next finer level, interpolated between vertices, merged with the encoder's features."""
-
-    def __init__(self, in_channels: int, skip_channels: int, out_channels: int, level: int) -> None:
-        super().__init__(level, "parents")
-        self.merge = _Residual(in_channels + skip_channels, out_channels, level)
-
-    def forward(self, x: Tensor, skip: Tensor) -> Tensor:
-        """Return regular features ``(n, out_channels, 6, V)`` of this level."""
-        finer = torch.cat([x, _take(x, self.parents).mean(dim=3)], dim=-1)
-        merged: Tensor = self.merge(torch.cat([finer, skip], dim=1))
-        return merged
-
-
 @registered
-class IcoCNN(nn.Module):
+class IcoCNN(ResidualUNet):
     """Residual U-Net of gauge equivariant convolutions (Cohen et al. 2019, supplement, 2D-3D-S).
 
-    Rotations of the panorama by the 60 rotations of the icosahedron rotate its scores.
+    Rotations of the signal by the 60 rotations of the icosahedron rotate its scores. Coarser levels
+    have the maximum of each vertex and its neighbors; finer ones are interpolated.
 
     Args:
         in_channels: Channels of the signal: 3 for RGB, 4 for RGB-D.
@@ -260,6 +260,10 @@ class IcoCNN(nn.Module):
 
     Raises:
         SettingError: There are too many widths for the level.
+
+    Example:
+        >>> sum(p.numel() for p in IcoCNN(4, 13, 5).parameters())
+        533973
     """
 
     def __init__(
@@ -269,43 +273,35 @@ class IcoCNN(nn.Module):
         level: int,
         widths: Sequence[int] = (8, 16, 32, 64, 64),
     ) -> None:
-        super().__init__()
         if not 0 < len(widths) <= level + 1:
             raise SettingError(
                 "network.widths", found=list(widths), expected=f"1 to {level + 1} at level {level}"
             )
+        levels = range(level, level - len(widths), -1)
+        super().__init__(
+            in_channels,
+            num_classes,
+            widths,
+            convolutions=[partial(GaugeConv, level=r) for r in levels],
+            pools=[_Pool(r, "pooled") for r in levels[:-1]],
+            ups=[partial(_unpool, level=r) for r in levels[:-1]],
+            block=_Block,
+        )
         self.level = level
         self.stem = nn.Sequential(
             GaugeConv(in_channels, widths[0], level, given=1),
             nn.BatchNorm2d(widths[0]),
             nn.ReLU(),
         )
-        self.downs = nn.ModuleList(
-            nn.Sequential(_Pool(level - i, "pooled"), _Residual(a, b, level - i - 1))
-            for i, (a, b) in enumerate(pairwise(widths))
-        )
-        below, ups = widths[-1], []
-        for i in reversed(range(len(widths) - 1)):
-            out_channels = widths[max(i - 1, 0)]
-            ups.append(_Up(below, widths[i], out_channels, level - i))
-            below = out_channels
-        self.ups = nn.ModuleList(ups)
-        self.head = GaugeConv(below, num_classes, level, returned=1)
+        self.head = GaugeConv(widths[0], num_classes, level, returned=1)
 
     def forward(
-        self, signals: Float[Tensor, "batch channels 1 vertices"]
-    ) -> Float[Tensor, "batch classes 1 vertices"]:
-        """Return scores of every vertex.
+        self, images: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch classes height width"]:
+        """Return scores of every vertex: images ``(B, C, 1, V)``.
 
         Raises:
-            SettingError: The input is not a signal on the vertices of the network's level.
+            SettingError: The images are not signals on the vertices of the network's level.
         """
-        check_signal(signals.shape, self.level)
-        skips = [self.stem(signals)]
-        for down in self.downs:
-            skips.append(down(skips[-1]))
-        x = skips.pop()
-        for up in self.ups:
-            x = up(x, skips.pop())
-        scores: Tensor = self.head(x)
-        return scores
+        check_signal(images.shape, self.level)
+        return super().forward(images)

@@ -156,7 +156,13 @@ def collect(
     Raises:
         SettingError: The signals are images, or have another number of positions.
     """
-    check_positions(signals, table.inputs)
+    if signals.shape[2:] != (1, table.inputs):
+        raise SettingError(
+            "input of a convolution on the sphere",
+            found=f"shape {tuple(signals.shape)}",
+            expected=f"(batch, channels, 1, {table.inputs})",
+            remedy="Set representation=icosphere, with the level and elements of the network.",
+        )
     rows = signals[:, :, 0].transpose(1, 2)
     rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
     if torch.compiler.is_exporting():  # no format of networks has a sparse product
@@ -166,25 +172,6 @@ def collect(
         product = _Product.apply(rows.contiguous(), *table.bags(rows.device, rows.dtype))
     shape = -1, table.outputs, table.taps * rows.shape[2]
     return product.reshape(shape).to(signals.dtype)
-
-
-def check_positions(signals: Tensor, positions: int) -> None:
-    """Refuse images, and signals of another icosphere.
-
-    Args:
-        signals: Input of a network or layer, ``(B, C, 1, V)`` expected.
-        positions: Expected number V of vertices or faces.
-
-    Raises:
-        SettingError: The shape is another one.
-    """
-    if signals.ndim != 4 or signals.shape[2:] != (1, positions):
-        raise SettingError(
-            "input of the network",
-            found=f"shape {tuple(signals.shape)}",
-            expected=f"(batch, channels, 1, {positions}), values on an icosphere",
-            remedy="Set representation=icosphere, with the level and the `on` of the network.",
-        )
 
 
 class MappedConv(nn.Module):

@@ -18,13 +18,6 @@ _LEVELS = 9
 """Tables of one method that are kept: one per level of the icosphere."""
 
 
-def unit_vertices(level: int) -> NDArray[np.float64]:
-    """Return the directions ``(V, 3)`` of the vertices."""
-    vertices = icosphere(level).vertices
-    directions: NDArray[np.float64] = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return directions
-
-
 @registered
 @lru_cache(_LEVELS)
 def mesh_operators(level: int) -> Table:
@@ -39,7 +32,7 @@ def mesh_operators(level: int) -> Table:
     Args:
         level: Level s of the icosphere.
     """
-    faces, points = icosphere(level).faces, unit_vertices(level)
+    faces, points = icosphere(level).faces, icosphere_directions(level)
     a, b, c = np.moveaxis(points[faces], 1, 0)
     double_normals = np.cross(b - a, c - a)
     double_areas = np.linalg.norm(double_normals, axis=1, keepdims=True)
@@ -137,6 +130,22 @@ def face_neighbors(level: int) -> Table:
     return Table.of_entries(np.concatenate(rows, axis=1)[..., None], np.ones(1), count)
 
 
+@lru_cache(_LEVELS)
+def vertex_parents(level: int) -> Table:
+    """Return the table that doubles the resolution of signals on vertices, with one value each.
+
+    A vertex of the coarser level keeps its value; a new vertex, on an edge, takes the mean of the
+    edge's two ends.
+
+    Args:
+        level: Level of the result, at least 1.
+    """
+    coarse = icosphere(level - 1)
+    parents = np.tile(np.arange(len(icosphere(level).vertices))[:, None], 2)
+    parents[icosphere(level).faces[3::4]] = coarse.faces[:, [[1, 2], [2, 0], [0, 1]]]
+    return Table.of_entries(parents[:, None], np.array(0.5), len(coarse.vertices))
+
+
 @registered
 @lru_cache(_LEVELS)
 def gnomonic_taps(level: int) -> Table:
@@ -165,3 +174,18 @@ def mapped_samples(level: int, directions_xyz: NDArray[np.float64]) -> Table:
     vertices, faces = icosphere(level)
     shape = (*directions_xyz.shape[:2], 3)
     return Table.of_entries(faces[found].reshape(shape), weights.reshape(shape), len(vertices))
+
+
+@lru_cache(_LEVELS)
+def vertex_means(level: int) -> Table:
+    """Return the table that halves the resolution of signals on vertices, with one value each.
+
+    It is the mean of the seven rows of `hexagonal_rings`: a vertex and the neighbors around it.
+
+    Args:
+        level: Level of the signals, at least 1.
+    """
+    rings = hexagonal_rings(level)
+    count = len(icosphere(level - 1).vertices)
+    means = sparse.kron(sparse.eye_array(count), np.full((1, rings.taps), 1 / rings.taps), "csr")
+    return Table.of_operators([means @ rings.matrix[: count * rings.taps]])

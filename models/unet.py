@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 
 import torch
@@ -12,6 +12,14 @@ from torch import Tensor, nn
 from tangent_train.errors import SettingError, width_height
 from tangent_train.registry import registered
 
+Convolution = Callable[[int, int], nn.Module]
+"""Makes a layer from its numbers of input and output channels."""
+
+
+def convolution_3x3(in_channels: int, out_channels: int) -> nn.Module:
+    """Return a 3×3 convolution that keeps the size."""
+    return nn.Conv2d(in_channels, out_channels, 3, padding=1)
+
 
 class Residual(nn.Module):
     """Bottleneck 1×1 – 3×3 – 1×1 with a 1×1 shortcut, all batch-normalized (Jiang et al. 2019).
@@ -19,16 +27,19 @@ class Residual(nn.Module):
     Args:
         in_channels: Input channels.
         out_channels: Output channels. The bottleneck has the smaller of the two.
+        convolution: Makes the layer in the middle.
     """
 
-    def __init__(self, in_channels: int, out_channels: int) -> None:
+    def __init__(
+        self, in_channels: int, out_channels: int, convolution: Convolution = convolution_3x3
+    ) -> None:
         super().__init__()
         neck = min(in_channels, out_channels)
         self.body = nn.Sequential(
             nn.Conv2d(in_channels, neck, 1),
             nn.BatchNorm2d(neck),
             nn.ReLU(inplace=True),
-            nn.Conv2d(neck, neck, 3, padding=1),
+            convolution(neck, neck),
             nn.BatchNorm2d(neck),
             nn.ReLU(inplace=True),
             nn.Conv2d(neck, out_channels, 1),
@@ -60,20 +71,79 @@ class Down(nn.Sequential):
 
 
 class _Up(nn.Module):
-    """Twice the resolution, merged with the encoder's features of that resolution."""
+    """A finer resolution, merged with the encoder's features of that resolution."""
 
-    def __init__(self, in_channels: int, skip_channels: int, out_channels: int) -> None:
+    def __init__(self, up: nn.Module, merge: nn.Module) -> None:
         super().__init__()
-        self.up = nn.ConvTranspose2d(in_channels, in_channels, 4, stride=2, padding=1)
-        self.merge = Residual(in_channels + skip_channels, out_channels)
+        self.up = up
+        self.merge = merge
 
     def forward(self, x: Tensor, skip: Tensor) -> Tensor:
         merged: Tensor = self.merge(torch.cat([self.up(x), skip], dim=1))
         return merged
 
 
+class ResidualUNet(nn.Module):
+    """UNet of residual blocks, for any kind of convolution (after Jiang et al. 2019).
+
+    Args:
+        in_channels: Channels of the image.
+        num_classes: Classes K.
+        widths: Channels at each resolution, from the finest.
+        convolutions: Make the convolutions at each resolution.
+        pools: Layers that lead from each resolution but the coarsest to the next.
+        ups: Make the layers that lead to each resolution but the coarsest from the next, from their
+            number of channels.
+        block: Makes a block from its numbers of input and output channels and the convolution.
+    """
+
+    def __init__(
+        self,
+        in_channels: int,
+        num_classes: int,
+        widths: Sequence[int],
+        convolutions: Sequence[Convolution],
+        pools: Sequence[nn.Module],
+        ups: Sequence[Callable[[int], nn.Module]],
+        block: Callable[[int, int, Convolution], nn.Module] = Residual,
+    ) -> None:
+        super().__init__()
+        self.stem = convolutions[0](in_channels, widths[0])
+        self.downs = nn.ModuleList(
+            nn.Sequential(pool, block(*channels, convolution))
+            for pool, channels, convolution in zip(
+                pools, pairwise(widths), convolutions[1:], strict=True
+            )
+        )
+        self.ups = nn.ModuleList()
+        below = widths[-1]
+        for i in reversed(range(len(widths) - 1)):
+            out_channels = widths[max(i - 1, 0)]
+            merge = below + widths[i], out_channels, convolutions[i]
+            self.ups.append(_Up(ups[i](below), block(*merge)))
+            below = out_channels
+        self.head = convolutions[0](below, num_classes)
+
+    def forward(
+        self, images: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch classes height width"]:
+        """Return scores of every pixel."""
+        skips = [self.stem(images)]
+        for down in self.downs:
+            skips.append(down(skips[-1]))
+        x = skips.pop()
+        for up in self.ups:
+            x = up(x, skips.pop())
+        scores: Tensor = self.head(x)
+        return scores
+
+
+def _transposed(channels: int) -> nn.Module:
+    return nn.ConvTranspose2d(channels, channels, 4, stride=2, padding=1)
+
+
 @registered
-class UNet(nn.Module):
+class UNet(ResidualUNet):
     """Residual UNet (paper, supplement, "Network training details"; after Jiang et al. 2019).
 
     With the default widths, four input channels and 14 classes it has the 2,896,654 trainable
@@ -95,18 +165,16 @@ class UNet(nn.Module):
         num_classes: int,
         widths: Sequence[int] = (16, 32, 64, 128, 256, 256),
     ) -> None:
-        super().__init__()
-        self.stride = 2 ** (len(widths) - 1)
-        self.stem = nn.Conv2d(in_channels, widths[0], 3, padding=1)
-        self.downs = nn.ModuleList(Down(a, b) for a, b in pairwise(widths))
-        ups = []
-        below = widths[-1]
-        for i in reversed(range(len(widths) - 1)):
-            out_channels = widths[max(i - 1, 0)]
-            ups.append(_Up(below, widths[i], out_channels))
-            below = out_channels
-        self.ups = nn.ModuleList(ups)
-        self.head = nn.Conv2d(below, num_classes, 3, padding=1)
+        fewer = len(widths) - 1
+        super().__init__(
+            in_channels,
+            num_classes,
+            widths,
+            convolutions=[convolution_3x3] * len(widths),
+            pools=[nn.AvgPool2d(2) for _ in range(fewer)],
+            ups=[_transposed] * fewer,
+        )
+        self.stride = 2**fewer
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -117,14 +185,7 @@ class UNet(nn.Module):
             SettingError: A side is not a multiple of the network's stride (32 by default).
         """
         check_sides(images, self.stride, "UNet")
-        skips = [self.stem(images)]
-        for down in self.downs:
-            skips.append(down(skips[-1]))
-        x = skips.pop()
-        for up in self.ups:
-            x = up(x, skips.pop())
-        scores: Tensor = self.head(x)
-        return scores
+        return super().forward(images)
 
 
 def check_sides(images: Tensor, stride: int, network: str) -> None:

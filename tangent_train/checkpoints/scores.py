@@ -11,8 +11,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from models.distortion_aware import make_distortion_aware
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.errors import SettingError
+from tangent_train.errors import SettingError, width_height
 
 _LABEL_MAP = 3
 """Number of dimensions of label maps without an axis of scores."""
@@ -40,6 +41,7 @@ class ClassScoreNetwork(nn.Module):
 
     Attributes:
         num_scores: Number of scores of a pixel: K, or the number of groups.
+        tile: See above.
     """
 
     def __init__(
@@ -54,7 +56,7 @@ class ClassScoreNetwork(nn.Module):
         self.network = network
         self.num_scores = num_classes if groups is None else len(groups)
         self._groups = groups
-        self._tile = tile
+        self.tile = tile
         self._kind = kind
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
@@ -69,9 +71,9 @@ class ClassScoreNetwork(nn.Module):
             SettingError: The network returns another number of scores.
         """
         size = (images.shape[-2], images.shape[-1])
-        if self._tile in (None, size):
+        if self.tile in (None, size):
             return self._class_scores(images, *arguments, **settings)
-        return _tiled_scores(self._class_scores, images, self._tile)
+        return _tiled_scores(self._class_scores, images, self.tile)
 
     def _class_scores(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
         returned = self.network(images, *arguments, **settings)
@@ -88,6 +90,30 @@ class ClassScoreNetwork(nn.Module):
         if groups is None:
             return scores
         return torch.cat([_sum(scores, group) for group in groups], dim=1)
+
+
+def network_for_views(network: nn.Module, views: Any) -> nn.Module:
+    """Return a network as it is applied to views: distortion-aware if they ask for it.
+
+    Args:
+        network: The network, see `make_distortion_aware`.
+        views: Representation or `PanoramaViews`, with ``distortion_aware`` and ``image_size``.
+
+    Raises:
+        SettingError: The network cannot be applied to the whole view on the sphere.
+    """
+    if not getattr(views, "distortion_aware", False):
+        return network
+    tile = getattr(network, "tile", None)
+    if tile not in (None, views.image_size):
+        raise SettingError(
+            "distortion-aware convolutions",
+            found=f"a network that takes only images of {width_height(tile)}",
+            expected=f"one that takes whole equirectangular images of "
+            f"{width_height(views.image_size)}",
+            remedy="Import the network from torch, without image_size=.",
+        )
+    return make_distortion_aware(network)
 
 
 def plain_scores(returned: Any) -> Tensor:
@@ -151,10 +177,10 @@ def _tiled_scores(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor
     return result
 
 
-_PROBED = {1: (127, 131), 2: (67, 71), 4: (37, 41), 8: (17, 19), 14: (11, 13), 16: (11, 13)}
-_PROBED |= dict.fromkeys((32, 64, 128), (5, 7))
-"""Candidate multiples, and the factors to try each with. They are primes, so that a side has no
-other divisors; 14 is for transformers with patches of 14 pixels."""
+_PROBED = {1: 127, 2: 67, 4: 37, 8: 17, 14: 11, 16: 11} | dict.fromkeys((32, 64, 128), 5)
+"""Candidate multiples, and the factor of the height to try each with, a prime: the height has no
+other divisors. The width is twice the height, for networks of equirectangular images; 14 is for
+transformers with patches of 14 pixels."""
 
 
 def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
@@ -177,8 +203,8 @@ def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
 
 @torch.no_grad()
 def _least_multiple(network: nn.Module, in_channels: int, device: str) -> int | None:
-    for multiple, counts in _PROBED.items():
-        size = torch.Size(multiple * count for count in counts)
+    for multiple, count in _PROBED.items():
+        size = torch.Size((multiple * count, 2 * multiple * count))
         with suppress(Exception):  # networks refuse sizes with different errors
             scores = network(torch.zeros(1, in_channels, *size, device=device))
             if scores.shape[-2:] == size:

@@ -22,7 +22,7 @@ import torch
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.scores import ClassScoreNetwork, plain_scores
+from tangent_train.checkpoints.scores import ClassScoreNetwork, network_for_views, plain_scores
 from tangent_train.errors import SettingError, at_least
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.resampling import resize
@@ -257,6 +257,7 @@ class Predictor:
         self._per_forward = views_per_forward(view_sets.image_size)
         if images_per_forward is not None:
             self._per_forward = at_least("images_per_forward", images_per_forward, 1)
+        self._network = network_for_views(trained.network, view_sets)
         self._trained, self._view_sets = trained, view_sets
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
@@ -279,7 +280,7 @@ class Predictor:
             The scores. Score k belongs to label k + 1; the last score may belong to no class, see
             `TrainedNetwork.groups`.
         """
-        network: Any = self._trained.network
+        network: Any = self._network
         sets: list[tuple[Views, ViewImages, Tensor | None]] = []
         if sees_rays(network):
             network = partial(network, images_per_chunk=self._per_forward)

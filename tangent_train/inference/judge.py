@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from models.distortion_aware import make_ordinary
 from tangent_train.geometry import CubeGrid, TangentGrid
 from tangent_train.inference.engine import (
     RenderedViews,
@@ -24,6 +25,7 @@ from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from torch import nn
 
     from tangent_train.checkpoints.trained import TrainedNetwork
 
@@ -74,7 +76,7 @@ class NetworkJudge:
 
     def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the mean doubt of each view."""
-        network: Any = self.trained.network
+        network: Any = self._network
         upright, rays = self._views, None
         views = replace(upright, grid=upright.grid.with_rotation(upright_rotation(up)))
         per_forward = views_per_forward(views.grid.size)
@@ -86,6 +88,11 @@ class NetworkJudge:
             for _, scores in view_scores(network, rendered.of(views), len(views), per_forward, rays)
         ]
         return torch.cat(found).cpu().numpy()
+
+    @cached_property
+    def _network(self) -> nn.Module:
+        """The network for pinhole images."""
+        return make_ordinary(self.trained.network)
 
     @cached_property
     def _views(self) -> PinholeViews:

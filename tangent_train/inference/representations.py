@@ -92,6 +92,7 @@ class PanoramaViews:
 
     Attributes:
         representation: Representation of upright panoramas.
+        distortion_aware: See `EquirectRepresentation`; False for other representations.
 
     Raises:
         SettingError: The network does not support such views.
@@ -114,6 +115,7 @@ class PanoramaViews:
         # Views that the user chooses may name any setting.
         self.representation = _built(trained, settings, None if views else trained.source)
         self.image_size = self.representation.image_size
+        self.distortion_aware = getattr(self.representation, "distortion_aware", False)
         self.blend = self.representation.blend
         self._trained, self._fill = trained, fill or trained.fill
 

@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
+from tangent_train.checkpoints.scores import network_for_views
 from tangent_train.errors import SettingError, at_least
 from tangent_train.results.evaluation import plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
@@ -110,6 +111,7 @@ class Task(lightning.LightningModule, ABC):
                 remedy="To train parts not at all, use task.frozen=[…].",
             )
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
+        network = network_for_views(network, representation)
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
             self.network.compile(**compile)  # in place: names of tensors stay as they are

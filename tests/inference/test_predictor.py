@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import weakref
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,8 @@ from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.samples import render_inputs
+from models import make_distortion_aware
+from tangent_train.checkpoints.scores import size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
@@ -108,6 +111,7 @@ def test_memory_of_another_size_or_on_a_disk_is_released(
         (TANGENT, {"blend": "feather", "levels": [4, 3]}, 4),
         (ERP, {"rotations": 3}, 4),
         (ERP | {"rows": 24}, {"rotations": 2}, 3),
+        (ERP | {"distortion_aware": True}, {"rotations": 2}, 3),
     ],
 )
 @pytest.mark.parametrize("upright", [None, "auto"])
@@ -152,6 +156,22 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     np.testing.assert_array_equal(labels, expected)
     task.sees_rays = False
     assert (task.predict_labels(images, (32, 64)).numpy() - 1 != expected).any(), "attention"
+
+
+def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> None:
+    plain = trained_network(ERP)
+    aware = trained_network(ERP | {"distortion_aware": True})
+    image = InputImage(_blocks(32, 64))
+    converted = trained_network(ERP, inner=make_distortion_aware(plain.inner))
+    expected = _labels(converted, image)
+    np.testing.assert_array_equal(_labels(aware, image), expected)
+    assert (_labels(plain, image) != expected).mean() > 0.01
+    assert size_multiple_of(converted.network, 3) == 1
+    area = (-90, 90, -30, 30)
+    assert PanoramaViews(plain).description(area) == "1 views of 32 × 32"
+    assert PanoramaViews(aware).description(area) == "1 views of 64 × 32"
+    with pytest.raises(SettingError, match=r"only images of 32 × 32 .* Import the network from"):
+        _labels(replace(aware, fixed_size=(32, 32)), image)
 
 
 def test_elevation_follows_the_zenith() -> None:

@@ -15,7 +15,11 @@ from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, p
 from studies.fov import fov
 from studies.output import markdown
 from studies.representation_distortion import representation_distortion
+from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.surface_area import surface_area
+from tangent_train.geometry import random_rotation
+from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.rendering import IcosphereRepresentation
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"
 PAGE = (DOCS / "results" / "distortion.md").read_text(encoding="utf-8")
@@ -78,3 +82,26 @@ def test_enlargement_is_the_mean_enlargement_of_the_lens() -> None:
     columns = enlarge(dot, 0.5)[0, 0].sum(dim=0)
     found = float(columns @ torch.arange(57.0) / columns.sum())
     assert found - 28 == pytest.approx(20 * mean_enlargement(0.5), abs=0.1)
+
+
+def test_rotation_errors_are_those_of_the_network() -> None:
+    """Of a network of pixels none; of one that returns the height z, in closed form."""
+    representation, group = IcosphereRepresentation(3), icosahedral_rotations()
+    traces = np.sort(np.einsum("nij,mij->nm", group, group))
+    assert (abs(traces[:, -2:] - [1 + 2 * math.cos(math.radians(72)), 3]) < 1e-9).all()
+    pointwise = torch.nn.Conv2d(4, 3, 1)
+    assert mean_error(pointwise, representation, group, by_cells=True) < 1e-3
+    rotations = np.stack([random_rotation(np.random.default_rng(5)), np.eye(3)])
+    assert 0.1 < mean_error(pointwise, representation, rotations[:1]) < 10
+    assert mean_error(pointwise, representation, rotations[1:]) < 1e-3
+
+    height = torch.from_numpy(icosphere_directions(3)[:, 2]).float()
+
+    def fixed(x: torch.Tensor) -> torch.Tensor:
+        scores = torch.stack([torch.zeros_like(height), height / 1e3])
+        return scores[None, :, None].expand(len(x), -1, -1, -1)
+
+    # The probabilities are linear in z: the difference of Rz and z is √(2 − 2 R_zz) as large.
+    expected = np.sqrt(2 - 2 * group[:, 2, 2].clip(max=1)).mean()
+    found = mean_error(fixed, representation, group, by_cells=True)  # type: ignore[arg-type]
+    assert found == pytest.approx(100 * expected, rel=1e-3)

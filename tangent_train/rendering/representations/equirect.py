@@ -125,9 +125,12 @@ class EquirectRepresentation:
             interpolated to the panorama.
         rotations: Number of rotations about the vertical to average over. Each has its seam at
             another longitude.
+        distortion_aware: True to sample the convolutions of the network on the sphere, see
+            `models.make_distortion_aware`. The image is then always a whole one.
 
     Raises:
-        SettingError: `crop_deg` is not between 0 and 360, or `rows` or `rotations` is less than 1.
+        SettingError: `crop_deg` is not between 0 and 360, or is given with `distortion_aware`;
+            `rows` or `rotations` is less than 1.
     """
 
     blend: Blend = "nearest"
@@ -141,7 +144,11 @@ class EquirectRepresentation:
         erp_height: int | None = None,
         rows: int | None = None,
         rotations: int = 1,
+        distortion_aware: bool = False,
     ) -> None:
+        if crop_deg is not None and distortion_aware:
+            found = f"{crop_deg}, with distortion_aware"
+            raise SettingError("representation.crop_deg", found=found, expected="null: all of it")
         if crop_deg is not None and not 0 < crop_deg <= 360:
             raise SettingError("representation.crop_deg", found=crop_deg, expected="0 to 360")
         if rows is not None:
@@ -153,6 +160,7 @@ class EquirectRepresentation:
         self.crop_deg = crop_deg
         self.random_rotation = random_rotation
         self.mirror = mirror
+        self.distortion_aware = distortion_aware
         self._rows = rows or self.erp_height
         self._rotation: NDArray[np.float64] | None = None
         self._area = SphereArea.of(None)
@@ -170,10 +178,10 @@ class EquirectRepresentation:
 
         Their numbers are rounded up to a multiple of 32 (of a divisor of `rows`). Under rotation,
         evaluation takes as many as needed, and a training sample as many as without rotation,
-        where they see most of the area.
+        where they see most of the area. With `distortion_aware`, all of them are kept.
         """
         limited = copy.copy(self)
-        limited._area = SphereArea.of(None) if area is None else area
+        limited._area = SphereArea.of(None) if area is None or self.distortion_aware else area
         return limited
 
     @property

@@ -1,0 +1,86 @@
+"""Networks of prior methods train, resume, are evaluated and exported, as typed.
+
+A new network is a row of `NETWORKS`; `tests/slow/cli/test_networks.py` then leaves it out.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+
+from tangent_train.checkpoints.content import read_settings
+from tests.cli.tiny_runs import SMALL_ROOMS, results, run_in
+
+
+class PriorMethod(NamedTuple):
+    """A network of the config tree.
+
+    Attributes:
+        settings: Settings that make it small.
+        representation: Class of the representation that it chooses.
+        has_onnx: True if it can be written as an ONNX file; False if that is refused.
+        package: Package that it needs.
+    """
+
+    settings: tuple[str, ...] = ()
+    representation: str = "IcosphereRepresentation"
+    has_onnx: bool = True
+    package: str = "torch"
+
+
+NETWORKS = {
+    **dict.fromkeys(
+        ("spherical_unet", "spherical_segformer", "sfno"),
+        PriorMethod((), "EquirectRepresentation", has_onnx=False, package="torch_harmonics"),
+    ),
+    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+}
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, ...]:
+    """Settings of generated rooms, for the `data` of any command."""
+    folder = tmp_path_factory.mktemp("rooms")
+    of_data = (text for text in SMALL_ROOMS if text.startswith(("data.rooms.", "trainer.")))
+    settings = ("data=synthrooms", f"data.root={folder}/rooms", *of_data)
+    run_in(folder, "prepare", *settings, "level=4")
+    return settings
+
+
+@pytest.mark.parametrize("name", NETWORKS)
+def test_trains_resumes_evaluates_and_exports(
+    name: str, rooms: tuple[str, ...], tmp_path: Path
+) -> None:
+    method = NETWORKS[name]
+    pytest.importorskip(method.package)
+    small = "level=4", "trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"
+    settings = "experiment=rooms/methods", f"network={name}", *rooms, *small, *method.settings
+    run_in(tmp_path, "train", *settings)
+    config = read_settings(tmp_path / "run" / "config.yaml")
+    assert config["representation"]["_target_"].endswith(f".{method.representation}")
+    last = tmp_path / "run/checkpoints/last.ckpt"
+    before = torch.load(last, weights_only=True)["state_dict"]
+    run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
+    after = torch.load(last, weights_only=True)
+    assert after["epoch"] == 1
+    same = [n for n, tensor in before.items() if torch.equal(tensor, after["state_dict"][n])]
+    assert not [n for n in same if n.startswith("network.")], "tensors that do not learn"
+
+    run_in(tmp_path, "evaluate", f"checkpoint={last}", *rooms, "hydra.run.dir=evaluated")
+    expected = np.array(results(tmp_path / "evaluated")["confusion"])
+    for suffix in (".safetensors", ".onnx"):
+        export = f"checkpoint={last}", f"output=net{suffix}"
+        if suffix == ".onnx" and not method.has_onnx:
+            with pytest.raises(SystemExit, match=r"A \.safetensors file takes every network"):
+                run_in(tmp_path, "export", *export)
+            continue
+        run_in(tmp_path, "export", *export)
+        run_in(tmp_path, "evaluate", f"checkpoint=net{suffix}", *rooms, f"hydra.run.dir={suffix}")
+        found = np.array(results(tmp_path / suffix)["confusion"])
+        if suffix == ".safetensors":
+            np.testing.assert_array_equal(found, expected)
+        assert np.abs(found - expected).sum() <= 0.002 * expected.sum()
