@@ -28,13 +28,6 @@ NETWORKS = {"spherical_unet": 444_045, "spherical_segformer": 393_677, "sfno": 5
 """Parameters with four channels and 13 classes."""
 
 
-def harmonic(degree: int, order: int, rows: int) -> Tensor:
-    """Real part of a spherical harmonic at the pixel centers of a panorama, by SciPy."""
-    x, y, z = np.moveaxis(equirect_directions((rows, 2 * rows)), -1, 0)
-    values = sph_harm_y(degree, order, np.arccos(z), np.arctan2(y, x)).real
-    return torch.tensor(values, dtype=torch.float32)
-
-
 def network_of(name: str, level: int) -> Any:
     settings = (f"network={name}", f"level={level}", "data.inputs=[rgb,depth]")
     return build(composed_settings("train", *settings))[1].network
@@ -43,7 +36,9 @@ def network_of(name: str, level: int) -> Any:
 @pytest.mark.parametrize(("degree", "order"), [(0, 0), (3, 2), (20, 7), (31, 0), (31, 31)])
 def test_transforms_of_pixel_centers_are_exact(degree: int, order: int) -> None:
     """The nearest grid of torch-harmonics returns other coefficients."""
-    signal, errors = harmonic(degree, order, 64), []
+    coefficients = np.zeros((32, 32), dtype=complex)
+    coefficients[degree, order] = 1
+    signal, errors = panoramas(coefficients, Rotation.identity()), []
     for exact in (False, True):
         forward = torch_harmonics.RealSHT(64, 128, 32, 32, grid="legendre-gauss")
         inverse = torch_harmonics.InverseRealSHT(64, 128, 32, 32, grid="legendre-gauss")
@@ -95,13 +90,21 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
         HarmonicNetwork("SphericalUNet", 3, 5, 3, {})
 
 
-def band_limited(coefficients: NDArray[np.complex128], rotation: Rotation) -> Tensor:
-    """Panoramas ``(…, 64, 128)`` of real functions, rotated, from coefficients ``(…, l, m)``."""
-    x, y, z = np.moveaxis(equirect_directions((64, 128)) @ rotation.as_matrix(), -1, 0)
+def functions_at(
+    directions: NDArray[np.float64], coefficients: NDArray[np.complex128]
+) -> NDArray[np.float64]:
+    """Values of real functions at directions ``(h, w, 3)``, from coefficients ``(…, l, m)``."""
+    x, y, z = np.moveaxis(directions, -1, 0)
     angles = np.arccos(z.clip(-1, 1)), np.arctan2(y, x)
-    degrees = range(coefficients.shape[-1])
-    basis = np.stack([[sph_harm_y(k, m, *angles) for m in degrees] for k in degrees])
-    return torch.tensor(np.einsum("...lm,lmhw->...hw", coefficients, basis).real).float()
+    degrees, orders = np.nonzero(coefficients.reshape(-1, *coefficients.shape[-2:]).any(axis=0))
+    basis = sph_harm_y(degrees[:, None, None], orders[:, None, None], *angles)
+    return np.einsum("...k,khw->...hw", coefficients[..., degrees, orders], basis).real
+
+
+def panoramas(coefficients: NDArray[np.complex128], rotation: Rotation) -> Tensor:
+    """Rotated functions as images ``(…, 64, 128)``, see `functions_at`."""
+    directions = equirect_directions((64, 128)) @ rotation.as_matrix()
+    return torch.tensor(functions_at(directions, coefficients)).float()
 
 
 def test_zonal_convolution_is_the_integral_over_the_sphere() -> None:
@@ -113,14 +116,12 @@ def test_zonal_convolution_is_the_integral_over_the_sphere() -> None:
     spectrum = np.apply_along_axis(
         lambda h: np.interp(np.linspace(0, 3, 32), np.arange(4), h), -1, filters
     )
-    nodes, weights = np.polynomial.legendre.leggauss(40)
-    longitudes = np.arange(80) * np.pi / 40
-    z, turn = np.meshgrid(nodes, longitudes, indexing="ij")
-    across = np.sqrt(1 - z**2)
-    points = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=-1)
-    orders = [[sph_harm_y(k, m, np.arccos(z), turn) for m in range(6)] for k in range(6)]
-    signal = np.einsum("clm,lmij->cij", coefficients, np.array(orders)).real
-    results = convolution(band_limited(coefficients, Rotation.identity())[None])[0]
+    z, weights = np.polynomial.legendre.leggauss(40)
+    z, longitudes = np.meshgrid(z, np.arange(80) * np.pi / 40, indexing="ij")
+    points = np.stack([np.cos(longitudes), np.sin(longitudes), z], axis=-1)
+    points[..., :2] *= np.sqrt(1 - z**2)[..., None]
+    signal = functions_at(points, coefficients)
+    results = convolution(panoramas(coefficients, Rotation.identity())[None])[0]
     places = [(0, 0), (13, 40), (32, 63), (63, 5)]
     for row, column in places:
         direction = equirect_directions((64, 128))[row, 2 * column]
@@ -139,9 +140,9 @@ def test_scores_of_the_zonal_classifier_do_not_change_under_rotation() -> None:
     assert sum(p.numel() for p in network.parameters()) == 487_592
     rng = np.random.default_rng(0)
     coefficients = rng.normal(size=(4, 2, 4, 4)) + 1j * rng.normal(size=(4, 2, 4, 4))
-    turns = Rotation.random(2, random_state=1)
+    rotations = Rotation.random(2, random_state=1)
     upright, *rotated = (
-        band_limited(coefficients, r)[:, None] for r in (Rotation.identity(), *turns)
+        panoramas(coefficients, r)[:, None] for r in (Rotation.identity(), *rotations)
     )
     with torch.no_grad():
         network.train()(upright)
