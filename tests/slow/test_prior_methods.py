@@ -38,6 +38,9 @@ NETWORKS = {
         PriorMethod((), "EquirectRepresentation", has_onnx=False, package="torch_harmonics"),
     ),
     "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    "spherenet_unet": PriorMethod(
+        ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
+    ),
 }
 
 
