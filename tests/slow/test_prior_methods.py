@@ -32,12 +32,16 @@ class PriorMethod(NamedTuple):
     package: str = "torch"
 
 
+_NARROW = ("network.widths=[4,8,8]",)
 NETWORKS = {
     **dict.fromkeys(
         ("spherical_unet", "spherical_segformer", "sfno"),
         PriorMethod((), "EquirectRepresentation", has_onnx=False, package="torch_harmonics"),
     ),
-    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    "ugscnn": PriorMethod(_NARROW),
+    "hexrunet": PriorMethod(_NARROW),
+    "spherephd": PriorMethod(_NARROW),
+    "spherenet_icosphere": PriorMethod(_NARROW),
     "spherenet_unet": PriorMethod(
         ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
     ),
