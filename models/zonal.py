@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -127,12 +128,13 @@ class ZonalClassifier(nn.Module):
         check_shape(images, self.shape)
         flat = images.flatten(0, 1)
         features = [flat[:, branch] for branch in self.branches]
-        for number, blocks in enumerate(self.layers):
+        layers: Any = self.layers
+        for number, blocks in enumerate(layers):
             if _is_halving(number):
                 features[0] = torch.cat(features, dim=1)
             features = [block(one) for block, one in zip(blocks, features, strict=True)]
         means = (torch.cat(features, dim=1) * self.areas).mean(dim=(-2, -1))
-        scores: Tensor = self.head(means.unflatten(0, images.shape[:2]).mean(dim=1))
+        scores: Tensor = self.head(means.view(*images.shape[:2], -1).mean(dim=1))
         return scores
 
 

@@ -116,8 +116,8 @@ def test_zonal_convolution_is_the_integral_over_the_sphere() -> None:
     spectrum = np.apply_along_axis(
         lambda h: np.interp(np.linspace(0, 3, 32), np.arange(4), h), -1, filters
     )
-    z, weights = np.polynomial.legendre.leggauss(40)
-    z, longitudes = np.meshgrid(z, np.arange(80) * np.pi / 40, indexing="ij")
+    nodes, weights = np.polynomial.legendre.leggauss(40)
+    z, longitudes = np.meshgrid(nodes, np.arange(80) * np.pi / 40, indexing="ij")
     points = np.stack([np.cos(longitudes), np.sin(longitudes), z], axis=-1)
     points[..., :2] *= np.sqrt(1 - z**2)[..., None]
     signal = functions_at(points, coefficients)

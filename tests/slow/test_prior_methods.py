@@ -95,35 +95,15 @@ def test_trains_resumes_evaluates_and_exports(
 
 def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> None:
     pytest.importorskip("torch_harmonics")
-    shapes = "data.shapes.train=3", "data.shapes.test=2", "data.validation_fraction=0"
-    small = (
-        "level=4",
-        "network.widths=[4,8]",
-        "trainer.max_epochs=1",
-        "scheduler=constant",
-        "hydra.run.dir=run",
+    settings = (
+        *("experiment=shapes/default", "network=zonal_classifier", "network.widths=[4,8]"),
+        *("data.shapes.train=3", "data.shapes.test=2", "data.validation_fraction=0", "level=4"),
+        *("trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"),
     )
-    run_in(
-        tmp_path,
-        "train",
-        "experiment=shapes/default",
-        "network=zonal_classifier",
-        "representation=erp",
-        *shapes,
-        *small,
-    )
+    run_in(tmp_path, "train", *settings, "representation=erp")
     run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
     last = tmp_path / "run/checkpoints/last.ckpt"
     run_in(tmp_path, "evaluate", f"checkpoint={last}", "hydra.run.dir=evaluated")
     assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
-    with pytest.raises(
-        SystemExit, match=r"representation: found images of 16 × 16 .*representation=erp"
-    ):
-        run_in(
-            tmp_path,
-            "train",
-            "experiment=shapes/default",
-            "network=zonal_classifier",
-            *shapes,
-            *small,
-        )
+    with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
+        run_in(tmp_path, "train", *settings)
