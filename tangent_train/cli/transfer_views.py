@@ -7,15 +7,19 @@ Every view is evaluated in every condition, on the same panoramas with the same 
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from tangent_train.checkpoints.scores import network_for_views
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.inference.representations import panorama_settings
+from tangent_train.registry import build_from_config
 
 _NAME = re.compile(r"\w[\w.+-]*")
 """Names that can be part of a folder's name."""
@@ -26,7 +30,8 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
-    sets the level of the stage.
+    sets the level of the stage. Distortion-aware views of a network that does not allow them are
+    left out.
 
     Args:
         config: Composed ``transfer.yaml``.
@@ -44,11 +49,28 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
             for n, rows in heights.items()
         }
     chosen = HydraConfig.get().runtime.choices.get("representation")
-    return {
+    views = {
         name: _view(config, trained, **(changes or {"option": name}))
         for name, changes in _named_entries(config, "compare").items()
         if changes or name != chosen
     }
+    return {n: view for n, view in views.items() if _is_possible(n, view, config, trained)}
+
+
+def _is_possible(
+    name: str, view: Mapping[str, Any], config: DictConfig, trained: TrainedNetwork | None
+) -> bool:
+    """Return False, and print the reason, if a network from a file cannot be distortion-aware."""
+    section = view["representation"]
+    if trained is not None and section.get("distortion_aware"):
+        level = {"level": view.get("level", config.level)}
+        try:
+            made = build_from_config({**section, **level}, "representation")
+            network_for_views(trained.network, made)
+        except SettingError as error:
+            print_text(f"View {name} is left out: {error}")
+            return False
+    return True
 
 
 def conditions_of(config: DictConfig) -> dict[str, dict[str, Any]]:

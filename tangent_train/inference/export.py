@@ -12,6 +12,7 @@ import torch
 from safetensors.torch import save_file
 from torch import Tensor
 
+from models.distortion_aware import make_ordinary
 from tangent_train.checkpoints.trained import (
     CHECKSUM_KEY,
     METADATA_KEY,
@@ -116,6 +117,17 @@ def _check(
     if path.suffix.lower() == ".safetensors" and (image_size, opset) != (None, None):
         raise SettingError(
             "image_size and opset", found=(image_size, opset), expected="null for .safetensors"
+        )
+    is_aware = make_ordinary(trained.inner) is not trained.inner
+    if path.suffix.lower() == ".onnx" and (
+        is_aware or trained.representation.get("distortion_aware")
+    ):
+        raise SettingError(
+            "output",
+            found=f"{path.name}, for distortion-aware convolutions",
+            expected="a name ending in .safetensors: such a graph would be right for whole "
+            "equirectangular images of one size only, and used for others",
+            remedy="A .safetensors file takes every network.",
         )
 
 

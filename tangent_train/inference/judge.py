@@ -19,7 +19,7 @@ from tangent_train.inference.engine import (
     views_per_forward,
 )
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.representations import PanoramaViews, takes_signals
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.rendering.representations.views import Views
 
 _AROUND = np.arange(4)  # faces of a cube without up and down
 _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
@@ -43,8 +44,9 @@ class NetworkJudge:
     A network that was trained on upright images is most confident on upright images. For each
     direction it gets four horizontal views of 135° that are upright for that direction. A network
     with cross-image attention gets all views of its representation, with which it was more often
-    right. The doubt of a view is the mean of 1 − confidence over its pixels. The likelihood of a
-    direction is the product of doubt⁻³ over up to 20 views.
+    right, and a network on an icosphere gets its signal. The doubt of a view is the mean of 1 −
+    confidence over its pixels. The likelihood of a direction is the product of doubt⁻³ over up to
+    20 views.
 
     Attributes:
         trained: The network.
@@ -77,12 +79,18 @@ class NetworkJudge:
     def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the mean doubt of each view."""
         network: Any = self._network
-        upright, rays = self._views, None
-        views = replace(upright, grid=upright.grid.with_rotation(upright_rotation(up)))
-        per_forward = views_per_forward(views.grid.size)
-        if sees_rays(network):
-            network = partial(network, images_per_chunk=per_forward)
-            rays = torch.from_numpy(upright.rays()).to(self.device)
+        rotation, rays = upright_rotation(up), None
+        views: Views
+        if takes_signals(self.trained):
+            seen = PanoramaViews(self.trained).representation
+            views, per_forward = seen.with_rotation(rotation).view_sets()[0], 1
+        else:
+            upright = self._views
+            views = replace(upright, grid=upright.grid.with_rotation(rotation))
+            per_forward = views_per_forward(upright.grid.size)
+            if sees_rays(network):
+                network = partial(network, images_per_chunk=per_forward)
+                rays = torch.from_numpy(upright.rays()).to(self.device)
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
             for _, scores in view_scores(network, rendered.of(views), len(views), per_forward, rays)

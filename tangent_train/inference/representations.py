@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
-from tangent_train.errors import SettingError, width_height
+from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
 from tangent_train.geometry import PinholeGrid, SphereArea, TangentGrid
 from tangent_train.inference.images import InputImage
@@ -44,6 +44,10 @@ ViewChoice = str | Mapping[str, Any] | None
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
+_ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
+
+_NOT_VIEWS = "icosphere", "perspective"
+"""Options of the configs of representations that are not views for networks of photos."""
 
 _VIEWS = "ring_wide"
 """Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
@@ -56,6 +60,18 @@ _OVERLAP = 0.25
 
 _OVERSAMPLED = 2
 """Photos are resized to at most 2 pixels per pixel of a crop before their borders are mirrored."""
+
+
+def takes_signals(trained: TrainedNetwork) -> bool:
+    """Return True for a network that was trained on signals on an icosphere."""
+    return trained.representation["_target_"] == _ICOSPHERE
+
+
+def _refuse_for_signals(trained: TrainedNetwork, name: str, value: object) -> None:
+    """Refuse a setting for photos, or of other views, for a network on an icosphere."""
+    if takes_signals(trained) and value is not None:
+        expected = "panoramas and the views of the training, for a network on an icosphere"
+        raise SettingError(name, found=value, expected=expected)
 
 
 class SourceViews(NamedTuple):
@@ -110,7 +126,7 @@ class PanoramaViews:
     ) -> None:
         settings = panorama_settings(trained, levels, base_level, views)
         settings["rotations"] = rotations
-        if settings["_target_"] != _EQUIRECT:
+        if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
             settings["blend"] = blend
         # Views that the user chooses may name any setting.
         self.representation = _built(trained, settings, None if views else trained.source)
@@ -128,7 +144,7 @@ class PanoramaViews:
         limited = self.representation.limited_to(SphereArea.of(area))
         rows, columns = limited.image_size
         sets = limited.view_sets()
-        text = f"{sum(map(len, sets))} views of {columns} × {rows}"
+        text = f"{counted(sum(map(len, sets)), 'views')} of {columns} × {rows}"
         grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
@@ -194,6 +210,7 @@ class PhotoViews:
                 expected="equirectangular: the network takes the elevation of every pixel, which "
                 "is unknown in photos",
             )
+        _refuse_for_signals(trained, "projection", "perspective")
         self._crops = [
             _photo_representation(trained, level, base_level)
             for level in level_list(levels, trained.photo_level or trained.level)
@@ -258,9 +275,8 @@ def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
     """
     changes = {"option": views} if isinstance(views, str) else dict(views)
     folder, option = config_folder() / "representation", changes.pop("option", None)
-    known = {
-        file.stem: file for file in sorted(folder.glob("*.yaml")) if file.stem != "perspective"
-    }
+    files = sorted(folder.glob("*.yaml"))
+    known = {file.stem: file for file in files if not file.stem.startswith(_NOT_VIEWS)}
     if option not in known:
         raise SettingError("views", found=views, expected=f"an option: {', '.join(known)}")
     section: Any = OmegaConf.to_container(OmegaConf.load(known[option]))
@@ -332,6 +348,8 @@ def panorama_settings(
         SettingError: The representation does not have these settings.
     """
     side, settings = trained.photo_side, dict(trained.representation)
+    _refuse_for_signals(trained, "views", views)
+    _refuse_for_signals(trained, "base_level", base_level)
     if side is not None and views is not None:
         return photo_network_settings(side, levels, base_level, views)
     chosen = [trained.level] if levels is None else level_list(levels, trained.level)
@@ -410,7 +428,8 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         raise SettingError(
             "levels and base_level",
             found=f"images of {width_height(size)}",
-            expected=f"at least {width_height(fixed)}, the input size of the network's file"
+            expected=f"{'' if 1 in fixed else 'at least '}{width_height(fixed)}, the input size of "
+            "the network's file"
             if fixed
             else f"multiples of {multiple}, the network's stride",
             remedy="Choose other levels, or leave both as trained.",
@@ -418,7 +437,9 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
 
 
 def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
-    """Return True if a network supports images of rows and columns."""
+    """Return True if a network supports images of rows and columns; only images are divided."""
+    if trained.fixed_size is not None and 1 in trained.fixed_size:
+        return size == trained.fixed_size
     if trained.fixed_size is not None:
         return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))
     return not any(side % trained.size_multiple for side in size)

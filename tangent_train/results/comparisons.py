@@ -159,4 +159,5 @@ def _base_level(record: Record) -> str:
         return str(base)
     target = str(record.settings.get("representation._target_")).rpartition(".")[2]
     name = target.removesuffix("Representation")
-    return _REPRESENTATIONS.get(name, name)
+    aware = ", distortion-aware" * bool(record.settings.get("representation.distortion_aware"))
+    return _REPRESENTATIONS.get(name, name) + aware

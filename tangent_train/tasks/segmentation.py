@@ -30,7 +30,7 @@ from tangent_train.metrics.segmentation import (
     segmentation_scores,
 )
 from tangent_train.registry import registered
-from tangent_train.rendering import EquirectRepresentation
+from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.results.evaluation import class_entries, plain_scores
@@ -107,13 +107,13 @@ class SegmentationTask(Task):
             if not fits:
                 raise SettingError(f"task.{name}", found=value, expected=expected)
         self.sees_rays = sees_rays(network)
-        if self.sees_rays and isinstance(representation, EquirectRepresentation):
+        whole = EquirectRepresentation | IcosphereRepresentation
+        if self.sees_rays and isinstance(representation, whole):
             raise SettingError(
                 "representation",
-                found="equirectangular images",
+                found="one view of the whole sphere",
                 expected="tangent images or a cube map for a network with cross-image context",
-                remedy="An equirectangular image is the whole sphere: use the network without "
-                "context.",
+                remedy="Use the network without context.",
             )
         self.weighting = class_weights
         self.auxiliary_weight = auxiliary_weight

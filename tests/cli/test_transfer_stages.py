@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -117,13 +118,14 @@ def test_photos_are_needed_to_train_on_but_not_to_test_a_given_network() -> None
     assert list(_stages(without, checkpoint="/p.ckpt")) == ["S"]
 
 
-def test_the_plan_for_networks_of_photos() -> None:
+def test_the_plan_for_networks_of_photos(capsys: pytest.CaptureFixture[str]) -> None:
     config = composed("transfer", "experiment=zero_shot", "checkpoint=/net.onnx")
     tangent = {"_target_": "tangent_train.rendering.TangentRepresentation", "erp_height": 1024}
     size = {"base_level": 0, "level": 9, "dim": 512, "levels": [9, 8]}
     trained = trained_network(tangent | size, fixed_size=(512, 512), photo_level=10)
     stages = _stages(config, trained, representation=tangent | size)
-    assert len(stages) == (1 + len(config.compare)) * len(config.conditions)
+    assert "View erp-512-distortion-aware is left out: " in capsys.readouterr().out
+    assert len(stages) == len(config.compare) * len(config.conditions)
     for stage in stages.values():
         made = build_from_config(stage.config["representation"], "representation")
         assert made.erp_height == 1024
@@ -131,6 +133,11 @@ def test_the_plan_for_networks_of_photos() -> None:
     assert _seen(stages, "S", "level", "levels", "dim") == ["Tang", 9, [9, 8], 512]
     assert _seen(stages, "S-tangent-9-b0", "level", "levels") == ["Tang", 9, None]
     assert _seen(stages, "S-tangent-10-b1", "level", "dim") == ["Tang", 10, 512]
+    flexible = replace(trained, fixed_size=None)
+    all_stages = _stages(config, flexible, representation=tangent | size)
+    section = all_stages["S-erp-512-distortion-aware"].config["representation"]
+    assert (section["distortion_aware"], section["rows"]) == (True, 512)
+    assert len(all_stages) - len(stages) == len(config.conditions)
 
 
 def test_the_study_has_a_stage_for_every_level(rooms: DictConfig) -> None:

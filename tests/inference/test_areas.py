@@ -22,7 +22,15 @@ from tangent_train.registry import build_from_config
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.datamodules.folder.folder_format import save, write_classes
-from tests.inference.trained import CUBE, ERP, TANGENT, color_network, sphere, trained_network
+from tests.inference.trained import (
+    CUBE,
+    ERP,
+    ICOSPHERE,
+    TANGENT,
+    color_network,
+    sphere,
+    trained_network,
+)
 from tests.models.sphere_networks import awake, small_context
 from tests.tasks.shapes import quiet_trainer
 
@@ -41,6 +49,7 @@ KINDS = {
     "cube map": CUBE | {"level": 5},
     "ring": RING,
     "equirectangular": ERP | {"level": 5, "rotations": 2},
+    "icosphere": ICOSPHERE | {"level": 5},
 }
 
 
@@ -101,7 +110,7 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
     assert whole.pixels.sum() > 0
     before, after = torch.stack(labels[:2]), torch.stack(labels[2:])
     assert (before == after)[before > 0].double().mean() > 0.98
-    is_less = rotation is None and kind != "cube map"
+    is_less = rotation is None and kind not in ("cube map", "icosphere")
     assert sum(views[2:]) <= sum(views[:2]) - is_less
     if kind == "equirectangular" and rotation is None:  # nothing is interpolated
         assert torch.equal(before, after)
@@ -118,7 +127,7 @@ def test_the_validation_loss_is_that_of_the_labels_in_the_area(tmp_path: Path) -
     assert {"val/loss", "val/miou"} < logged[0].keys()
 
 
-@pytest.mark.parametrize("kind", ["tangent", "nearest", "equirectangular", "context"])
+@pytest.mark.parametrize("kind", ["tangent", "nearest", "equirectangular", "icosphere", "context"])
 @pytest.mark.parametrize("up", [None, (0.3, 0.2, 0.9)])
 def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     """With a network that sees surroundings, tilted or not, and with cross-image attention."""

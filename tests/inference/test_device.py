@@ -16,7 +16,15 @@ from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tests.fake_gpu import fake_gpu
-from tests.inference.trained import CUBE, ERP, PERSPECTIVE, TANGENT, sphere, trained_network
+from tests.inference.trained import (
+    CUBE,
+    ERP,
+    ICOSPHERE,
+    PERSPECTIVE,
+    TANGENT,
+    sphere,
+    trained_network,
+)
 
 UP = np.array([0.6, 0, 0.8])
 
@@ -39,6 +47,8 @@ CASES: dict[str, tuple[dict[str, Any], tuple[str, ...], InputImage, dict[str, An
     "shrunk": (TANGENT, ("rgb", "depth"), _image(75), {"levels": [4, 3], "blend": "nearest"}),
     "cube": (CUBE, ("rgb",), _image(31), {}),
     "equirectangular": (ERP, ("rgb", "depth"), _image(40, up=UP), {"rotations": 3}),
+    "icosphere": (ICOSPHERE, ("rgb", "depth"), _image(40, up=UP), {"rotations": 2}),
+    "on faces": (ICOSPHERE | {"elements": "faces"}, ("rgb", "elevation"), _image(32), {}),
     "enlarged": (ERP, ("rgb", "elevation"), _image(12), {}),
     "photo": (PERSPECTIVE, ("rgb",), _photo(48), {}),
     "small photo": (PERSPECTIVE, ("rgb",), _photo(11), {"blend": "nearest"}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,9 +12,10 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
 from tangent_train.geometry import equirect_directions, random_rotation
+from tangent_train.geometry.icosphere_signals import icosphere_directions
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
-from tests.inference.trained import TANGENT, trained_network
+from tests.inference.trained import ICOSPHERE, TANGENT, trained_network
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -42,6 +44,16 @@ class WholeSky(Sky):
     def forward(self, images: Tensor, rays: Tensor, **_: Any) -> Tensor:  # type: ignore[override]
         assert rays.shape == (1, len(images), 3, 3)
         return super().forward(images)
+
+
+class SkyOfVertices(Sky):
+    """The same, for a signal on the vertices of level 4: bright above the horizon."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        self.shapes.add(tuple(images.shape))
+        above = torch.from_numpy(icosphere_directions(4)[:, 2] > 0)
+        fits = (images[:, 0] > 0) == above
+        return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
 
 
 def _judge(network: Sky | None = None, **changes: Any) -> NetworkJudge:
@@ -93,3 +105,15 @@ def test_views_have_a_size_that_the_network_takes(
     likely = _judge(network, **changes)(InputImage(_bright_above(AXES[2])), AXES)
     assert likely.argmax() == 2
     assert network.shapes == {(count, 3, side, side)}
+
+
+def test_a_network_on_an_icosphere_gets_its_signal_in_every_direction() -> None:
+    network = SkyOfVertices()
+    trained = trained_network(ICOSPHERE, inner=network, class_names=("unknown", "up", "down"))
+    judge = NetworkJudge(replace(trained, normalization=PLAIN, fixed_size=(1, 2562)))
+    ups = AXES @ random_rotation(np.random.default_rng(1)).T
+    for true in range(6):
+        likely = judge(InputImage(_bright_above(ups[true])), ups)
+        assert likely.argmax() == true
+        assert likely.argmin() == (true + 3) % 6
+    assert network.shapes == {(1, 3, 1, 2562)}

@@ -33,6 +33,7 @@ from tangent_train.tasks.segmentation import SegmentationTask
 from tests.inference.trained import (
     CUBE,
     ERP,
+    ICOSPHERE,
     PERSPECTIVE,
     TANGENT,
     color_network,
@@ -111,6 +112,8 @@ def test_memory_of_another_size_or_on_a_disk_is_released(
         (TANGENT, {"blend": "feather", "levels": [4, 3]}, 4),
         (ERP, {"rotations": 3}, 4),
         (ERP | {"rows": 24}, {"rotations": 2}, 3),
+        (ICOSPHERE, {"rotations": 2}, 4),
+        (ICOSPHERE | {"elements": "faces", "interpolation": "nearest"}, {}, 3),
         (ERP | {"distortion_aware": True}, {"rotations": 2}, 3),
     ],
 )
@@ -338,3 +341,22 @@ def test_impossible_settings_are_refused() -> None:
         PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
     with pytest.raises(SettingError, match="device"):
         Predictor(trained, PanoramaViews(trained), "nonsense")
+
+
+def test_a_network_on_an_icosphere_takes_only_its_signals() -> None:
+    of_level = trained_network(ICOSPHERE, fixed_size=(1, 2562))
+    assert PanoramaViews(of_level, 4).description() == "1 view of 2562 × 1"
+    with pytest.raises(SettingError, match=r"found images of 10242 × 1 .* expected 2562 × 1 "):
+        PanoramaViews(of_level, levels=5)
+    of_any = trained_network(ICOSPHERE)
+    assert PanoramaViews(of_any, levels=5).image_size == (1, 10242)
+    for trained in (of_level, of_any):
+        with pytest.raises(SettingError, match=r"views: found ring.*on an icosphere"):
+            PanoramaViews(trained, views="ring")
+        with pytest.raises(SettingError, match=r"base_level: found 1.*on an icosphere"):
+            PanoramaViews(trained, base_level=1)
+        with pytest.raises(SettingError, match="projection: found perspective"):
+            PhotoViews(trained)
+    for views in ("icosphere", "icosphere_faces"):
+        with pytest.raises(SettingError, match=f"views: found {views}; expected an option"):
+            PanoramaViews(trained_network(TANGENT), views=views)

@@ -21,6 +21,7 @@ CLASS_NAMES = ("unknown", "dark", "green", "bright")
 _RENDERING = "tangent_train.rendering."
 TANGENT = {"_target_": _RENDERING + "TangentRepresentation", "base_level": 0, "level": 4}
 ERP = {"_target_": _RENDERING + "EquirectRepresentation", "level": 4}
+ICOSPHERE = {"_target_": _RENDERING + "IcosphereRepresentation", "level": 4}
 CUBE = {"_target_": _RENDERING + "CubemapRepresentation", "level": 4}
 PERSPECTIVE = {"_target_": _RENDERING + "PerspectiveRepresentation", "level": 6, "dim": 24}
 

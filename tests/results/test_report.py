@@ -77,6 +77,16 @@ def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     assert explained not in _runs_report(*several).tables()[0].note
 
 
+def test_the_views_of_a_row_are_named() -> None:
+    target = "tangent_train.rendering.EquirectRepresentation"
+    records = []
+    for aware in (False, True):
+        section = {"_target_": target, "distortion_aware": aware, "base_level": None}
+        records.append(made_record([0.5] * 3, representation=section))
+    shown = {cells["b"] for cells in _cells(_runs_report(*records)).values()}
+    assert shown == {"ERP", "ERP, distortion-aware"}
+
+
 def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
     report = _runs_report(made_record([0.5] * 13, REAL, protocol=PROTOCOL))
     cells = _cells(report)

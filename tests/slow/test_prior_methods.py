@@ -23,15 +23,29 @@ class PriorMethod(NamedTuple):
         settings: Settings that make it small.
         representation: Class of the representation that it chooses.
         has_onnx: True if it can be written as an ONNX file; False if that is refused.
+        package: Package that it needs.
     """
 
     settings: tuple[str, ...] = ()
     representation: str = "IcosphereRepresentation"
     has_onnx: bool = True
+    package: str = "torch"
 
 
+_NARROW = ("network.widths=[4,8,8]",)
 NETWORKS = {
-    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    **dict.fromkeys(
+        ("spherical_unet", "spherical_segformer", "sfno"),
+        PriorMethod((), "EquirectRepresentation", has_onnx=False, package="torch_harmonics"),
+    ),
+    "ugscnn": PriorMethod(_NARROW),
+    "hexrunet": PriorMethod(_NARROW),
+    "spherephd": PriorMethod(_NARROW),
+    "icocnn": PriorMethod(_NARROW),
+    "spherenet_icosphere": PriorMethod(_NARROW),
+    "spherenet_unet": PriorMethod(
+        ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
+    ),
 }
 
 
@@ -50,6 +64,7 @@ def test_trains_resumes_evaluates_and_exports(
     name: str, rooms: tuple[str, ...], tmp_path: Path
 ) -> None:
     method = NETWORKS[name]
+    pytest.importorskip(method.package)
     small = "level=4", "trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"
     settings = "experiment=rooms/methods", f"network={name}", *rooms, *small, *method.settings
     run_in(tmp_path, "train", *settings)
@@ -77,3 +92,19 @@ def test_trains_resumes_evaluates_and_exports(
         if suffix == ".safetensors":
             np.testing.assert_array_equal(found, expected)
         assert np.abs(found - expected).sum() <= 0.002 * expected.sum()
+
+
+def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> None:
+    pytest.importorskip("torch_harmonics")
+    settings = (
+        *("experiment=shapes/default", "network=zonal_classifier", "network.widths=[4,8]"),
+        *("data.shapes.train=3", "data.shapes.test=2", "data.validation_fraction=0", "level=4"),
+        *("trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"),
+    )
+    run_in(tmp_path, "train", *settings, "representation=erp")
+    run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
+    last = tmp_path / "run/checkpoints/last.ckpt"
+    run_in(tmp_path, "evaluate", f"checkpoint={last}", "hydra.run.dir=evaluated")
+    assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
+    with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
+        run_in(tmp_path, "train", *settings)

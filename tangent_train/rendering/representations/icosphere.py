@@ -47,7 +47,6 @@ from tangent_train.rendering.sampling import (
     EquirectMap,
     Taps,
     bilinear_equirect_taps,
-    nearest_equirect_index,
     sample,
     sample_map,
 )
@@ -160,9 +159,9 @@ class IcosphereViews(Views):
         """Return the pixel ``(V,)`` at the direction of each vertex or face."""
 
         def build(shape: tuple[int, int]) -> tuple[NDArray[np.int64]]:
-            u, v = self._positions(icosphere_directions(self.level, self.elements), shape)
-            index = nearest_equirect_index(torch.from_numpy(u), torch.from_numpy(v), shape)
-            return (index.numpy(),)
+            positions = self._positions(icosphere_directions(self.level, self.elements), shape)
+            u, v = np.rint(positions).astype(np.int64)
+            return (v.clip(0, shape[0] - 1) * shape[1] + u % shape[1],)
 
         return self._table(("pixels",), shape, build)[0]
 
@@ -227,8 +226,8 @@ def _at_vertices(values: Tensor, level: int) -> Tensor:
 class IcosphereRepresentation:
     """A signal on the vertices or faces of an icosphere, for networks on its mesh.
 
-    The view is always the whole sphere. Of a partial panorama, the pixels outside its area are
-    black, and their labels unknown.
+    The view is always the whole sphere. Outside the area of a partial panorama, colors are those of
+    ``data.fill``, and labels are unknown.
 
     Args:
         level: Level s of the panorama and of the icosphere.
