@@ -41,6 +41,7 @@ NETWORKS = {
     "ugscnn": PriorMethod(_NARROW),
     "hexrunet": PriorMethod(_NARROW),
     "spherephd": PriorMethod(_NARROW),
+    "icocnn": PriorMethod(_NARROW),
     "spherenet_icosphere": PriorMethod(_NARROW),
     "spherenet_unet": PriorMethod(
         ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
