@@ -58,13 +58,14 @@ class ZonalConvolution(nn.Module):
 
     def forward(self, images: Float[Tensor, "b c h w"]) -> Float[Tensor, "b d r r"]:
         """Return the convolved panoramas, with as many columns as rows, from the first column."""
-        filters = functional.interpolate(
-            self.weight, self._degrees, mode="linear", align_corners=True
-        )
-        response = filters[..., : len(self.gain)] * self.gain
-        spectrum = torch.view_as_real(self.analysis(images))
-        spectrum = torch.einsum("bclmz,dcl->bdlmz", spectrum, response)
-        result: Tensor = self.synthesis(torch.view_as_complex(spectrum.contiguous()))
+        with torch.autocast(images.device.type, enabled=False):  # transforms need float32
+            filters = functional.interpolate(
+                self.weight, self._degrees, mode="linear", align_corners=True
+            )
+            response = filters[..., : len(self.gain)] * self.gain
+            spectrum = torch.view_as_real(self.analysis(images.float()))
+            spectrum = torch.einsum("bclmz,dcl->bdlmz", spectrum, response)
+            result: Tensor = self.synthesis(torch.view_as_complex(spectrum.contiguous()))
         return result
 
 

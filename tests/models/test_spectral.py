@@ -71,10 +71,11 @@ def test_networks_of_torch_harmonics_commute_with_rotations_about_the_vertical(n
     torch.testing.assert_close(rotated / spread, scores / spread, rtol=0, atol=1e-3)
 
 
-def test_a_checkpoint_is_read_without_trust(tmp_path: Path) -> None:
+def test_a_checkpoint_is_read_without_trust_and_works_in_mixed_precision(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "net.ckpt", "network=sfno", "level=3")
     network: Any = load_trained(tmp_path / "net.ckpt").network
-    assert network(torch.zeros(1, 4, 16, 32)).shape == (1, 13, 16, 32)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert network(torch.zeros(1, 4, 16, 32)).shape == (1, 13, 16, 32)
 
 
 def test_images_of_another_size_are_refused() -> None:
@@ -152,5 +153,8 @@ def test_scores_of_the_zonal_classifier_do_not_change_under_rotation() -> None:
     for other in others:
         assert (other - scores).norm() / spread < 1e-3
     network.zero_grad()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        mixed = network(upright)
+    assert (mixed - scores).norm() / spread < 0.05
     network(upright).square().sum().backward()
     assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
