@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from models.tables import mapped_samples as mapped_samples
     from models.tables import mesh_operators as mesh_operators
     from models.unet import UNet as UNet
+    from models.zonal import ZonalClassifier as ZonalClassifier
 
 _FILES = {
     "AuxiliaryHead": "auxiliary_head",
@@ -43,6 +44,7 @@ _FILES = {
     "SphereContext": "sphere_context",
     "Table": "mapped",
     "UNet": "unet",
+    "ZonalClassifier": "zonal",
     "face_neighbors": "tables",
     "gnomonic_taps": "tables",
     "hexagonal_rings": "tables",

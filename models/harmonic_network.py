@@ -27,7 +27,7 @@ class HarmonicNetwork(nn.Module):
     Its nearest grid is that of Gauss and Legendre, whose rows are at most a quarter of a row away.
     Convolutions and resampling at full resolution take this grid; harmonic transforms at full
     resolution are exact, see `use_pixel_rows`. Columns are exact: the networks do not depend on
-    the longitude.
+    the longitude. All is computed in float32, also with mixed precision.
 
     Args:
         architecture: Network of ``torch_harmonics.examples.models``.
@@ -78,7 +78,8 @@ class HarmonicNetwork(nn.Module):
             SettingError: The images are not whole equirectangular images of the level.
         """
         check_shape(images, self.shape)
-        scores: Tensor = self.network(images)
+        with torch.autocast(images.device.type, enabled=False):  # transforms need float32
+            scores: Tensor = self.network(images.float())
         return scores
 
 

@@ -34,7 +34,7 @@ class _Bags(NamedTuple):
 def _bags(matrix: Any, device: torch.device, dtype: torch.dtype) -> _Bags:
     """Copy a sparse matrix of SciPy to a device."""
     rows = matrix.tocsr()
-    columns, starts = (torch.from_numpy(a).long() for a in (rows.indices, rows.indptr[:-1]))
+    columns, starts = (torch.from_numpy(a).int() for a in (rows.indices, rows.indptr[:-1]))
     values = torch.from_numpy(rows.data).to(device, dtype)
     return _Bags(columns.to(device), starts.to(device), values)
 
@@ -71,9 +71,9 @@ class Table:
         """
         outputs, taps, entries = indices.shape
         values = np.broadcast_to(weights, indices.shape).astype(np.float64).ravel()
-        starts = np.arange(outputs * taps + 1) * entries
+        starts = np.arange(outputs * taps + 1, dtype=np.int32) * entries
         shape = outputs * taps, inputs
-        matrix = sparse.csr_array((values, indices.ravel().astype(np.int64), starts), shape)
+        matrix = sparse.csr_array((values, indices.ravel().astype(np.int32), starts), shape)
         matrix.sum_duplicates()
         matrix.eliminate_zeros()
         return cls(matrix, taps)

@@ -70,7 +70,7 @@ def probabilities(network: nn.Module, representation: Any, panorama: Tensor) -> 
 
 @torch.no_grad()
 def mean_error(
-    network: nn.Module, representation: Any, rotations: Array, *, by_cells: bool = False
+    network: nn.Module, representation: Any, rotations: Array, by_cells: bool = False
 ) -> float:
     """Return the mean error of rotations in percent.
 
@@ -109,7 +109,7 @@ def mean_error(
     return 100 * float(np.mean(errors))
 
 
-def rotation_error(name: str, checkpoint: str, count: int = 20) -> list[Row]:
+def rotation_error(name: str, checkpoint: str, count: int = 20) -> Row:
     """Return mean errors in percent with random and with trained weights.
 
     The icosahedral group permutes signals on an icosphere. Other views are resampled; the last
@@ -120,7 +120,7 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> list[Row]:
         checkpoint: File of the trained network.
         count: Number of rotations of each group.
     """
-    trained, rng, rows = load_trained(Path(checkpoint)), np.random.default_rng(1), []
+    trained, rng = load_trained(Path(checkpoint)), np.random.default_rng(1)
     representation = build_from_config(trained.representation, "representation")
     by_cells = isinstance(representation, IcosphereRepresentation)
     group = rng.permutation(icosahedral_rotations()[1:])[:count]
@@ -133,18 +133,19 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> list[Row]:
     pixels = equirect_directions((representation.erp_height, 2 * representation.erp_height))
     with torch.no_grad():
         probabilities(random.train(), representation, signal(pixels))
+    networks = {"random": random.eval(), "trained": trained.inner}
+    row: Row = {"method": name}
+    for weights, network in networks.items():
+        row[f"icosahedral, {weights}"] = mean_error(network, representation, group, by_cells)
+    for weights, network in networks.items():
+        row[f"SO(3), {weights}"] = mean_error(network, representation, rotations)
     pointwise = nn.Conv2d(trained.in_channels, len(trained.class_names) - 1, 1)
-    resampling = mean_error(pointwise, representation, rotations)
-    for weights, network in (("random", random.eval()), ("trained", trained.inner)):
-        row: Row = {"method": name, "weights": weights}
-        row["icosahedral group %"] = mean_error(network, representation, group, by_cells=by_cells)
-        row["SO(3) %"] = mean_error(network, representation, rotations)
-        rows.append(row | {"SO(3) %, 1×1 convolution": resampling})
-    return rows
+    row["SO(3), 1×1"] = mean_error(pointwise, representation, rotations)
+    return {title: f"{v:.2g}" if isinstance(v, float) else v for title, v in row.items()}
 
 
 if __name__ == "__main__":
     named = (text.partition("=") for text in sys.argv[1:])
-    table = [row for name, _, checkpoint in named for row in rotation_error(name, checkpoint)]
+    table = [rotation_error(name, checkpoint) for name, _, checkpoint in named]
     write_text(Path("figures/rotation_error.csv"), csv_text(list(table[0]), table))
-    print(markdown(table, 3))
+    print(markdown(table))

@@ -5,6 +5,7 @@ A new network is a row of `NETWORKS`; `tests/slow/cli/test_networks.py` then lea
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,9 @@ import pytest
 import torch
 
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli.run import build
 from tests.cli.tiny_runs import SMALL_ROOMS, results, run_in
+from tests.running import ROOT, composed_settings
 
 
 class PriorMethod(NamedTuple):
@@ -23,15 +26,26 @@ class PriorMethod(NamedTuple):
         settings: Settings that make it small.
         representation: Class of the representation that it chooses.
         has_onnx: True if it can be written as an ONNX file; False if that is refused.
+        package: Package that it needs.
     """
 
     settings: tuple[str, ...] = ()
     representation: str = "IcosphereRepresentation"
     has_onnx: bool = True
+    package: str = "torch"
 
 
+_NARROW = ("network.widths=[4,8,8]",)
 NETWORKS = {
-    "ugscnn": PriorMethod(("network.widths=[4,8,8]",)),
+    **dict.fromkeys(
+        ("spherical_unet", "spherical_segformer", "sfno"),
+        PriorMethod((), "EquirectRepresentation", has_onnx=False, package="torch_harmonics"),
+    ),
+    "ugscnn": PriorMethod(_NARROW),
+    "hexrunet": PriorMethod(_NARROW),
+    "spherephd": PriorMethod(_NARROW),
+    "icocnn": PriorMethod(_NARROW),
+    "spherenet_icosphere": PriorMethod(_NARROW),
     "spherenet_unet": PriorMethod(
         ("network.network.widths=[4,8,8]",), "EquirectRepresentation", has_onnx=False
     ),
@@ -53,6 +67,7 @@ def test_trains_resumes_evaluates_and_exports(
     name: str, rooms: tuple[str, ...], tmp_path: Path
 ) -> None:
     method = NETWORKS[name]
+    pytest.importorskip(method.package)
     small = "level=4", "trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"
     settings = "experiment=rooms/methods", f"network={name}", *rooms, *small, *method.settings
     run_in(tmp_path, "train", *settings)
@@ -80,3 +95,33 @@ def test_trains_resumes_evaluates_and_exports(
         if suffix == ".safetensors":
             np.testing.assert_array_equal(found, expected)
         assert np.abs(found - expected).sum() <= 0.002 * expected.sum()
+
+
+def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> None:
+    pytest.importorskip("torch_harmonics")
+    settings = (
+        *("experiment=shapes/default", "network=zonal_classifier", "network.widths=[4,8]"),
+        *("data.shapes.train=3", "data.shapes.test=2", "data.validation_fraction=0", "level=4"),
+        *("trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"),
+    )
+    run_in(tmp_path, "train", *settings, "representation=erp")
+    run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
+    last = tmp_path / "run/checkpoints/last.ckpt"
+    run_in(tmp_path, "evaluate", f"checkpoint={last}", "hydra.run.dir=evaluated")
+    assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
+    with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
+        run_in(tmp_path, "train", *settings)
+
+
+def test_the_reference_page_lists_every_network_with_its_number_of_parameters() -> None:
+    pytest.importorskip("torch_harmonics")
+    page = (ROOT / "docs/reference/networks.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \|.*\| `(\w+)`.*\| ([\d,]+) \|$", page, re.MULTILINE)
+    assert {name for name, _, _ in rows} == NETWORKS.keys()
+    for name, representation, count in rows:
+        data = "data=synthrooms", "data.inputs=[rgb,depth]", "level=5"
+        settings = composed_settings("train", *data, f"network={name}")
+        alone = composed_settings("train", *data, f"representation={representation}")
+        assert settings["representation"]["_target_"] == alone["representation"]["_target_"]
+        _, task = build(settings)
+        assert sum(p.numel() for p in task.network.parameters()) == int(count.replace(",", ""))

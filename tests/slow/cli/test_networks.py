@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -20,19 +19,11 @@ from tests.tasks.small_networks import save_checkpoint
 
 NETWORKS = {path.stem for path in (config_folder() / "network").glob("*.yaml")}
 NETWORKS -= {"fcn_resnet_coco"}  # fcn_resnet with weights from the internet
-NETWORKS -= PRIOR_METHODS.keys()
+NETWORKS -= {*PRIOR_METHODS, "zonal_classifier"}
 OF_SHAPES = {"shape_classifier", "shape_classifier_16"}
 ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
 """Of the same parts as others."""
-WHOLE = {"spherical_unet", "spherical_segformer", "sfno"}
-"""For whole equirectangular images; see `test_prior_methods` for their export."""
-if find_spec("torch_harmonics") is None:
-    NETWORKS -= WHOLE
-SMALLER = {
-    "fcn_resnet": "network.depth=50",
-    "fcn_resnet_context": "network.network.depth=50",
-    **dict.fromkeys(WHOLE, "network.level=4"),
-}
+DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 
 
 def _composed(*overrides: str) -> dict[str, Any]:
@@ -44,15 +35,14 @@ SHAPES = ("data=modelnet40", "data.root=nowhere", "task=classification")
 
 @pytest.mark.parametrize("network", sorted(NETWORKS))
 def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> None:
-    settings = [f"network={network}", *([SMALLER[network]] if network in SMALLER else [])]
+    settings = [f"network={network}", *([DEPTH[network]] if network in DEPTH else [])]
     shapes = network in OF_SHAPES
     cases = {6: SHAPES} if shapes else {3: ("data.inputs=[rgb]",), 4: ("data.inputs=[rgb,depth]",)}
     for channels, of_data in cases.items():
         _, task = build(_composed(*of_data, *settings))
         assert len(task.class_names) == (40 if shapes else 14)
-        columns = 64 if network in WHOLE else 32
-        images = torch.randn(2, *([3] if shapes else []), channels, 32, columns)
-        assert task(images).shape == ((2, 40) if shapes else (2, 13, 32, columns))
+        images = torch.randn(2, *([3] if shapes else []), channels, 32, 32)
+        assert task(images).shape == ((2, 40) if shapes else (2, 13, 32, 32))
     outputs = [task(images)] if shapes else task.outputs(images).values()
     sum(output.square().mean() for output in outputs).backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
@@ -60,11 +50,11 @@ def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> No
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
-@pytest.mark.parametrize("network", sorted(NETWORKS - OF_SHAPES - ALIKE - WHOLE))
+@pytest.mark.parametrize("network", sorted(NETWORKS - OF_SHAPES - ALIKE))
 def test_every_kind_of_network_can_be_exported_for_images_of_any_size(
     network: str, suffix: str, tmp_path: Path
 ) -> None:
-    shallow = [SMALLER[network]] if network in SMALLER else []
+    shallow = [DEPTH[network]] if network in DEPTH else []
     level = ["level=5", "representation.erp_height=32"]
     save_checkpoint(tmp_path / "net.ckpt", f"network={network}", *level, *shallow)
     trained = load_trained(tmp_path / "net.ckpt")
