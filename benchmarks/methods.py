@@ -10,6 +10,7 @@ import ctypes
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 
@@ -51,26 +52,28 @@ def methods(quick: bool) -> Iterator[Table]:
         with tempfile.TemporaryDirectory() as root, quiet():
             for name, text in METHODS.items():
                 with attempted(f"{name}, level {level}"):
-                    calls = _calls([f"level={level}", *text.split()], root, 2 ** (level + 1))
-                    if rounds > 1:
-                        calls[0](), calls[1]()
-                    ctypes.CDLL(None).malloc_trim(0)  # or the step reuses memory that is free
-                    first: list[float] = []
-                    mib = peak_mib(lambda c=calls, f=first: f.append(_seconds(c[0])))
-                    values = (
-                        first + [_seconds(calls[0]) for _ in range(rounds - 1)],
-                        [_seconds(calls[1]) for _ in range(rounds)],
-                        [mib],
+                    step, evaluate = _calls(
+                        [f"level={level}", *text.split()], root, 2 ** (level + 1)
                     )
-                    for table, row in zip(tables.values(), values, strict=True):
-                        table.rows.append(Row(name, row, is_ours=True))
+                    if rounds > 1:
+                        step(), evaluate()
+                    ctypes.CDLL(None).malloc_trim(0)  # or the step reuses memory that is free
+                    times: tuple[list[float], ...] = [], []
+                    mib = peak_mib(partial(_time, step, times[0]))
+                    for _ in range(rounds - 1):
+                        _time(step, times[0])
+                    for _ in range(rounds):
+                        _time(evaluate, times[1])
+                    for table, values in zip(tables.values(), (*times, [mib]), strict=True):
+                        table.rows.append(Row(name, values, is_ours=True))
         yield from tables.values()
 
 
-def _seconds(call: Callable[[], object]) -> float:
+def _time(call: Callable[[], object], times: list[float]) -> None:
+    """Append the CPU seconds of a call."""
     start = time.process_time()
     call()
-    return time.process_time() - start
+    times.append(time.process_time() - start)
 
 
 def _calls(settings: list[str], root: str, rows: int) -> tuple[Callable[[], object], ...]:

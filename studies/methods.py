@@ -74,7 +74,7 @@ def picture() -> Figure:
     for axes, title in zip(figure.subplots(1, 2), titles, strict=True):
         is_scores, ends = title == titles[0], {}
         for name, by_level in times.items():
-            points = [(int(column.split()[1]), ms) for column, ms in by_level.items()]
+            points = [(float(column.split()[1]), ms) for column, ms in by_level.items()]
             if is_scores:
                 points = [(by_level["level 5"], scores[name]["upright"])]
             style = "o-" if name.startswith(OURS) else "s--"
