@@ -97,7 +97,7 @@ class DistortionAwareConv2d(nn.Conv2d):
         return torch.cat(outputs, dim=-2)
 
 
-@torch.compiler.disable
+@torch.compiler.disable  # type: ignore[untyped-decorator]
 @lru_cache(maxsize=256)
 def _row_taps(
     shape: tuple[int, int],
