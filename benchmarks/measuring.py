@@ -106,26 +106,21 @@ class Table:
         return statistics.median(self.ratios(name, to))
 
 
-def measure(
-    alternatives: Sequence[Alternative],
-    rounds: int,
-    clock: Callable[[], float] = time.perf_counter,
-) -> list[Row]:
+def measure(alternatives: Sequence[Alternative], rounds: int) -> list[Row]:
     """Measure the seconds of alternatives, in turn; every other round in the opposite order.
 
     Args:
         alternatives: Each runs twice first, to compile code and fill caches.
         rounds: Number of measurements of each.
-        clock: Returns seconds; `time.process_time` for CPU time.
     """
 
     def seconds(alternative: Alternative, repeats: int) -> float:
-        start = clock()
+        start = time.perf_counter()
         for _ in range(repeats):
             alternative.run()
         if DEVICE.type == "cuda":
             torch.cuda.synchronize()
-        return (clock() - start) / repeats
+        return (time.perf_counter() - start) / repeats
 
     warm = [min(seconds(alternative, 1), seconds(alternative, 1)) for alternative in alternatives]
     repeats = [math.ceil(_SHORTEST_S / max(taken, 1e-6)) for taken in warm]

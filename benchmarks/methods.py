@@ -1,7 +1,7 @@
 """Time a training step and an evaluation of each method of docs/results/prior_methods.md, by level.
 
-A step trains on one panorama, an evaluation labels one; both include rendering. Seconds are CPU
-time of one thread, so that other programs on the machine matter less.
+A step trains on one panorama (on four crops of 90°), an evaluation labels one. Both include
+rendering. Seconds are CPU time of one thread, so that other programs on the machine matter less.
 """
 
 from __future__ import annotations
@@ -10,41 +10,70 @@ import ctypes
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import torch
 
-from benchmarks.measuring import Alternative, Row, Table, attempted, measure, peak_mib
+from benchmarks.measuring import Row, Table, attempted, peak_mib
 from benchmarks.training import built, quiet
 
+_UNET = "network=unet_small task.channels_last=true"
+_WIDTHS = "network.widths=[16,32,64,128,256,256]"  # as many parameters as the UNet, or fewer
 METHODS = {
-    "tangent images, b = 0": "network=unet_small",
-    "tangent images, b = 1": "network=unet_small representation.base_level=1",
-    "level views": "network=unet_small representation=ring",
-    "ERP, whole": "network=unet_small representation=erp",
-    "ERP, 90° crops": "network=unet_small representation=erp_crops",
+    "tangent images, b = 0": f"{_UNET} representation=tangent",
+    "tangent images, b = 1": f"{_UNET} representation.base_level=1",
+    "level views": f"{_UNET} representation=ring",
+    "ERP, whole": f"{_UNET} representation=erp",
+    "ERP, 90° crops": f"{_UNET} representation=erp_crops data.panoramas_per_step=4",
+    "ugscnn": f"network=ugscnn {_WIDTHS}",
+    "hexrunet": f"network=hexrunet {_WIDTHS}",
+    "spherephd": f"network=spherephd {_WIDTHS}",
+    "spherenet_icosphere": f"network=spherenet_icosphere {_WIDTHS}",
+    "icocnn": "network=icocnn network.widths=[4,8,16,32,32]",
+    "spherenet_unet": "network=spherenet_unet",
+    "spherical_unet": "network=spherical_unet",
+    "spherical_segformer": "network=spherical_segformer",
+    "sfno": "network=sfno",
 }
 """Settings besides ``experiment=rooms/methods``, by name of the method."""
+
+_ROUNDS = {5: 5, 6: 3}
+"""Calls by level; at higher levels, one call without a warm-up."""
 
 
 def methods(quick: bool) -> Iterator[Table]:
     """Measure all methods at levels 5 to 8: seconds of steps and evaluations, and peak memory."""
     for level in (5,) if quick else (5, 6, 7, 8):
-        steps, evaluations, memory = [], [], []
+        rounds = 1 if quick else _ROUNDS.get(level, 1)
+        tables = {
+            name: Table(f"methods: {name}, level {level}", [], unit)
+            for name, unit in (("step", "s"), ("evaluation", "s"), ("memory of a step", "MiB"))
+        }
         with tempfile.TemporaryDirectory() as root, quiet():
             for name, text in METHODS.items():
                 with attempted(f"{name}, level {level}"):
-                    step, evaluate = _calls(f"level={level} {text}".split(), root, 2 ** (level + 1))
-                    step(), evaluate()
+                    step, evaluate = _calls(
+                        [f"level={level}", *text.split()], root, 2 ** (level + 1)
+                    )
+                    if rounds > 1:
+                        step(), evaluate()
                     ctypes.CDLL(None).malloc_trim(0)  # or the step reuses memory that is free
-                    mib = peak_mib(step)
-                    memory.append(Row(name, [mib], is_ours=True))
-                    steps.append(Alternative(name, step, is_ours=True))
-                    evaluations.append(Alternative(name, evaluate, is_ours=True))
-            rounds = 1 if quick else 3
-            rows = [measure(calls, rounds, time.process_time) for calls in (steps, evaluations)]
-        yield Table(f"methods: step, level {level}", rows[0])
-        yield Table(f"methods: evaluation, level {level}", rows[1])
-        yield Table(f"methods: memory of a step, level {level}", memory, "MiB")
+                    times: tuple[list[float], ...] = [], []
+                    mib = peak_mib(partial(_time, step, times[0]))
+                    for _ in range(rounds - 1):
+                        _time(step, times[0])
+                    for _ in range(rounds):
+                        _time(evaluate, times[1])
+                    for table, values in zip(tables.values(), (*times, [mib]), strict=True):
+                        table.rows.append(Row(name, values, is_ours=True))
+        yield from tables.values()
+
+
+def _time(call: Callable[[], object], times: list[float]) -> None:
+    """Append the CPU seconds of a call."""
+    start = time.process_time()
+    call()
+    times.append(time.process_time() - start)
 
 
 def _calls(settings: list[str], root: str, rows: int) -> tuple[Callable[[], object], ...]:

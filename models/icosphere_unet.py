@@ -62,9 +62,9 @@ class IcosphereUNet(ResidualUNet):
     """UNet of Jiang et al. (2019) on icospheres of decreasing levels, for any table.
 
     With `mesh_operators`, four inputs and 15 outputs, it has the 5,180,239 trainable parameters of
-    the article's network. Like `UNet`, it pools before the first 1×1
-    convolution of a block instead of after it: the values are the same, except for statistics of
-    batch normalization, which see the coarser level.
+    the article's network. Like `UNet`, it pools before the first 1×1 convolution of a block instead
+    of after it. Except for the maximum of faces, the values are the same; statistics of batch
+    normalization see the coarser level.
 
     Args:
         in_channels: Channels of the signal: 3 for RGB, 4 for RGB-D.

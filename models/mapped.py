@@ -34,7 +34,7 @@ class _Bags(NamedTuple):
 def _bags(matrix: Any, device: torch.device, dtype: torch.dtype) -> _Bags:
     """Copy a sparse matrix of SciPy to a device."""
     rows = matrix.tocsr()
-    columns, starts = (torch.from_numpy(a).long() for a in (rows.indices, rows.indptr[:-1]))
+    columns, starts = (torch.from_numpy(a).int() for a in (rows.indices, rows.indptr[:-1]))
     values = torch.from_numpy(rows.data).to(device, dtype)
     return _Bags(columns.to(device), starts.to(device), values)
 
@@ -71,9 +71,9 @@ class Table:
         """
         outputs, taps, entries = indices.shape
         values = np.broadcast_to(weights, indices.shape).astype(np.float64).ravel()
-        starts = np.arange(outputs * taps + 1) * entries
+        starts = np.arange(outputs * taps + 1, dtype=np.int32) * entries
         shape = outputs * taps, inputs
-        matrix = sparse.csr_array((values, indices.ravel().astype(np.int64), starts), shape)
+        matrix = sparse.csr_array((values, indices.ravel().astype(np.int32), starts), shape)
         matrix.sum_duplicates()
         matrix.eliminate_zeros()
         return cls(matrix, taps)
@@ -99,10 +99,6 @@ class Table:
         """Return the table itself: copies of a network share it."""
         return self
 
-    def __reduce__(self) -> tuple[Any, ...]:
-        """Leave the copies for devices to the process that reads the table."""
-        return type(self), (self.matrix, self.taps)
-
     def bags(self, device: torch.device, dtype: torch.dtype) -> tuple[_Bags, _Bags]:
         """Return T and its transpose on a device."""
         key = device, dtype
@@ -126,6 +122,7 @@ class _Product(torch.autograd.Function):
     def forward(ctx: Any, x: Tensor, matrix: _Bags, transposed: _Bags) -> Tensor:
         ctx.matrices = transposed, matrix
         columns, starts, values = matrix
+        # On a CPU, this is twice as fast as the product of torch.sparse.
         return torch.stack(
             [
                 functional.embedding_bag(

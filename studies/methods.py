@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MultipleLocator
 
 from studies.output import COLORS
 
@@ -15,25 +16,23 @@ DOCS = Path(__file__).parents[1] / "docs"
 OURS = ("tangent images", "level views", "ERP")
 """Beginnings of the names of methods that use ordinary networks; the others are dashed."""
 
-Curves = dict[str, dict[int, float]]
-"""Values of methods by level."""
 
-
-def curves(name: str) -> Curves:
-    """Return a table of values by level; empty cells are left out.
+def table(name: str) -> dict[str, dict[str, float]]:
+    """Return the numbers of a table, by method and column.
 
     Args:
-        name: Name of a CSV file in docs/results/data: columns "method", "level 5", …
+        name: Name of a CSV file in docs/results/data with a column "method".
     """
     with (DOCS / "results" / "data" / f"{name}.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    found: Curves = {}
-    for row in rows:
-        numbers = {k: re.match(r"[\d.,]+", v) for k, v in row.items() if k.startswith("level ")}
-        found[row["method"]] = {
-            int(k.split()[1]): float(m[0].replace(",", "")) for k, m in numbers.items() if m
+    return {
+        row["method"]: {
+            column: float(found[0].replace(",", ""))
+            for column, cell in row.items()
+            if (found := re.match(r"[\d.,]+", cell))
         }
-    return found
+        for row in rows
+    }
 
 
 def label(axes: Any, ends: dict[str, tuple[float, float]], colors: dict[str, str]) -> None:
@@ -62,29 +61,36 @@ def label(axes: Any, ends: dict[str, tuple[float, float]], colors: dict[str, str
             fontsize=9,
             va="center",
             color=colors[name],
-            arrowprops={"arrowstyle": "-", "color": colors[name], "lw": 0.5, "alpha": 0.6},
+            arrowprops={"arrowstyle": "-", "color": colors[name], "lw": 0.5, "relpos": (0, 0.5)},
         )
 
 
 def picture() -> Figure:
     """Plot mIoU over the time of a panorama, and this time over the level."""
     figure = Figure((12, 5.4), layout="constrained")
-    times, scores = curves("prior_methods_evaluation"), curves("prior_methods_levels")
+    times, scores = table("prior_methods_evaluation"), table("prior_methods_time")
     colors = {name: COLORS[k % len(COLORS)] for k, name in enumerate(times)}
-    titles = "Upright mIoU, trained for the same time", "Cost of a method by level"
+    titles = "Upright mIoU after the same time of training, level 5", "Cost of a method by level"
     for axes, title in zip(figure.subplots(1, 2), titles, strict=True):
         is_scores, ends = title == titles[0], {}
         for name, by_level in times.items():
-            points = [(by_level[s], m) for s, m in scores.get(name, {}).items() if s in by_level]
-            points = points if is_scores else list(by_level.items())
-            if points:
-                style = "o-" if name.startswith(OURS) else "s--"
-                axes.plot(*zip(*points, strict=True), style, color=colors[name], ms=4)
-                ends[name] = points[-1]
+            points = [(float(column.split()[1]), ms) for column, ms in by_level.items()]
+            if is_scores:
+                points = [(by_level["level 5"], scores[name]["upright"])]
+            style = "o-" if name.startswith(OURS) else "s--"
+            axes.plot(*zip(*points, strict=True), style, color=colors[name], ms=4)
+            ends[name] = points[-1]
         axes.set(title=title, xscale="log" if is_scores else "linear")
         axes.set(yscale="linear" if is_scores else "log")
         axes.set(xlabel="ms per panorama" if is_scores else "level s")
         axes.set(ylabel="mIoU %" if is_scores else "ms per panorama")
+        logarithmic, linear = axes.xaxis, axes.yaxis
+        if not is_scores:
+            logarithmic, linear = linear, logarithmic
+        logarithmic.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        logarithmic.set_major_formatter("{x:g}")
+        logarithmic.set_minor_formatter("")
+        linear.set_major_locator(MultipleLocator(10 if is_scores else 1))
         axes.spines[["top", "right"]].set_visible(False)
         label(axes, ends, colors)
     return figure

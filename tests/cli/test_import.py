@@ -298,6 +298,7 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         ({"views": {"option": "ring", "fov": 80}}, "18 views that miss"),
         ({"views": "ring", "base_level": 1}, "base_level: found 1"),
         ({"views": "ring", "levels": [5, 4]}, "levels: found"),
+        ({"views": "erp_distortion_aware"}, "distortion-aware convolutions: found a network"),
     ],
 )
 def test_impossible_views_are_refused(
@@ -306,6 +307,18 @@ def test_impossible_views_are_refused(
     run("import", *OF_ONNX, "output=ours.onnx")
     with pytest.raises(SettingError, match=message):
         tt.load(here / "ours.onnx", **given)
+
+
+@pytest.mark.parametrize(
+    ("size", "expected"), [((32, 32), "only images of 32"), (("h", "w"), "ONNX file from torch")]
+)
+def test_no_file_is_written_for_convolutions_that_cannot_be_sampled(
+    size: tuple[Any, Any], expected: str, here: Path, run: Run
+) -> None:
+    write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
+    with pytest.raises(SystemExit, match=f"distortion-aware convolutions: .*{expected}"):
+        run("import", *OF_ONNX, "output=ours.onnx", "views=erp_distortion_aware")
+    assert not (here / "ours.onnx").exists()
 
 
 def test_an_unknown_size_is_512(here: Path, run: Run) -> None:

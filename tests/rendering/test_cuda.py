@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation
+from tangent_train.geometry.icosphere_signals import IcosphereElements
 from tangent_train.metrics import SegmentationMetric
 from tangent_train.rendering import (
     Blend,
@@ -17,6 +18,7 @@ from tangent_train.rendering import (
     tangent_to_labels,
 )
 from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.representations.icosphere import IcosphereViews
 from tangent_train.rendering.representations.views import PinholeViews
 
 pytestmark = pytest.mark.gpu
@@ -35,6 +37,20 @@ def test_tangent_images_equal_those_on_the_cpu(interpolation: Interpolation) -> 
     expected = equirect_to_tangent(panorama, GRID, [0, 7], interpolation)
     on_gpu = equirect_to_tangent(panorama.cuda(), GRID, [0, 7], interpolation)
     torch.testing.assert_close(on_gpu.cpu(), expected)
+
+
+@pytest.mark.parametrize("interpolation", ["bilinear", "nearest"])
+@pytest.mark.parametrize("elements", ["vertices", "faces"])
+def test_signals_and_their_panoramas_equal_those_on_the_cpu(
+    elements: IcosphereElements, interpolation: Interpolation
+) -> None:
+    panorama = _random(3, *SHAPE).float()
+    views = IcosphereViews(6, elements, random_rotation(np.random.default_rng(0)))
+    expected = views.render(panorama, interpolation)
+    on_gpu = views.render(panorama.cuda(), interpolation)
+    torch.testing.assert_close(on_gpu.cpu(), expected, rtol=1e-4, atol=1e-4)
+    canvas, placed = (views.placed(signal, SHAPE)[0] for signal in (expected, on_gpu))
+    torch.testing.assert_close(placed.cpu(), canvas, rtol=1e-4, atol=1e-4)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float64, 1e-7), (torch.float32, 1e-4)])

@@ -5,6 +5,7 @@ A new network is a row of `NETWORKS`; `tests/slow/cli/test_networks.py` then lea
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +14,9 @@ import pytest
 import torch
 
 from tangent_train.checkpoints.content import read_settings
+from tangent_train.cli.run import build
 from tests.cli.tiny_runs import SMALL_ROOMS, results, run_in
+from tests.running import ROOT, composed_settings
 
 
 class PriorMethod(NamedTuple):
@@ -108,3 +111,17 @@ def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> No
     assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
     with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
         run_in(tmp_path, "train", *settings)
+
+
+def test_the_reference_page_lists_every_network_with_its_number_of_parameters() -> None:
+    pytest.importorskip("torch_harmonics")
+    page = (ROOT / "docs/reference/networks.md").read_text()
+    rows = re.findall(r"^\| `(\w+)` \|.*\| `(\w+)`.*\| ([\d,]+) \|$", page, re.MULTILINE)
+    assert {name for name, _, _ in rows} == NETWORKS.keys()
+    for name, representation, count in rows:
+        data = "data=synthrooms", "data.inputs=[rgb,depth]", "level=5"
+        settings = composed_settings("train", *data, f"network={name}")
+        alone = composed_settings("train", *data, f"representation={representation}")
+        assert settings["representation"]["_target_"] == alone["representation"]["_target_"]
+        _, task = build(settings)
+        assert sum(p.numel() for p in task.network.parameters()) == int(count.replace(",", ""))

@@ -13,6 +13,7 @@ from scipy.optimize import brentq
 from studies.angular_resolution import angular_resolution
 from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
 from studies.fov import fov
+from studies.methods import picture, table
 from studies.output import markdown
 from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
@@ -85,7 +86,7 @@ def test_enlargement_is_the_mean_enlargement_of_the_lens() -> None:
 
 
 def test_rotation_errors_are_those_of_the_network() -> None:
-    """Of a network of pixels none; of one that returns the height z, in closed form."""
+    """A network of pixels has none; that of one that returns the height z, in closed form."""
     representation, group = IcosphereRepresentation(3), icosahedral_rotations()
     traces = np.sort(np.einsum("nij,mij->nm", group, group))
     assert (abs(traces[:, -2:] - [1 + 2 * math.cos(math.radians(72)), 3]) < 1e-9).all()
@@ -105,3 +106,12 @@ def test_rotation_errors_are_those_of_the_network() -> None:
     expected = np.sqrt(2 - 2 * group[:, 2, 2].clip(max=1)).mean()
     found = mean_error(fixed, representation, group, by_cells=True)  # type: ignore[arg-type]
     assert found == pytest.approx(100 * expected, rel=1e-3)
+
+
+def test_the_chart_of_methods_names_every_method_once() -> None:
+    methods = sorted(table("prior_methods_time"))
+    for axes in picture().axes:
+        assert sorted(text.get_text() for text in axes.texts) == methods
+        heights = np.sort([text.get_position()[1] for text in axes.texts])
+        assert np.diff(heights).min() > 0.05
+        assert heights[-1] <= 1

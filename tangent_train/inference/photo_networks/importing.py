@@ -13,7 +13,12 @@ from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import ScoreKind
-from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
+from tangent_train.checkpoints.scores import (
+    ClassScoreNetwork,
+    Groups,
+    network_for_views,
+    size_multiple_of,
+)
 from tangent_train.checkpoints.trained import (
     TrainedNetwork,
     load_trained,
@@ -87,7 +92,7 @@ def import_network(
     # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
     seen = photo_network_settings(side, levels, base_level, views)
-    size = build_from_config(seen, "representation").image_size
+    representation = build_from_config(seen, "representation")
     described = TrainedNetwork(
         inner=network.network,
         class_names=tuple(names),
@@ -95,7 +100,7 @@ def import_network(
         normalization=network.normalization,
         level=seen["level"],
         representation=seen,
-        image_size=size,
+        image_size=representation.image_size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else network.image_size,
         photo_level=_photo_level(network.image_size[1], fov_deg),
@@ -104,6 +109,7 @@ def import_network(
         settings=network.settings,
     )
     check_size(described, described.image_size)
+    network_for_views(described.network, representation)  # refused before it is used
     with atomic_path(path) as temporary:
         if isinstance(network.network, OnnxNetwork):
             write_metadata(network.network.path, temporary, described)
