@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -14,7 +13,7 @@ from models.mapped import MappedConv, Table, collect
 from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
-from tangent_train.geometry.icosphere_signals import IcosphereElements, check_signal
+from tangent_train.geometry.icosphere_signals import IcosphereElements
 from tangent_train.registry import registered
 
 Pooling = Literal["first", "mean", "max"]
@@ -135,15 +134,3 @@ class IcosphereUNet(ResidualUNet):
             pools=[_Pool(pooling, level - k, positions[k]) for k in range(1, len(widths))],
             ups=[partial(up, k=k) for k in range(len(widths) - 1)],
         )
-        self.level, self.elements = level, elements
-
-    def forward(
-        self, images: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores at every vertex or face: images ``(B, C, 1, V)``.
-
-        Raises:
-            SettingError: The images are not signals on the icosphere of the network's level.
-        """
-        check_signal(images.shape, self.level, self.elements)
-        return super().forward(images)
