@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
+from models.icosphere_unet import levels_of
 from models.unet import Convolution, ResidualUNet
-from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import icosphere
 from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
 from tangent_train.registry import registered
@@ -260,7 +260,7 @@ class IcoCNN(ResidualUNet):
         widths: Regular channels, of six values each, at level s, s − 1, ….
 
     Raises:
-        SettingError: There are too many widths for the level.
+        SettingError: The number of widths does not fit the level.
 
     Example:
         >>> sum(p.numel() for p in IcoCNN(4, 13, 5).parameters())
@@ -274,11 +274,7 @@ class IcoCNN(ResidualUNet):
         level: int,
         widths: Sequence[int] = (8, 16, 32, 64, 64),
     ) -> None:
-        if not 0 < len(widths) <= level + 1:
-            raise SettingError(
-                "network.widths", found=list(widths), expected=f"1 to {level + 1} at level {level}"
-            )
-        levels = range(level, level - len(widths), -1)
+        levels = levels_of(widths, level)
         super().__init__(
             in_channels,
             num_classes,

@@ -56,6 +56,25 @@ class _Unpool(nn.Module):
         return functional.pad(x, new, value=float(self.unpooling == "ones"))
 
 
+def levels_of(widths: Sequence[int], level: int) -> range:
+    """Return the level of each width, the finest first.
+
+    Args:
+        widths: Channels at each level.
+        level: Level of the finest icosphere.
+
+    Raises:
+        SettingError: There are no widths, or more of them than levels.
+    """
+    if not 0 < len(widths) <= level + 1:
+        raise SettingError(
+            "network.widths",
+            found=f"{len(widths)} widths at level {level}",
+            expected=f"1 to {level + 1}, one per level down to 0",
+        )
+    return range(level, level - len(widths), -1)
+
+
 @registered
 class IcosphereUNet(ResidualUNet):
     """UNet of Jiang et al. (2019) on icospheres of decreasing levels, for any table.
@@ -79,8 +98,8 @@ class IcosphereUNet(ResidualUNet):
         normalized_ups: True to normalize and rectify after that convolution.
 
     Raises:
-        SettingError: There are more widths than levels, or a kind of pooling is not for the
-            positions of the table.
+        SettingError: The number of widths does not fit the level, or a kind of pooling does not fit
+            the positions of the table.
 
     Example:
         >>> from models import mesh_operators
@@ -100,13 +119,7 @@ class IcosphereUNet(ResidualUNet):
         unpooling: Unpooling = "zeros",
         normalized_ups: bool = False,
     ) -> None:
-        if len(widths) > level + 1:
-            raise SettingError(
-                "network.widths",
-                found=f"{len(widths)} widths at level {level}",
-                expected=f"at most {level + 1}, one per level down to 0",
-            )
-        tables = [table(level - k) for k in range(len(widths))]
+        tables = [table(r) for r in levels_of(widths, level)]
         positions = [one.inputs for one in tables]
         elements: IcosphereElements = "vertices"
         choices = {"pooling": ("first", "mean"), "unpooling": ("zeros", "ones", "mean")}
