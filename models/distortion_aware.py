@@ -53,14 +53,14 @@ class DistortionAwareConv2d(nn.Conv2d):
 
     def _conv_forward(self, input: Tensor, weight: Tensor, bias: Tensor | None) -> Tensor:  # noqa: A002
         height, width = shape = input.shape[-2], input.shape[-1]
-        if abs(width - 2 * height) > 1:  # halves of an odd number are rounded
+        if width != 2 * height:
             raise SettingError(
                 "distortion-aware convolutions",
                 found=f"an image or features of {width_height(shape)}",
-                expected="a whole equirectangular image, twice as wide as high, and no other "
-                "padding than that of the convolutions",
+                expected="whole equirectangular ones, twice as wide as high",
                 remedy="Choose representation=erp_distortion_aware (views=erp_distortion_aware), "
-                "or a network without them.",
+                "with rows that are a multiple of the network's stride. A network that pads its "
+                "features itself cannot be used.",
             )
         left, right, top, bottom = self._reversed_padding_repeated_twice
         kernel, dilation = self.kernel_size, self.dilation
@@ -97,6 +97,7 @@ class DistortionAwareConv2d(nn.Conv2d):
         return torch.cat(outputs, dim=-2)
 
 
+@torch.compiler.disable  # type: ignore[untyped-decorator]
 @lru_cache(maxsize=256)
 def _row_taps(
     shape: tuple[int, int],
@@ -130,9 +131,7 @@ def _row_taps(
 
 def _framed(features: Tensor) -> Tensor:
     """Return features with a row across each pole, and the first column again after the last."""
-    half = features.shape[-1] // 2
-    ends = features[..., [0, -1], :]
-    beyond = (ends.roll(half, -1) + ends.roll(features.shape[-1] - half, -1)) / 2
+    beyond = features[..., [0, -1], :].roll(features.shape[-1] // 2, -1)
     tall = torch.cat([beyond[..., :1, :], features, beyond[..., 1:, :]], dim=-2)
     return torch.cat([tall, tall[..., :1]], dim=-1)
 
