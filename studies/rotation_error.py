@@ -6,7 +6,7 @@ random signal x and a rotation R.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -133,19 +133,23 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> Row:
     pixels = equirect_directions((representation.erp_height, 2 * representation.erp_height))
     with torch.no_grad():
         probabilities(random.train(), representation, signal(pixels))
-    networks = {"random": random.eval(), "trained": trained.inner}
+    networks = {"random weights": random.eval(), "trained": trained.inner}
     row: Row = {"method": name}
     for weights, network in networks.items():
-        row[f"icosahedral, {weights}"] = mean_error(network, representation, group, by_cells)
+        row[f"icosahedral group, {weights}"] = mean_error(network, representation, group, by_cells)
     for weights, network in networks.items():
         row[f"SO(3), {weights}"] = mean_error(network, representation, rotations)
     pointwise = nn.Conv2d(trained.in_channels, len(trained.class_names) - 1, 1)
-    row["SO(3), 1×1"] = mean_error(pointwise, representation, rotations)
-    return {title: f"{v:.2g}" if isinstance(v, float) else v for title, v in row.items()}
+    row["SO(3), 1 × 1 convolution"] = mean_error(pointwise, representation, rotations)
+    return {
+        title: f"{float(f'{v:.2g}'):g}" if isinstance(v, float) else v for title, v in row.items()
+    }
 
 
 if __name__ == "__main__":
-    named = (text.partition("=") for text in sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("methods", nargs="+", metavar="<method>=<checkpoint>")
+    named = (text.partition("=") for text in parser.parse_args().methods)
     table = [rotation_error(name, checkpoint) for name, _, checkpoint in named]
     write_text(Path("figures/rotation_error.csv"), csv_text(list(table[0]), table))
     print(markdown(table))

@@ -86,7 +86,7 @@ def test_enlargement_is_the_mean_enlargement_of_the_lens() -> None:
 
 
 def test_rotation_errors_are_those_of_the_network() -> None:
-    """A network of pixels has none; that of one that returns the height z, in closed form."""
+    """A network of pixels is equivariant; one that returns the height z has a closed form."""
     representation, group = IcosphereRepresentation(3), icosahedral_rotations()
     traces = np.sort(np.einsum("nij,mij->nm", group, group))
     assert (abs(traces[:, -2:] - [1 + 2 * math.cos(math.radians(72)), 3]) < 1e-9).all()

@@ -44,11 +44,9 @@ from tangent_train.rendering.representations.pinhole import unless_identity, ver
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import (
-    EquirectMap,
     Taps,
     bilinear_equirect_taps,
     sample,
-    sample_map,
 )
 from tangent_train.rendering.tables import Value, cached
 
@@ -106,25 +104,20 @@ class IcosphereViews(Views):
             image = resize(image, equirect_shape(self.level), interpolation)
         result: Any
         if isinstance(image, Tensor):
-            shape = image.shape[-2], image.shape[-1]
-            source = image.flatten(-2)
-            if interpolation == "nearest":
-                result = source[..., torch.from_numpy(self._pixels(shape)).to(image.device)]
-            else:
-                result = self._averaged(self._at_points(source, shape))
+            if interpolation == "bilinear":
+                return self._means(image)[None, :, None]
+            pixels = torch.from_numpy(self._pixels((image.shape[-2], image.shape[-1])))
+            result = image.flatten(-2)[..., pixels.to(image.device)]
             return result[None, ..., None, :]
-        shape = image.shape[0], image.shape[1]
+        shape, rest = (image.shape[0], image.shape[1]), image.shape[2:]
         if interpolation == "nearest":
-            result = image.reshape(-1, *image.shape[2:])[self._pixels(shape)]
+            result = image.reshape(-1, *rest)[self._pixels(shape)]
             return result[None, None]
-        at: EquirectMap = self._map(shape)
-        points = np.empty((*at.u.shape, *image.shape[2:]), image.dtype)
-        sample_map(at, np.ascontiguousarray(image), interpolation, points)
-        wide = np.promote_types(image.dtype, np.float32)
-        values = torch.from_numpy(points.reshape(at.u.size, -1).T.astype(wide))
-        result = self._averaged(values).numpy().T
+        planes = image.reshape(*shape, -1).transpose(2, 0, 1)
+        wide = planes.astype(np.promote_types(image.dtype, np.float32))
+        result = self._means(torch.from_numpy(wide)).numpy().T
         result = np.rint(result) if image.dtype.kind in "ui" else result
-        return result.astype(image.dtype).reshape(1, 1, -1, *image.shape[2:])
+        return result.astype(image.dtype).reshape(1, 1, -1, *rest)
 
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return scores ``(1, K, 1, V)`` interpolated to the canvas, and the canvas as one view."""
@@ -165,34 +158,26 @@ class IcosphereViews(Views):
 
         return self._table(("pixels",), shape, build)[0]
 
-    def _map(self, shape: tuple[int, int]) -> EquirectMap:
-        """Return the positions of the sampling points in a panorama."""
+    def _points(self, shape: tuple[int, int]) -> tuple[NDArray[np.float32]]:
+        """Return columns and rows ``(2, P)`` of the sampling points in a panorama."""
+        points = sampling_points(self.level, self.elements).directions
+        positions = np.empty((2, len(points)), np.float32)
+        for start in range(0, len(points), _CHUNK):
+            part = slice(start, start + _CHUNK)
+            positions[:, part] = self._positions(points[part].astype(np.float64), shape)
+        return (positions,)
 
-        def build(shape: tuple[int, int]) -> EquirectMap:
-            points = sampling_points(self.level, self.elements).directions
-            positions = np.empty((2, len(points)), np.float32)
-            for start in range(0, len(points), _CHUNK):
-                part = slice(start, start + _CHUNK)
-                positions[:, part] = self._positions(points[part].astype(np.float64), shape)
-            u, v = positions.reshape(2, 20 * 2**self.level, -1)
-            return EquirectMap.of(u, v, shape)
-
-        return self._table(("points",), shape, build)
-
-    def _at_points(self, source: Tensor, shape: tuple[int, int]) -> Tensor:
-        """Return values ``(C, P)`` of an image ``(C, H W)`` at the sampling points."""
-        at = self._map(shape)
+    def _means(self, image: Tensor) -> Tensor:
+        """Return means ``(C, V)`` of an image ``(C, H, W)`` over cells, differentiable."""
+        shape, source = (image.shape[-2], image.shape[-1]), image.flatten(-2)
+        positions = self._table(("points",), shape, self._points)[0]
         parts = []
-        for start in range(0, at.u.size, _CHUNK):
-            lines = at.in_panorama(slice(start, start + _CHUNK))
-            u, v = (torch.from_numpy(line).to(source.device) for line in lines)
+        for start in range(0, positions.shape[1], _CHUNK):
+            u, v = torch.from_numpy(positions[:, start : start + _CHUNK]).to(image.device)
             parts.append(sample(source, bilinear_equirect_taps(u, v, shape)))
-        return torch.cat(parts, dim=1)
-
-    def _averaged(self, values: Tensor) -> Tensor:
-        """Return means ``(C, V)`` over cells of values ``(C, P)`` at the sampling points."""
         _, *taps = sampling_points(self.level, self.elements)
-        return sample(values, Taps(*(torch.from_numpy(part).to(values.device) for part in taps)))
+        average = Taps(*(torch.from_numpy(part).to(image.device) for part in taps))
+        return sample(torch.cat(parts, dim=1), average)
 
     def _score_taps(self, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return sources and weights ``(T, H W)`` of the scores at each pixel of a canvas."""

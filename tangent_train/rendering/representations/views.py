@@ -1,10 +1,10 @@
 """Representations of panoramas: the images that a network gets as input.
 
 A *representation* selects the *views* of a panorama: tangent images or, as baselines, the faces of
-a cube, the equirectangular image itself or crops of it. It selects the views of one training sample
-with random subsets, rotations and mirroring, and lists the sets of views that evaluation and
-prediction average over. Views render themselves from an image, and provide their position on its
-canvas (see `kernels`). `inference.engine` passes them to the network.
+a cube, the equirectangular image itself, crops of it or a signal on an icosphere. It selects the
+views of one training sample with random subsets, rotations and mirroring, and lists the sets of
+views that evaluation and prediction average over. Views render themselves from an image, and
+provide their position on its canvas (see `kernels`). `inference.engine` passes them to the network.
 """
 
 from __future__ import annotations
