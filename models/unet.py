@@ -201,10 +201,18 @@ def check_sides(images: Tensor, stride: int, network: str) -> None:
     """
     height, width = images.shape[-2:]
     if height % stride or width % stride:
+        remedy = (
+            f"Set representation.crop_multiple={stride}, or choose another representation.dim, "
+            "level or network."
+        )
+        if height == 1:  # a signal on an icosphere
+            remedy = (
+                "Choose a network for signals on an icosphere, such as network=ugscnn, or a "
+                "representation of images, such as representation=tangent."
+            )
         raise SettingError(
             f"image size for the {network}",
             found=width_height((height, width)),
             expected=f"sides that are multiples of {stride}",
-            remedy=f"Set representation.crop_multiple={stride}, or choose another "
-            "representation.dim, level or network.",
+            remedy=remedy,
         )

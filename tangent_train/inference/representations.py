@@ -70,8 +70,22 @@ def takes_signals(trained: TrainedNetwork) -> bool:
 def _refuse_for_signals(trained: TrainedNetwork, name: str, value: object) -> None:
     """Refuse a setting for photos, or of other views, for a network on an icosphere."""
     if takes_signals(trained) and value is not None:
-        expected = "panoramas and the views of the training, for a network on an icosphere"
-        raise SettingError(name, found=value, expected=expected)
+        raise SettingError(
+            name,
+            found=value,
+            expected="no value: a network on an icosphere takes panoramas in the representation "
+            "of its training",
+            remedy=f"Leave out {name}=.",
+        )
+
+
+def _takes_whole_panoramas(trained: TrainedNetwork) -> bool:
+    """Return True for a network of whole equirectangular images of one size, never divided."""
+    return (
+        trained.representation["_target_"] == _EQUIRECT
+        and trained.photo_level is None
+        and trained.fixed_size == trained.image_size
+    )
 
 
 class SourceViews(NamedTuple):
@@ -138,13 +152,18 @@ class PanoramaViews:
     def description(self, area: Sequence[float] | None = None) -> str:
         """Return number and size of the views; of pinhole images also their angle and resolution.
 
+        Signals on an icosphere are described by their number of values.
+
         Args:
             area: Area that the panoramas show, see `SphereArea.of`.
         """
         limited = self.representation.limited_to(SphereArea.of(area))
         rows, columns = limited.image_size
         sets = limited.view_sets()
-        text = f"{counted(sum(map(len, sets)), 'views')} of {columns} × {rows}"
+        count = sum(map(len, sets))
+        if takes_signals(self._trained):
+            return f"{counted(count, 'signals')} of {columns} values"
+        text = f"{counted(count, 'views')} of {columns} × {rows}"
         grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
         tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
         if not tangent:
@@ -424,6 +443,14 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
         SettingError: The network does not support the size.
     """
     fixed, multiple = trained.fixed_size, trained.size_multiple
+    if _takes_whole_panoramas(trained) and size != fixed:
+        raise SettingError(
+            "views",
+            found=f"images of {width_height(size)}",
+            expected=f"whole panoramas of {width_height(trained.image_size)}, the only images "
+            "that the network takes",
+            remedy="Use the level and the views of the training. Photos are not supported.",
+        )
     if not _fits(trained, size):
         raise SettingError(
             "levels and base_level",
@@ -439,6 +466,8 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
 def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
     """Return True if a network supports images of rows and columns; only images are divided."""
     if trained.fixed_size is not None and 1 in trained.fixed_size:
+        return size == trained.fixed_size
+    if _takes_whole_panoramas(trained):
         return size == trained.fixed_size
     if trained.fixed_size is not None:
         return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))

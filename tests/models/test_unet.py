@@ -64,6 +64,8 @@ def test_a_side_that_does_not_fit_is_refused() -> None:
         SettingError, match=r"HexUNet: found 32 × 24 \(width × height\); .* multiples of 16"
     ):
         HexUNet(3, 4)(torch.zeros(1, 3, 24, 32))
+    with pytest.raises(SettingError, match=r"2562 × 1 .*for signals on an icosphere.*=ugscnn"):
+        UNet(3, 4)(torch.zeros(1, 3, 1, 2562))
 
 
 def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
