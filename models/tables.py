@@ -25,9 +25,14 @@ def mesh_operators(level: int) -> Table:
 
     L is the cotangent Laplacian without division by the area of a vertex. The derivatives towards
     east and north are those of the linear function on each face, along EW = NS × n and the gradient
-    NS of the latitude, averaged over the faces of a vertex by area. All are for a sphere of radius
-    1. A pole has neither east nor north: its rows average the derivatives along NS and EW of its
-    five faces, which tend to 0 for smooth functions.
+    NS of the latitude, averaged over the faces of a vertex by area.
+
+    The article has derivatives per radian on a sphere of radius 1. Here, they are per vertex
+    spacing `vertex_resolution(level)`, and L is divided by 2√3, so that it is the mean of the ring
+    minus the value where triangles are equilateral. Weights absorb these constants of a level, but
+    training is faster when no row outweighs the others. A pole has neither east nor north: its
+    rows average the derivatives along NS and EW of its five faces, which tend to 0 for smooth
+    functions.
 
     Args:
         level: Level s of the icosphere.
@@ -53,12 +58,13 @@ def mesh_operators(level: int) -> Table:
         return sparse.coo_array((entries.ravel(), (at, of)), shape).tocsr()
 
     laplacian = -areas[:, None, None] * np.einsum("fix,fjx->fij", gradients, gradients)
+    shares = shares * vertex_resolution(level)
     derivatives = [
         shares[:, :, None] * np.einsum("fx,fjx->fj", along, gradients)[:, None]
         for along in (east, north)
     ]
     identity = sparse.eye_array(len(points), format="csr")
-    return Table.of_operators([identity, *map(assembled, (laplacian, *derivatives))])
+    return Table.of_operators([identity, *map(assembled, (laplacian / 12**0.5, *derivatives))])
 
 
 @registered

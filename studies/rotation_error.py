@@ -6,7 +6,7 @@ random signal x and a rotation R.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -147,7 +147,9 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> Row:
 
 
 if __name__ == "__main__":
-    named = (text.partition("=") for text in sys.argv[1:])
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("methods", nargs="+", metavar="<method>=<checkpoint>")
+    named = (text.partition("=") for text in parser.parse_args().methods)
     table = [rotation_error(name, checkpoint) for name, _, checkpoint in named]
     write_text(Path("figures/rotation_error.csv"), csv_text(list(table[0]), table))
     print(markdown(table))

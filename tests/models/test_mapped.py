@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from models.mapped import MappedConv, Table
 from models.tables import mesh_operators
 from tangent_train.errors import SettingError
-from tangent_train.geometry import icosphere
+from tangent_train.geometry import icosphere, vertex_resolution
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 
 CL = torch.channels_last
@@ -142,13 +142,22 @@ def test_mesh_operators_converge_to_the_derivatives_of_spherical_harmonics(name:
         degrees, (value, east, north) = _harmonics(points)[name]
         same, laplacian, *derivatives = (mesh_operators(level).matrix @ value).reshape(-1, 4).T
         np.testing.assert_array_equal(same, value)
-        found = np.stack([laplacian / areas, *derivatives])
+        per_radian = np.stack(derivatives) / vertex_resolution(level)
+        found = np.stack([12**0.5 * laplacian / areas, *per_radian])
         wrong = found - np.stack([-degrees * value, east, north])
         errors.append(np.sqrt((areas * wrong**2).sum(axis=1) / areas.sum()))
     coarse, middle, fine = errors
     assert (fine < (0.011, 0.0015, 0.0015)).all()
     for before, after in ((coarse, middle), (middle, fine)):
         assert (after <= before * np.array([0.5, 0.3, 0.3]) + 1e-12).all()
+
+
+def test_no_mesh_operator_outweighs_the_others_at_any_level() -> None:
+    """For white noise, they have 1.1, 0.6 and 0.6 times the size of the signal."""
+    for level in range(2, 6):
+        rows = mesh_operators(level).matrix
+        sizes = np.sqrt(rows.power(2).sum(axis=1).reshape(-1, 4).mean(axis=0))
+        np.testing.assert_allclose(sizes, (1, 1.08, 0.6, 0.6), rtol=0.2, err_msg=str(level))
 
 
 @pytest.mark.parametrize("level", [0, 3])
