@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache, partial
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
+from models.icosphere_unet import levels_of
 from models.unet import Convolution, ResidualUNet
-from tangent_train.errors import SettingError
-from tangent_train.geometry.icosphere import MAX_LEVEL, icosphere
+from tangent_train.geometry.icosphere import icosphere
 from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
 from tangent_train.registry import registered
 
@@ -42,7 +42,7 @@ def _by_edge(faces: _Indices, values: _Indices) -> Callable[[_Indices, _Indices]
     return lambda a, b: of_keys[np.searchsorted(keys, a * count + b)]
 
 
-@lru_cache(maxsize=MAX_LEVEL + 1)
+@cache
 def _charts(level: int) -> _Indices:
     """Return ``(5, 2^r + 1, 2^(r+1) + 1)`` vertices of the charts with all their edges."""
     if level == 0:
@@ -79,7 +79,7 @@ def _neighbors(level: int) -> tuple[_Indices, _Indices]:
     return neighbors, (back + 3 - np.arange(6)) % 6
 
 
-@lru_cache(maxsize=MAX_LEVEL + 1)
+@cache
 def atlas(level: int) -> dict[str, Tensor]:
     """Return indices of the icosphere of one level (Cohen et al. 2019, section 5).
 
@@ -260,7 +260,7 @@ class IcoCNN(ResidualUNet):
         widths: Regular channels, of six values each, at level s, s − 1, ….
 
     Raises:
-        SettingError: There are too many widths for the level.
+        SettingError: The number of widths does not fit the level.
 
     Example:
         >>> sum(p.numel() for p in IcoCNN(4, 13, 5).parameters())
@@ -274,11 +274,7 @@ class IcoCNN(ResidualUNet):
         level: int,
         widths: Sequence[int] = (8, 16, 32, 64, 64),
     ) -> None:
-        if not 0 < len(widths) <= level + 1:
-            raise SettingError(
-                "network.widths", found=list(widths), expected=f"1 to {level + 1} at level {level}"
-            )
-        levels = range(level, level - len(widths), -1)
+        levels = levels_of(widths, level)
         super().__init__(
             in_channels,
             num_classes,
@@ -304,5 +300,5 @@ class IcoCNN(ResidualUNet):
         Raises:
             SettingError: The images are not signals on the vertices of the network's level.
         """
-        check_signal(images.shape, self.level)
+        check_signal(images.shape, icosphere_count(self.level))
         return super().forward(images)

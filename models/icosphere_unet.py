@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Literal
 
-from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -14,7 +13,7 @@ from models.mapped import MappedConv, Table, collect
 from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
-from tangent_train.geometry.icosphere_signals import IcosphereElements, check_signal
+from tangent_train.geometry.icosphere_signals import IcosphereElements
 from tangent_train.registry import registered
 
 Pooling = Literal["first", "mean", "max"]
@@ -57,6 +56,25 @@ class _Unpool(nn.Module):
         return functional.pad(x, new, value=float(self.unpooling == "ones"))
 
 
+def levels_of(widths: Sequence[int], level: int) -> range:
+    """Return the level of each width, the finest first.
+
+    Args:
+        widths: Channels at each level.
+        level: Level of the finest icosphere.
+
+    Raises:
+        SettingError: There are no widths, or more of them than levels.
+    """
+    if not 0 < len(widths) <= level + 1:
+        raise SettingError(
+            "network.widths",
+            found=f"{len(widths)} widths at level {level}",
+            expected=f"1 to {level + 1}, one per level down to 0",
+        )
+    return range(level, level - len(widths), -1)
+
+
 @registered
 class IcosphereUNet(ResidualUNet):
     """UNet of Jiang et al. (2019) on icospheres of decreasing levels, for any table.
@@ -80,8 +98,8 @@ class IcosphereUNet(ResidualUNet):
         normalized_ups: True to normalize and rectify after that convolution.
 
     Raises:
-        SettingError: There are more widths than levels, or a kind of pooling is not for the
-            positions of the table.
+        SettingError: The number of widths does not fit the level, or a kind of pooling does not fit
+            the positions of the table.
 
     Example:
         >>> from models import mesh_operators
@@ -101,13 +119,7 @@ class IcosphereUNet(ResidualUNet):
         unpooling: Unpooling = "zeros",
         normalized_ups: bool = False,
     ) -> None:
-        if len(widths) > level + 1:
-            raise SettingError(
-                "network.widths",
-                found=f"{len(widths)} widths at level {level}",
-                expected=f"at most {level + 1}, one per level down to 0",
-            )
-        tables = [table(level - k) for k in range(len(widths))]
+        tables = [table(r) for r in levels_of(widths, level)]
         positions = [one.inputs for one in tables]
         elements: IcosphereElements = "vertices"
         choices = {"pooling": ("first", "mean"), "unpooling": ("zeros", "ones", "mean")}
@@ -135,15 +147,3 @@ class IcosphereUNet(ResidualUNet):
             pools=[_Pool(pooling, level - k, positions[k]) for k in range(1, len(widths))],
             ups=[partial(up, k=k) for k in range(len(widths) - 1)],
         )
-        self.level, self.elements = level, elements
-
-    def forward(
-        self, images: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores at every vertex or face: images ``(B, C, 1, V)``.
-
-        Raises:
-            SettingError: The images are not signals on the icosphere of the network's level.
-        """
-        check_signal(images.shape, self.level, self.elements)
-        return super().forward(images)

@@ -14,7 +14,7 @@ from scipy import sparse
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
+from tangent_train.geometry.icosphere_signals import check_signal
 
 
 class _Bags(NamedTuple):
@@ -153,13 +153,7 @@ def collect(
     Raises:
         SettingError: The signals are images, or have another number of positions.
     """
-    if signals.shape[2:] != (1, table.inputs):
-        raise SettingError(
-            "input of a convolution on the sphere",
-            found=f"shape {tuple(signals.shape)}",
-            expected=f"(batch, channels, 1, {table.inputs})",
-            remedy="Set representation=icosphere, with the level and elements of the network.",
-        )
+    check_signal(signals.shape, table.inputs)
     rows = signals[:, :, 0].transpose(1, 2)
     rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
     if torch.compiler.is_exporting():  # no format of networks has a sparse product

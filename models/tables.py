@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +14,9 @@ from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions, locate
 from tangent_train.registry import registered
 
-_LEVELS = 9
-"""Tables of one method that are kept: one per level of the icosphere."""
-
 
 @registered
-@lru_cache(_LEVELS)
+@cache
 def mesh_operators(level: int) -> Table:
     """Return the four rows of MeshConv (Jiang et al. 2019, equation 3): x, L x, ∂EW x, ∂NS x.
 
@@ -68,7 +65,7 @@ def mesh_operators(level: int) -> Table:
 
 
 @registered
-@lru_cache(_LEVELS)
+@cache
 def hexagonal_rings(level: int) -> Table:
     """Return the seven rows of HexConv (Zhang et al. 2019, section 3.2): a vertex and its ring.
 
@@ -110,7 +107,7 @@ def hexagonal_rings(level: int) -> Table:
 
 
 @registered
-@lru_cache(_LEVELS)
+@cache
 def face_neighbors(level: int) -> Table:
     """Return the ten rows of SpherePHD (Lee et al. 2019, figure 5), for signals on faces.
 
@@ -136,7 +133,7 @@ def face_neighbors(level: int) -> Table:
     return Table.of_entries(np.concatenate(rows, axis=1)[..., None], np.ones(1), count)
 
 
-@lru_cache(_LEVELS)
+@cache
 def vertex_parents(level: int) -> Table:
     """Return the table that doubles the resolution of signals on vertices, with one value each.
 
@@ -153,7 +150,7 @@ def vertex_parents(level: int) -> Table:
 
 
 @registered
-@lru_cache(_LEVELS)
+@cache
 def gnomonic_taps(level: int) -> Table:
     """Return nine taps: a 3 × 3 grid on the tangent plane of each vertex, aligned to the north.
 
@@ -182,7 +179,7 @@ def mapped_samples(level: int, directions_xyz: NDArray[np.float64]) -> Table:
     return Table.of_entries(faces[found].reshape(shape), weights.reshape(shape), len(vertices))
 
 
-@lru_cache(_LEVELS)
+@cache
 def vertex_means(level: int) -> Table:
     """Return the table that halves the resolution of signals on vertices, with one value each.
 

@@ -53,33 +53,31 @@ def icosphere_level(count: int) -> tuple[int, IcosphereElements] | None:
     return known.get(count)
 
 
-def check_signal(
-    shape: Sequence[int], level: int, elements: IcosphereElements = "vertices"
-) -> None:
-    """Refuse the input of a network that is not a signal on the icosphere of its level.
+def _described(rows: int, count: int) -> str:
+    known = icosphere_level(count) if rows == 1 else None
+    if known is None:
+        return f"an image of {width_height((rows, count))} pixels"
+    return f"a signal on the {count} {known[1]} of the icosphere of level {known[0]}"
+
+
+def check_signal(shape: Sequence[int], count: int) -> None:
+    """Refuse the input of a network that is not a signal of its icosphere.
 
     Args:
         shape: Shape of the input, ``(..., 1, V)`` for V values.
-        level: Level s of the network.
-        elements: Places of the network's values.
+        count: Number V of values that the network expects.
 
     Raises:
         SettingError: The input is another image or signal.
     """
-    rows, count = shape[-2:]
-    if rows == 1 and count == icosphere_count(level, elements):
-        return
-    known = icosphere_level(count) if rows == 1 else None
-    found = f"an image of {width_height((rows, count))} pixels"
-    if known is not None:
-        found = f"a signal on the {count} {known[1]} of the icosphere of level {known[0]}"
-    setting = "" if elements == "vertices" else f" representation.elements={elements}"
-    raise SettingError(
-        "input of the network",
-        found=found,
-        expected=f"a signal on the {icosphere_count(level, elements)} {elements} of level {level}",
-        remedy=f"Set representation=icosphere level={level}{setting}.",
-    )
+    rows, values = shape[-2:]
+    if (rows, values) != (1, count):
+        raise SettingError(
+            "input of the network",
+            found=_described(rows, values),
+            expected=_described(1, count),
+            remedy="Set representation=icosphere, with this level and representation.elements.",
+        )
 
 
 @lru_cache(maxsize=4)

@@ -106,17 +106,6 @@ def test_it_approaches_the_ordinary_convolution_at_the_equator() -> None:
     assert polar > 100 * fine
 
 
-def test_rotations_by_columns_commute_with_it() -> None:
-    torch.manual_seed(0)
-    network = make_distortion_aware(
-        nn.Sequential(nn.Conv2d(2, 5, 3, padding=1), nn.ReLU(), nn.Conv2d(5, 3, 5, padding=2))
-    ).double()
-    images = torch.randn(1, 2, 9, 18, dtype=torch.float64)
-    for columns in (1, 7):
-        expected = network(images).roll(columns, -1)
-        torch.testing.assert_close(network(images.roll(columns, -1)), expected)
-
-
 def test_gradients_are_those_of_finite_differences(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("models.distortion_aware._SAMPLES", 500)
     conv = make_distortion_aware(nn.Conv2d(2, 2, 3, padding=1, groups=2, dtype=torch.float64))

@@ -107,5 +107,3 @@ def test_every_parameter_learns_and_another_signal_is_refused() -> None:
     assert names == {"weight", "bias", "running_mean", "running_var", "num_batches_tracked"}
     with pytest.raises(SettingError, match="vertices of the icosphere of level 3"):
         network(_signals(3))
-    with pytest.raises(SettingError, match="1 to 3 at level 2"):
-        IcoCNN(3, 5, 2, (2, 3, 4, 5))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from models.mapped import Table
 from models.tables import face_neighbors, gnomonic_taps, hexagonal_rings, mapped_samples
-from tangent_train.geometry import icosphere, rotation_about, vertex_resolution
+from tangent_train.geometry import icosphere, vertex_resolution
 from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 
@@ -30,22 +30,6 @@ def test_rows_are_weighted_means(build: Callable[[int], Table], level: int) -> N
     assert table.outputs == table.inputs
     assert table.matrix.data.min() >= 0
     np.testing.assert_allclose(_values(table, np.ones(table.inputs)), 1, atol=1e-12)
-
-
-@pytest.mark.parametrize("build", _TABLES)
-def test_a_rotation_by_72_degrees_about_the_poles_permutes_the_rows(
-    build: Callable[[int], Table],
-) -> None:
-    table = build(3)
-    cells = icosphere_directions(3, "faces" if build is face_neighbors else "vertices")
-    rotated = cells @ rotation_about([0, 0, 1], 2 * np.pi / 5).T
-    target = (rotated @ cells.T).argmax(axis=1)
-    np.testing.assert_allclose(cells[target], rotated, atol=1e-12)
-    signal = np.random.default_rng(0).normal(size=table.inputs)
-    before, after = _values(table, signal[target]), _values(table, signal)[target]
-    if build is gnomonic_taps:  # the grid at a pole is aligned to longitude 0
-        before, after = (np.delete(values, _POLES, axis=0) for values in (before, after))
-    np.testing.assert_allclose(before, after, atol=1e-12)
 
 
 def test_rings_mix_two_hexagonal_filters() -> None:
@@ -115,22 +99,24 @@ def test_order_of_faces_is_that_of_the_unfolded_icosahedron() -> None:
     np.testing.assert_array_less(cosine, -0.95)  # turned by 180° beside it
 
 
-def test_taps_interpolate_at_the_directions_of_the_grid() -> None:
-    points = icosphere_directions(3)
-    expected = gnomonic_taps_xyz(points, 3, float(np.tan(vertex_resolution(3))))
-    taps = _values(gnomonic_taps(3), points)
-    np.testing.assert_allclose(
-        taps / np.linalg.norm(taps, axis=-1, keepdims=True), expected, atol=1e-12
-    )
-    np.testing.assert_allclose(taps[:, 4], points, atol=1e-12)
-
-
-def test_mapped_samples_interpolate_anywhere() -> None:
+def _some_directions() -> NDArray[np.float64]:
     directions = np.random.default_rng(0).normal(size=(5, 2, 3))
-    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
-    table = mapped_samples(2, directions)
-    assert (table.outputs, table.taps, table.inputs) == (5, 2, 162)
-    values = _values(table, icosphere_directions(2))
-    np.testing.assert_allclose(
-        values / np.linalg.norm(values, axis=-1, keepdims=True), directions, atol=1e-12
-    )
+    return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
+
+
+@pytest.mark.parametrize(
+    ("table", "expected"),
+    [
+        (mapped_samples(2, _some_directions()), _some_directions()),
+        (
+            gnomonic_taps(2),
+            gnomonic_taps_xyz(icosphere_directions(2), 3, np.tan(vertex_resolution(2))),
+        ),
+    ],
+    ids=["mapped_samples", "gnomonic_taps"],
+)
+def test_taps_interpolate_at_their_directions(table: Table, expected: NDArray[np.float64]) -> None:
+    assert (table.outputs, table.taps, table.inputs) == (*expected.shape[:2], 162)
+    taps = _values(table, icosphere_directions(2))
+    taps /= np.linalg.norm(taps, axis=-1, keepdims=True)
+    np.testing.assert_allclose(taps, expected, atol=1e-12)

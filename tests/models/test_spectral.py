@@ -24,9 +24,6 @@ torch_harmonics = pytest.importorskip("torch_harmonics")
 from models.harmonic_network import HarmonicNetwork, use_pixel_rows  # noqa: E402
 from models.zonal import ZonalClassifier, ZonalConvolution  # noqa: E402
 
-NETWORKS = {"spherical_unet": 444_045, "spherical_segformer": 393_677, "sfno": 591_936}
-"""Parameters with four channels and 13 classes."""
-
 
 def network_of(name: str, level: int) -> Any:
     settings = (f"network={name}", f"level={level}", "data.inputs=[rgb,depth]")
@@ -54,19 +51,17 @@ def test_transforms_of_pixel_centers_are_exact(degree: int, order: int) -> None:
     torch.testing.assert_close(inverse(spectrum), signal, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", ["spherical_unet", "spherical_segformer", "sfno"])
 def test_networks_of_torch_harmonics_commute_with_rotations_about_the_vertical(name: str) -> None:
     torch.manual_seed(0)
-    network = network_of(name, 5)
-    assert sum(p.numel() for p in network.parameters()) == NETWORKS[name]
-    network.eval()
-    images = torch.randn(1, 4, 64, 128)
+    network = network_of(name, 4).eval()
+    images = torch.randn(1, 4, 32, 64)
     scores = network(images)
-    assert scores.shape == (1, 13, 64, 128)
+    assert scores.shape == (1, 13, 32, 64)
     scores.square().mean().backward()
     assert all(p.grad is not None for p in network.parameters())
     # Whole columns at the coarsest resolution.
-    rotated = network(images.roll(32, -1)).roll(-32, -1)
+    rotated = network(images.roll(16, -1)).roll(-16, -1)
     spread = scores.std()
     torch.testing.assert_close(rotated / spread, scores / spread, rtol=0, atol=1e-3)
 
