@@ -92,25 +92,24 @@ class ClassScoreNetwork(nn.Module):
         return torch.cat([_sum(scores, group) for group in groups], dim=1)
 
 
-def network_for_views(network: nn.Module, views: Any) -> nn.Module:
-    """Return a network as it is applied to views: distortion-aware if they ask for it.
+def network_for_views(network: nn.Module, distortion_aware: bool | None) -> nn.Module:
+    """Return a network as it is applied to views: distortion-aware if they are.
 
     Args:
         network: The network, see `make_distortion_aware`.
-        views: Representation or `PanoramaViews`, with ``distortion_aware`` and ``image_size``.
+        distortion_aware: Setting of the representation; None if it has no such setting.
 
     Raises:
-        SettingError: The network cannot be applied to the whole view on the sphere.
+        SettingError: The convolutions cannot be sampled on the sphere.
     """
-    if not getattr(views, "distortion_aware", False):
+    if not distortion_aware:
         return network
     tile = getattr(network, "tile", None)
-    if tile not in (None, views.image_size):
+    if tile is not None:
         raise SettingError(
             "distortion-aware convolutions",
             found=f"a network that takes only images of {width_height(tile)}",
-            expected=f"one that takes whole equirectangular images of "
-            f"{width_height(views.image_size)}",
+            expected="one that takes whole equirectangular images",
             remedy="Import the network from torch, without image_size=.",
         )
     return make_distortion_aware(network)

@@ -48,6 +48,9 @@ _PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
 _FROM_DATA = ("num_classes", "classes", "in_channels")
 """Settings that are taken from the data."""
 
+_WHOLE_SPHERE = "EquirectRepresentation", "IcosphereRepresentation"
+"""Representations with one view of the whole sphere."""
+
 _EXPORTED = "a network written by tangent-export"
 _TRAINED = "a checkpoint written by tangent-train"
 
@@ -66,8 +69,8 @@ class TrainedNetwork:
         representation: Section ``representation`` of the training's config.
         image_size: Rows and columns of the images in an evaluation of that representation.
         size_multiple: Number that height and width of images must be multiples of.
-        fixed_size: Rows and columns of the only image size that the network takes, into which
-            larger images are divided; None if it takes other sizes.
+        fixed_size: Rows and columns of the only image size that the network takes; None if it
+            takes other sizes. Larger images are divided, except for `is_spherical`.
         photo_level: Level s with the pixels per degree of the photos that an imported network was
             trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
@@ -103,14 +106,19 @@ class TrainedNetwork:
         normalized.
         """
         count = len(self.class_names) - 1
-        return ClassScoreNetwork(
-            self.inner, count, self.groups, self.fixed_size, self.score_kind
-        ).eval()
+        tile = None if self.is_spherical else self.fixed_size
+        return ClassScoreNetwork(self.inner, count, self.groups, tile, self.score_kind).eval()
+
+    @property
+    def is_spherical(self) -> bool:
+        """True if the network takes only whole spheres of the size of its training."""
+        kind = str(self.representation["_target_"]).rpartition(".")[2]
+        return self.fixed_size == self.image_size and kind in _WHOLE_SPHERE
 
     @property
     def photo_side(self) -> int | None:
         """Side of the views if it does not depend on the level: fixed size, or imported network."""
-        if self.fixed_size is not None:
+        if self.fixed_size is not None and not self.is_spherical:
             return max(self.fixed_size)
         return None if self.photo_level is None else self.image_size[1]
 

@@ -19,7 +19,6 @@ from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.inference.representations import panorama_settings
-from tangent_train.registry import build_from_config
 
 _NAME = re.compile(r"\w[\w.+-]*")
 """Names that can be part of a folder's name."""
@@ -54,22 +53,18 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
         for name, changes in _named_entries(config, "compare").items()
         if changes or name != chosen
     }
-    return {n: view for n, view in views.items() if _is_possible(n, view, config, trained)}
+    if trained is None:
+        return views
+    return {name: view for name, view in views.items() if _is_possible(name, view, trained)}
 
 
-def _is_possible(
-    name: str, view: Mapping[str, Any], config: DictConfig, trained: TrainedNetwork | None
-) -> bool:
-    """Return False, and print the reason, if a network from a file cannot be distortion-aware."""
-    section = view["representation"]
-    if trained is not None and section.get("distortion_aware"):
-        level = {"level": view.get("level", config.level)}
-        try:
-            made = build_from_config({**section, **level}, "representation")
-            network_for_views(trained.network, made)
-        except SettingError as error:
-            print_text(f"View {name} is left out: {error}")
-            return False
+def _is_possible(name: str, view: Mapping[str, Any], trained: TrainedNetwork) -> bool:
+    """Return False, and print the reason, if a network cannot be distortion-aware."""
+    try:
+        network_for_views(trained.network, view["representation"].get("distortion_aware"))
+    except SettingError as error:
+        print_text(f"View {name} is left out: {error}")
+        return False
     return True
 
 

@@ -257,7 +257,9 @@ class Predictor:
         self._per_forward = views_per_forward(view_sets.image_size)
         if images_per_forward is not None:
             self._per_forward = at_least("images_per_forward", images_per_forward, 1)
-        self._network = network_for_views(trained.network, view_sets)
+        self._network = network_for_views(
+            trained.network, getattr(view_sets, "distortion_aware", None)
+        )
         self._trained, self._view_sets = trained, view_sets
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)

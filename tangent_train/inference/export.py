@@ -125,9 +125,7 @@ def _check(
         raise SettingError(
             "output",
             found=f"{path.name}, for distortion-aware convolutions",
-            expected="a name ending in .safetensors: such a graph would be right for whole "
-            "equirectangular images of one size only, and used for others",
-            remedy="A .safetensors file takes every network.",
+            expected="a name ending in .safetensors: a graph would be right for one size only",
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from models.distortion_aware import make_ordinary
-from tangent_train.geometry import CubeGrid, TangentGrid
+from tangent_train.geometry import TangentGrid
 from tangent_train.inference.engine import (
     RenderedViews,
     sees_rays,
@@ -19,8 +19,8 @@ from tangent_train.inference.engine import (
     views_per_forward,
 )
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews, takes_signals
-from tangent_train.rendering.representations.views import PinholeViews
+from tangent_train.inference.representations import PanoramaViews
+from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from torch import nn
 
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.rendering.representations.views import Views
+    from tangent_train.rendering.representations.views import Representation
 
-_AROUND = np.arange(4)  # faces of a cube without up and down
 _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
 _EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
 _COUNTED = 20  # more, smaller views do not add evidence
@@ -44,7 +43,7 @@ class NetworkJudge:
     A network that was trained on upright images is most confident on upright images. For each
     direction it gets four horizontal views of 135° that are upright for that direction. A network
     with cross-image attention gets all views of its representation, with which it was more often
-    right, and a network on an icosphere gets its signal. The doubt of a view is the mean of 1 −
+    right, and a network of whole spheres gets its view. The doubt of a view is the mean of 1 −
     confidence over its pixels. The likelihood of a direction is the product of doubt⁻³ over up to
     20 views.
 
@@ -79,18 +78,14 @@ class NetworkJudge:
     def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return the mean doubt of each view."""
         network: Any = self._network
-        rotation, rays = upright_rotation(up), None
-        views: Views
-        if takes_signals(self.trained):
-            seen = PanoramaViews(self.trained).representation
-            views, per_forward = seen.with_rotation(rotation).view_sets()[0], 1
-        else:
-            upright = self._views
-            views = replace(upright, grid=upright.grid.with_rotation(rotation))
-            per_forward = views_per_forward(upright.grid.size)
-            if sees_rays(network):
-                network = partial(network, images_per_chunk=per_forward)
-                rays = torch.from_numpy(upright.rays()).to(self.device)
+        representation, rays = self._representation, None
+        per_forward = views_per_forward(representation.image_size)
+        views = representation.with_rotation(upright_rotation(up)).view_sets()[0]
+        if not self._takes_own_views:
+            views = views[:4]  # of a cube, without up and down
+        if sees_rays(network):
+            network = partial(network, images_per_chunk=per_forward)
+            rays = torch.from_numpy(representation.view_sets()[0].rays()).to(self.device)
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
             for _, scores in view_scores(network, rendered.of(views), len(views), per_forward, rays)
@@ -102,15 +97,18 @@ class NetworkJudge:
         """The network for pinhole images."""
         return make_ordinary(self.trained.network)
 
+    @property
+    def _takes_own_views(self) -> bool:
+        return self.trained.is_spherical or sees_rays(self.trained.network)
+
     @cached_property
-    def _views(self) -> PinholeViews:
+    def _representation(self) -> Representation:
         """The views of an upright panorama."""
         trained = self.trained
-        if sees_rays(trained.network):
-            seen: Any = PanoramaViews(trained).representation
-            return PinholeViews(seen.grid)
+        if self._takes_own_views:
+            return PanoramaViews(trained).representation
         quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its level
         least = quarter if trained.fixed_size is None else max(trained.fixed_size)
         side = -(-least // trained.size_multiple) * trained.size_multiple
         beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))
-        return PinholeViews(CubeGrid(side, margin=round(side / 2 * beyond)), _AROUND)
+        return CubemapRepresentation(trained.level, side, margin=round(side / 2 * beyond))

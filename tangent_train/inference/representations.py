@@ -19,6 +19,7 @@ from tangent_train.inference.images import InputImage
 from tangent_train.registry import SettingsFile, build_from_config
 from tangent_train.rendering import (
     EquirectRepresentation,
+    IcosphereRepresentation,
     PerspectiveRepresentation,
     Representation,
 )
@@ -60,32 +61,6 @@ _OVERLAP = 0.25
 
 _OVERSAMPLED = 2
 """Photos are resized to at most 2 pixels per pixel of a crop before their borders are mirrored."""
-
-
-def takes_signals(trained: TrainedNetwork) -> bool:
-    """Return True for a network that was trained on signals on an icosphere."""
-    return trained.representation["_target_"] == _ICOSPHERE
-
-
-def _refuse_for_signals(trained: TrainedNetwork, name: str, value: object) -> None:
-    """Refuse a setting for photos, or of other views, for a network on an icosphere."""
-    if takes_signals(trained) and value is not None:
-        raise SettingError(
-            name,
-            found=value,
-            expected="no value: a network on an icosphere takes panoramas in the representation "
-            "of its training",
-            remedy=f"Leave out {name}=.",
-        )
-
-
-def _takes_whole_panoramas(trained: TrainedNetwork) -> bool:
-    """Return True for a network of whole equirectangular images of one size, never divided."""
-    return (
-        trained.representation["_target_"] == _EQUIRECT
-        and trained.photo_level is None
-        and trained.fixed_size == trained.image_size
-    )
 
 
 class SourceViews(NamedTuple):
@@ -161,7 +136,7 @@ class PanoramaViews:
         rows, columns = limited.image_size
         sets = limited.view_sets()
         count = sum(map(len, sets))
-        if takes_signals(self._trained):
+        if rows == 1:  # signals on an icosphere
             return f"{counted(count, 'signals')} of {columns} values"
         text = f"{counted(count, 'views')} of {columns} × {rows}"
         grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
@@ -229,7 +204,6 @@ class PhotoViews:
                 expected="equirectangular: the network takes the elevation of every pixel, which "
                 "is unknown in photos",
             )
-        _refuse_for_signals(trained, "projection", "perspective")
         self._crops = [
             _photo_representation(trained, level, base_level)
             for level in level_list(levels, trained.photo_level or trained.level)
@@ -367,8 +341,6 @@ def panorama_settings(
         SettingError: The representation does not have these settings.
     """
     side, settings = trained.photo_side, dict(trained.representation)
-    _refuse_for_signals(trained, "views", views)
-    _refuse_for_signals(trained, "base_level", base_level)
     if side is not None and views is not None:
         return photo_network_settings(side, levels, base_level, views)
     chosen = [trained.level] if levels is None else level_list(levels, trained.level)
@@ -402,7 +374,7 @@ def panorama_settings(
 
 def _built(
     trained: TrainedNetwork, settings: dict[str, Any], source: SettingsFile | None
-) -> PinholeRepresentation | EquirectRepresentation:
+) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
     """Build the representation from settings.
 
     Raises:
@@ -424,7 +396,7 @@ def _photo_representation(
     else:
         views = "tangent" if trained.photo_level is not None else None
         seen = _built(trained, panorama_settings(trained, level, base_level, views), trained.source)
-        if isinstance(seen, EquirectRepresentation):
+        if not isinstance(seen, PinholeRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
         size = seen.image_size
         half_extent = min(grid.half_size[0] for grid in seen.grids)
@@ -442,33 +414,24 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     Raises:
         SettingError: The network does not support the size.
     """
-    fixed, multiple = trained.fixed_size, trained.size_multiple
-    if _takes_whole_panoramas(trained) and size != fixed:
-        raise SettingError(
-            "views",
-            found=f"images of {width_height(size)}",
-            expected=f"whole panoramas of {width_height(trained.image_size)}, the only images "
-            "that the network takes",
-            remedy="Use the level and the views of the training. Photos are not supported.",
-        )
-    if not _fits(trained, size):
-        raise SettingError(
-            "levels and base_level",
-            found=f"images of {width_height(size)}",
-            expected=f"{'' if 1 in fixed else 'at least '}{width_height(fixed)}, the input size of "
-            "the network's file"
-            if fixed
-            else f"multiples of {multiple}, the network's stride",
-            remedy="Choose other levels, or leave both as trained.",
-        )
+    if _fits(trained, size):
+        return
+    expected = f"multiples of {trained.size_multiple}, the network's stride"
+    remedy = "Choose other levels, or leave both as trained."
+    if trained.fixed_size is not None:
+        size_in_file = width_height(trained.fixed_size)
+        expected = f"at least {size_in_file}, the input size of the network's file"
+    if trained.is_spherical:
+        expected = f"{width_height(trained.image_size)}, the panorama or signal of the training"
+        remedy = "It labels whole panoramas: leave projection, views and base_level as trained too."
+    found = f"images of {width_height(size)}"
+    raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
 
 
 def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
-    """Return True if a network supports images of rows and columns; only images are divided."""
-    if trained.fixed_size is not None and 1 in trained.fixed_size:
-        return size == trained.fixed_size
-    if _takes_whole_panoramas(trained):
-        return size == trained.fixed_size
+    """Return True if a network supports images of rows and columns."""
+    if trained.is_spherical:
+        return size == trained.image_size
     if trained.fixed_size is not None:
         return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))
     return not any(side % trained.size_multiple for side in size)

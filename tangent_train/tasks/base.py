@@ -111,7 +111,7 @@ class Task(lightning.LightningModule, ABC):
                 remedy="To train parts not at all, use task.frozen=[…].",
             )
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
-        network = network_for_views(network, representation)
+        network = network_for_views(network, getattr(representation, "distortion_aware", None))
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
             self.network.compile(**compile)  # in place: names of tensors stay as they are

@@ -15,7 +15,7 @@ from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
-from tests.inference.trained import ICOSPHERE, TANGENT, trained_network
+from tests.inference.trained import ERP, ICOSPHERE, TANGENT, trained_network
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -107,13 +107,19 @@ def test_views_have_a_size_that_the_network_takes(
     assert network.shapes == {(count, 3, side, side)}
 
 
-def test_a_network_on_an_icosphere_gets_its_signal_in_every_direction() -> None:
-    network = SkyOfVertices()
-    trained = trained_network(ICOSPHERE, inner=network, class_names=("unknown", "up", "down"))
-    judge = NetworkJudge(replace(trained, normalization=PLAIN, fixed_size=(1, 2562)))
+@pytest.mark.parametrize(
+    ("representation", "network", "size"),
+    [(ICOSPHERE, SkyOfVertices(), (1, 2562)), (ERP, Sky(), (32, 64))],
+)
+def test_a_network_of_whole_spheres_gets_its_view_in_every_direction(
+    representation: dict[str, Any], network: Sky, size: tuple[int, int]
+) -> None:
+    names = ("unknown", "up", "down")
+    trained = trained_network(representation, inner=network, class_names=names, fixed_size=size)
+    judge = NetworkJudge(replace(trained, normalization=PLAIN))
     ups = AXES @ random_rotation(np.random.default_rng(1)).T
     for true in range(6):
         likely = judge(InputImage(_bright_above(ups[true])), ups)
         assert likely.argmax() == true
         assert likely.argmin() == (true + 3) % 6
-    assert network.shapes == {(1, 3, 1, 2562)}
+    assert network.shapes == {(1, 3, *size)}

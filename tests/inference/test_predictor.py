@@ -339,33 +339,27 @@ def test_impossible_settings_are_refused() -> None:
         PanoramaViews(strided, levels=(3,))
     with pytest.raises(SettingError, match=r"at least 48 × 24 \(width"):
         PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
-    whole = trained_network(ERP, fixed_size=(32, 64))
-    assert PanoramaViews(whole).image_size == (32, 64)
-    for settings in ({"levels": 5}, {"views": "tangent"}, {"base_level": 1}):
-        with pytest.raises(SettingError, match=r"views: .* whole panoramas of 64 × 32"):
-            PanoramaViews(whole, **settings)
-    with pytest.raises(SettingError, match=r"whole panoramas of 64 × 32 .* Photos are not"):
-        PhotoViews(whole)
     with pytest.raises(SettingError, match="device"):
         Predictor(trained, PanoramaViews(trained), "nonsense")
 
 
-def test_a_network_on_an_icosphere_takes_only_its_signals() -> None:
-    of_level = trained_network(ICOSPHERE, fixed_size=(1, 2562))
-    assert PanoramaViews(of_level, 4).description() == "1 signal of 2562 values"
-    with pytest.raises(SettingError, match=r"found images of 10242 × 1 .* expected 2562 × 1 "):
-        PanoramaViews(of_level, levels=5)
-    of_any = trained_network(ICOSPHERE)
-    assert PanoramaViews(of_any, levels=5).image_size == (1, 10242)
-    for trained in (of_level, of_any):
-        with pytest.raises(
-            SettingError, match=r"views: found ring.*on an icosphere.*Leave out views="
-        ):
-            PanoramaViews(trained, views="ring")
-        with pytest.raises(SettingError, match=r"base_level: found 1.*on an icosphere"):
-            PanoramaViews(trained, base_level=1)
-        with pytest.raises(SettingError, match="projection: found perspective"):
-            PhotoViews(trained)
+@pytest.mark.parametrize(("representation", "size"), [(ICOSPHERE, (1, 2562)), (ERP, (32, 64))])
+def test_a_network_of_whole_spheres_takes_only_those_of_its_training(
+    representation: dict[str, Any], size: tuple[int, int]
+) -> None:
+    trained = trained_network(representation, fixed_size=size)
+    expected = f"expected {size[1]} × {size[0]} .* labels whole panoramas: leave"
+    changes: dict[str, Any]
+    for changes in ({"levels": 5}, {"views": "ring"}, {"base_level": 1}):
+        with pytest.raises(SettingError, match=expected):
+            PanoramaViews(trained, **changes)
+    with pytest.raises(SettingError, match=expected):
+        PhotoViews(trained)
+    assert PanoramaViews(trained, 4).image_size == size
+
+
+def test_signals_are_not_views_of_photo_networks() -> None:
+    assert PanoramaViews(trained_network(ICOSPHERE)).description() == "1 signal of 2562 values"
     for views in ("icosphere", "icosphere_faces"):
         with pytest.raises(SettingError, match=f"views: found {views}; expected an option"):
             PanoramaViews(trained_network(TANGENT), views=views)

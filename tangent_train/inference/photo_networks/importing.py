@@ -92,7 +92,7 @@ def import_network(
     # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
     seen = photo_network_settings(side, levels, base_level, views)
-    representation = build_from_config(seen, "representation")
+    size = build_from_config(seen, "representation").image_size
     described = TrainedNetwork(
         inner=network.network,
         class_names=tuple(names),
@@ -100,7 +100,7 @@ def import_network(
         normalization=network.normalization,
         level=seen["level"],
         representation=seen,
-        image_size=representation.image_size,
+        image_size=size,
         size_multiple=multiple or 1,
         fixed_size=None if multiple else network.image_size,
         photo_level=_photo_level(network.image_size[1], fov_deg),
@@ -109,7 +109,7 @@ def import_network(
         settings=network.settings,
     )
     check_size(described, described.image_size)
-    network_for_views(described.network, representation)  # refused before it is used
+    network_for_views(described.network, seen.get("distortion_aware"))  # refused before it is used
     with atomic_path(path) as temporary:
         if isinstance(network.network, OnnxNetwork):
             write_metadata(network.network.path, temporary, described)
