@@ -82,16 +82,16 @@ def probable_name(command: str, message: str) -> str:
     if setting is None:
         return ""
     name, declared = setting[1], list(_names(declared_settings(command)))
-    inner = [
-        f"{section}.{key}"
+    inner = {
+        f"{section}.{key}": value
         for section in declared
         for file in sorted((config_folder() / section.rpartition(".")[2]).glob("*.yaml"))
-        for key in yaml.safe_load(file.read_text("utf-8")) or ()
-    ]
+        for key, value in (yaml.safe_load(file.read_text("utf-8")) or {}).items()
+    }
     if name in inner:  # a setting of another option
         return ""
-    for one in inner:
-        if one.endswith(f".{name}"):
+    for one, value in inner.items():  # but not one that copies the missing setting
+        if one.endswith(f".{name}") and value != f"${{{name}}}":
             return f"Is {one} meant? "
     return _other_command(command, name) or nearest(name, [*declared, *inner])
 

@@ -393,7 +393,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
         ("evaluate", "levels=9", "Is representation.levels meant?"),
         ("train", "area=[0,1,2,3]", "Is data.area meant?"),
         ("transfer", "photos.data.rot=x", "Is photos.data.root meant?"),
-        ("train", "experiment=rooms/demmo", "Is rooms/demo meant?"),
+        ("train", "experiment=rooms/demmo", "Is rooms/demo or rooms/methods meant?"),
         ("train", "experiment=densepass", "Is field/cityscapes_densepass or field/cityscapes_d"),
         ("train", "experiment=rooms/transfer", "Is tangent-transfer meant?"),
         ("import_network", "level=9", "Is levels meant?"),
