@@ -248,7 +248,9 @@ class _Block(nn.Module):
 
 @registered
 class IcoCNN(ResidualUNet):
-    """Residual U-Net of gauge equivariant convolutions (Cohen et al. 2019, supplement, 2D-3D-S).
+    """Residual U-Net of gauge equivariant convolutions (Cohen et al. 2019).
+
+    Its widths, blocks and pooling are assumptions: the article was not at hand.
 
     Rotations of the signal by the 60 rotations of the icosahedron rotate its scores. Coarser levels
     have the maximum of each vertex and its neighbors; finer ones are interpolated.
