@@ -36,6 +36,8 @@ _BATCHES = (1, 3)
 
 _LEAST_TRACED = 32
 
+_SAFETENSORS = "A .safetensors file takes every network."
+
 
 class Export(NamedTuple):
     """Result of an export.
@@ -98,7 +100,7 @@ def export_network(
         "output",
         found=f"{path.name}, which cannot be written ({first_line(cause)})",
         expected="a network that torch's exporter supports",
-        remedy="A .safetensors file takes every network.",
+        remedy=_SAFETENSORS,
     ) from failure
 
 
@@ -125,7 +127,8 @@ def _check(
         raise SettingError(
             "output",
             found=f"{path.name}, for distortion-aware convolutions",
-            expected="a name ending in .safetensors: a graph would be right for one size only",
+            expected="ordinary convolutions: the sampling would be right for one size only",
+            remedy=_SAFETENSORS,
         )
 
 
