@@ -38,17 +38,19 @@ class Heading(NamedTuple):
         unit: ``%`` for a share of 1, which is printed in percent; else a unit, or "".
         of_class: Key of the score of one class that this score is the mean of, or "".
         class_text: Name of that score in reports.
+        better: ``higher``, or ``lower`` for errors.
     """
 
     text: str
     unit: str = "%"
     of_class: str = ""
     class_text: str = ""
+    better: str = "higher"
 
     @property
     def column(self) -> str:
         """Heading of a column with the score."""
-        return f"{self.text} {self.unit}".strip()
+        return f"{self.text} {self.unit}".strip() + " ↓" * (self.better == "lower")
 
     @property
     def class_column(self) -> str:
@@ -73,6 +75,7 @@ def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
             heading.unit,
             heading.of_class and heading.of_class + SOLID_ANGLE,
             heading.class_text and f"{heading.class_text} by solid angle",
+            heading.better,
         )
         for name, heading in headings.items()
     }
