@@ -24,7 +24,7 @@ from tangent_train.cli.predict_labels import LabelPrediction, ReadsImage
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.errors import SettingError, counted
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.results.html import EncodedImage
@@ -202,7 +202,8 @@ class _Images:
 
     def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
         """Predict one image."""
-        return self._prediction(*job.value, self._folder.files(job.item), progress)
+        image, area = job.value
+        return self._prediction(image, area, self._folder.files(job.item), progress)
 
     def write(self, job: Job) -> Entry:
         """Write the results of one image; return its entry in the summary."""
@@ -275,10 +276,8 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _check_videos(inputs: Inputs, folder: PredictionFolder) -> None:
-    source, pictures = (
-        folder.results.source,
-        set(folder.results.pictures).intersection(folder.kinds),
-    )
+    results, source = folder.results, folder.results.source
+    pictures = set(results.pictures).intersection(folder.kinds)
     if inputs.videos and pictures and source not in folder.kinds:
         raise SettingError(
             "write",

@@ -59,13 +59,14 @@ class LabelResults(ImageResults):
     """
 
     summary = "classes"
-    suffixes = {"labels": ".png", "color": ".png", "overlay": ".png", "probabilities": ".npy"}
     usual = ("labels", "color", "overlay")
     pictures = ("color", "overlay")
     unknown = 0
 
     def __init__(self, class_names: Sequence[str]) -> None:
         self.class_names = self.columns = class_names
+        pictures = dict.fromkeys(("labels", "color", "overlay"), ".png")
+        self.suffixes = pictures | {"probabilities": ".npy"}
 
     def write_description(self, folder: Path) -> None:
         """Write ``classes.json`` (labels by name), without classes that are called unknown."""
