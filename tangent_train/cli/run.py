@@ -305,6 +305,9 @@ def build_trained(
     Raises:
         SettingError: The network does not fit the data, or the class map fits neither of them.
     """
+    task = resolve_target(settings["task"], "task", source)
+    remedy = "Choose the task of the network: task=segmentation for classes, task=depth for depth."
+    trained.check_predicts(getattr(task, "predicts", ""), remedy)
     data = build_data(settings, source)
     notes = []
     if settings.get("class_map") is not None:
