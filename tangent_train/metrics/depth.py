@@ -102,31 +102,35 @@ class DepthProtocol:
         return torch.where(known, truth, torch.nan)
 
     def aligned(
-        self, prediction: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]
+        self,
+        prediction: Float[Tensor, "*shape"],
+        truth: Float[Tensor, "*shape"],
+        ray_lengths: Tensor | None = None,
     ) -> Float[Tensor, "*shape"]:
         """Align the prediction for an image with its true distances, and clip it.
 
         Args:
-            prediction: Predicted distances in any unit; NaN where there are none.
-            truth: True distances in meters; NaN where unknown.
+            prediction: Predicted distances in any unit; NaN where unknown.
+            truth: True distances in meters; NaN where unknown or outside the limits.
+            ray_lengths: Distance divided by z-depth of the pixels of a photo, whose z-depth is
+                aligned; None for a panorama.
 
         Returns:
-            Distances in meters; NaN where there are none, or where the alignment makes them
-            negative.
+            Distances in meters; NaN where unknown, or where the alignment makes them negative.
         """
-        distances = prediction.double()
-        distances = torch.where(distances > 0, distances, torch.nan)
-        used = (self.limited(truth) > 0) & distances.isfinite()
+        distances = torch.where(prediction > 0, prediction.double(), torch.nan)
+        lengths = 1.0 if ray_lengths is None else ray_lengths.double()
+        used = (truth > 0) & distances.isfinite()
         if self.alignment != "none" and used.any():
+            values, true = distances / lengths, truth.double() / lengths
             is_disparity = self.alignment_in == "disparity"
-            values, true = distances, truth.double()
             if is_disparity:
                 values, true = 1 / values, 1 / true
             scale, shift = _fit(values[used], true[used], self.alignment)
             values = scale * values + shift
-            if self.clip and is_disparity:
+            if is_disparity and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
-            distances = 1 / values if is_disparity else values
+            distances = lengths * (1 / values if is_disparity else values)
         if self.clip:
             distances = distances.clamp(self.min_distance, self.max_distance)
         return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)

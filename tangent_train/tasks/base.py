@@ -526,9 +526,7 @@ class Task(lightning.LightningModule, ABC):
             group["lr"] *= group_factor
         if self.schedule is None:
             return optimizer
-        configured = self.schedule.configure(
-            optimizer, length, factors, self.monitor, self.mode_of
-        )
+        configured = self.schedule.configure(optimizer, length, factors, self.monitor, self.mode_of)
         return {"optimizer": optimizer, "lr_scheduler": configured}
 
     def _length(self) -> dict[str, int]:

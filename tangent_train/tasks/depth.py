@@ -26,6 +26,9 @@ from tangent_train.checkpoints.distances import (
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
+from tangent_train.inference.alignment import Align
+from tangent_train.inference.depth import combine_depth
+from tangent_train.inference.engine import view_scores
 from tangent_train.metrics.depth import (
     Alignment,
     DepthMetric,
@@ -39,8 +42,9 @@ from tangent_train.registry import registered
 from tangent_train.results.evaluation import plain_scores
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
-from tangent_train.tasks.views import ViewsTask
+from tangent_train.tasks.views import ViewsTask, labels_of_views
 
+_PANORAMA_DIMENSIONS = 2
 _LEAST = 1e-3
 """Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
 
@@ -81,14 +85,14 @@ class DepthTask(ViewsTask):
     headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
         {
             "absrel": Heading("AbsRel", "", better="lower"),
-            "delta1": Heading("δ1", "%"),
+            "delta1": Heading("δ1"),
             "rmse": Heading("RMSE", "m", better="lower"),
-            "mae": Heading("MAE", "m", better="lower"),
-            "sqrel": Heading("SqRel", "m", better="lower"),
-            "rmse_log": Heading("RMSElog", "", better="lower"),
-            "delta2": Heading("δ2", "%"),
-            "delta3": Heading("δ3", "%"),
-            "missing": Heading("missing", "%", better="lower"),
+            "mae": Heading("MAE", "m", better="lower", is_main=False),
+            "sqrel": Heading("SqRel", "m", better="lower", is_main=False),
+            "rmse_log": Heading("RMSElog", "", better="lower", is_main=False),
+            "delta2": Heading("δ2", is_main=False),
+            "delta3": Heading("δ3", is_main=False),
+            "missing": Heading("missing", better="lower", is_main=False),
         }
     )
     monitor: ClassVar[str] = "val/absrel"
@@ -104,7 +108,7 @@ class DepthTask(ViewsTask):
         depth_kind: DepthKind | None = None,
         loss: DepthLoss = "log_l1",
         scale_invariance: float = 0.5,
-        align: str | None = None,
+        align: Align | None = None,
         alignment: Alignment = "none",
         alignment_in: Quantity | None = None,
         min_distance: float = 0.0,
@@ -114,11 +118,12 @@ class DepthTask(ViewsTask):
     ) -> None:
         super().__init__(network, representation, class_names, *arguments, **settings)
         of_file = getattr(network, "kind", None)
-        kinds, losses = get_args(DepthKind), get_args(DepthLoss)
+        kinds, losses, aligns = map(get_args, (DepthKind, DepthLoss, Align))
         if of_file is not None:
             kinds = (of_file,)
         for name, value, fits, expected in (
             ("depth_kind", depth_kind, depth_kind in (None, *kinds), " or ".join(kinds)),
+            ("align", align, align in (None, *aligns), f"null, {' or '.join(aligns)}"),
             ("loss", loss, loss in losses, " or ".join(losses)),
             ("scale_invariance", scale_invariance, 0 <= scale_invariance <= 1, "0 to 1"),
             ("label_smoothing", self.label_smoothing, self.label_smoothing == 0, "0 for distances"),
@@ -137,7 +142,7 @@ class DepthTask(ViewsTask):
             alignment_in = "disparity" if is_disparity(self.depth_kind) else "distance"
         self.protocol = DepthProtocol(alignment, alignment_in, min_distance, max_distance, clip)
         self.loss: DepthLoss = loss
-        self.scale_invariance = scale_invariance
+        self.scale_invariance = float(scale_invariance)
         self.align = align
 
     @staticmethod
@@ -171,18 +176,104 @@ class DepthTask(ViewsTask):
 
     def _loss(self, outputs: Tensor, truth: Tensor) -> Tensor:
         """Return the loss of outputs ``(n, 1, h, w)``, given the correct ones ``(n, h, w)``."""
-        values = outputs[:, 0]
+        return log_error_sum(self.errors(outputs, truth), self.loss, self.scale_invariance)
+
+    def errors(
+        self, outputs: Float[Tensor, "images 1 height width"], truth: Tensor
+    ) -> Float[Tensor, "images height width"]:
+        """Return the errors of the logarithm of the network's depth, or disparity.
+
+        Relative outputs are first scaled and shifted, see `scaled_and_shifted`.
+
+        Args:
+            outputs: Outputs of the network.
+            truth: The correct outputs ``(n, h, w)``; NaN where unknown.
+        """
+        values = outputs[:, 0].to(truth.dtype)  # float32 in half-precision training
         if self.depth_kind == "log_distance":
-            errors = values - truth
-        else:
-            if not is_metric(self.depth_kind):
-                values = scaled_and_shifted(values, truth)
-            errors = values.clamp(min=_LEAST).log() - truth.log()
-        return log_error_sum(errors, self.loss, self.scale_invariance)
+            return values - truth
+        if not is_metric(self.depth_kind):
+            values = scaled_and_shifted(values, truth)
+        return values.clamp(min=_LEAST).log() - truth.log()
 
     def loss_norm(self, labels: Tensor) -> Tensor:
         """Return the number of pixels whose distance is known."""
         return (~labels.isnan()).sum().float()
+
+    def _add_loss(self, outputs: Tensor, truth: Tensor, ray_lengths: Tensor) -> None:
+        """Add the loss of views, given their true distances, to the validation loss."""
+        labels = from_distance(truth, self.depth_kind, ray_lengths)
+        self.add_validation_loss(self._loss(outputs, labels), labels)
+
+    @torch.no_grad()
+    def predict_distances(
+        self,
+        images: Float[Tensor, "images channels height width"],
+        shape: tuple[int, ...],
+        ray_lengths: Float[Tensor, "some height width"],
+        rotation: NDArray[np.float64] | None = None,
+        truth: Tensor | None = None,
+        area: SphereArea | None = None,
+    ) -> Float[Tensor, "*shape"]:
+        """Predict the distances of one panorama, or of the crops of a photo.
+
+        Args:
+            images: Images of all view sets of the representation, in this order.
+            shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
+                crops.
+            ray_lengths: Ray lengths of each view set, or of each crop.
+            rotation: Rotation of the representation ``(3, 3)``.
+            truth: True distances in meters, to add to the validation loss; None to compute no loss.
+            area: Area of a partial panorama; None for the whole sphere.
+
+        Returns:
+            Distances of that shape; NaN where unknown.
+        """
+        kind = self.depth_kind
+        if len(shape) != _PANORAMA_DIMENSIONS:  # crops, each separately
+            depth = self._depth_of(images.__getitem__, len(images))
+            if truth is not None:
+                self._add_loss(depth, truth, ray_lengths)
+            return distance_of(along_rays(depth[:, 0], kind, ray_lengths), kind)
+        outputs = []
+        for views, of_set, rays in self.view_sets(images, rotation, area):
+            depth = self._depth_of(of_set, len(views), rays)
+            if truth is not None:
+                lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
+                self._add_loss(depth, labels_of_views(truth, views), lengths)
+            outputs.append((views, depth))
+        size, blend = (shape[0], shape[1]), self.representation.blend
+        combined = combine_depth(outputs, size, kind, blend, self.align, area=area)
+        return combined.distance.to(images.device)
+
+    def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
+        """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
+        parts = view_scores(self, images, count, self.images_per_forward, rays)
+        return torch.cat([depth for _, depth in parts])
+
+    def evaluate(self, batch: Any) -> Tensor:
+        """Add a batch of panoramas or photos to `metric`; return the aligned distances."""
+        predictions = []
+        for images, target, lengths, rotation, numbers in zip(
+            batch.images, batch.target, batch.ray_lengths, batch.rotation, batch.area, strict=True
+        ):
+            truth = self.meters(target)
+            distances = self.predict_distances(
+                images,
+                tuple(target.shape),
+                lengths,
+                rotation.cpu().numpy(),
+                None if self.is_tested else truth,
+                SphereArea.of_numbers(numbers.cpu().numpy()),
+            )
+            if target.ndim != _PANORAMA_DIMENSIONS:  # the crops of a photo have separate scales
+                crops = zip(distances, truth, lengths, strict=True)
+                aligned = torch.stack([self.protocol.aligned(*crop) for crop in crops])
+            else:
+                aligned = self.protocol.aligned(distances, truth)
+            self.metric.update(aligned, truth)
+            predictions.append(aligned)
+        return torch.stack(predictions)
 
     def build_metric(self) -> DepthMetric:
         """Build the metric, which keeps the sums of the errors of each image."""

@@ -125,7 +125,8 @@ def scaled_and_shifted(
     def mean(x: Tensor) -> Tensor:
         return x.where(known, 0).sum(dim=(1, 2), keepdim=True) / counts
 
-    exact, true = _exact(values), _exact(truth)
+    # Without NaN, whose gradients would be NaN too.
+    exact, true = _exact(values), _exact(truth).where(known, 0)
     centered, true_mean = exact - mean(exact), mean(true)
     variance = mean(centered.square()).clamp(min=torch.finfo(exact.dtype).eps)
     return centered * (mean(centered * (true - true_mean)) / variance) + true_mean
