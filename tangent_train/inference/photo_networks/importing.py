@@ -9,7 +9,6 @@ from pathlib import Path
 
 import torch
 
-from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import ScoreKind
@@ -208,7 +207,7 @@ def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
     network, representation, level = (content.pop(name) for name in names)
     content |= {
         "config": {"network": network, "representation": representation, "level": level},
-        "predicts": PIXEL_CLASSES,
+        "predicts": described.predicts,
         "state_dict": {
             name: t.contiguous().float() if t.is_floating_point() else t
             for name, t in described.network.state_dict().items()
