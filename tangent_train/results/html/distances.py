@@ -79,7 +79,8 @@ def pack_distances(
         key: np.where(np.isfinite(d) & (d > 0), d.astype(np.float64), np.nan)
         for key, d in distances.items()
     }
-    center, radius = (0.0, 0.0, 0.0), 1.0
+    center: tuple[float, ...] = (0.0, 0.0, 0.0)
+    radius = 1.0
     for key, values in maps.items():
         if sphere or camera:
             rays = _rays(values.shape, None if sphere else camera)
