@@ -35,12 +35,17 @@ from tangent_train.metrics.depth import (
     DepthProtocol,
     Quantity,
     depth_intervals,
+    depth_scores,
+    error_sums,
     mean_depth_scores,
 )
 from tangent_train.metrics.segmentation import BAND_EDGES_DEG
 from tangent_train.registry import registered
 from tangent_train.results.evaluation import plain_scores
+from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.pictures import distance_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
+from tangent_train.tasks.base import RGB
 from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
 from tangent_train.tasks.views import ViewsTask, labels_of_views
 
@@ -303,6 +308,31 @@ class DepthTask(ViewsTask):
     def facts(self) -> dict[str, str]:
         """See `Task`: errors are those of the pixels of an image, averaged over the images."""
         return {"weighting": "pixels, then images", **self.protocol.facts}
+
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB:
+        """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
+        truth = self.meters(target)
+        return distance_panel(
+            *shown_arrays(image, truth, prediction, self.representation, most_rows)
+        )
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage:
+        """Return the image with its true and predicted distances, aligned as for the scores."""
+        truth = self.meters(target)
+        scores = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())
+        arrays = shown_arrays(image, truth, prediction, self.representation, cut=False)
+        return encode_image(
+            name,
+            arrays[0],
+            distance=arrays[2],
+            true_distance=arrays[1],
+            sphere=target.ndim == _PANORAMA_DIMENSIONS,
+            note=f"AbsRel {scores['absrel']:.3g}",
+        )
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
         """See `Task`."""
