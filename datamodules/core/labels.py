@@ -14,6 +14,9 @@ PIXEL_CLASSES = "pixel_classes"
 IMAGE_CLASS = "image_class"
 """One class index for an image or shape."""
 
+DISTANCE = "distance"
+"""A distance from the center for every pixel, in steps of 1/512 m, 0 where unknown."""
+
 
 @dataclass(frozen=True)
 class ClassSet:

@@ -33,9 +33,31 @@ ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "lab
   index K.
 """
 
+DepthKind = Literal[
+    "log_distance",
+    "metric_distance",
+    "metric_z",
+    "canonical_inverse",
+    "relative_depth",
+    "relative_disparity",
+]
+"""Output of a depth network, a channel of values at the pixels of its images.
+
+* `log_distance`: natural logarithm of the distance along the ray in meters; trained by `DepthTask`.
+* `metric_distance`: distance along the ray in meters.
+* `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
+* `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of
+  Depth Pro; z-depth is proportional to the focal length.
+* `relative_depth`: z-depth up to a scale and a shift per image.
+* `relative_disparity`: 1 / z-depth up to a scale and a shift per image.
+
+In views that are not pinhole images (equirectangular images, icospheres), z-depth is the distance.
+"""
+
 _FIELDS = {
     "config": dict,
-    "class_names": list[Text],
+    "class_names": list[Text],  # empty for depth networks
+    "depth_kind": DepthKind | None,  # for imported depth networks; None for log_distance
     "fixed_size": list[int] | None,  # for imported networks
     "epoch": int | None,  # for runs: the last epoch that has begun, from 0
     "groups": GROUPS,
@@ -55,7 +77,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     Args:
         path: Checkpoint. Tensors are memory-mapped; checksums are compared if they are needed.
         needed: Names of the fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
+            ``class_names``, ``depth_kind``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
             ``normalization``, ``photo_level``, ``predicts``, ``score_kind``, ``state_dict``.
 
     Raises:

@@ -18,16 +18,18 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.images.gpano import Fill
 from models.onnx_network import OnnxNetwork, graph_checksum
 from tangent_train.checkpoints.content import (
     GROUPS,
     INPUTS,
     NORMALIZATION,
+    DepthKind,
     ScoreKind,
     read_checkpoint,
 )
+from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
@@ -51,6 +53,9 @@ _FROM_DATA = ("num_classes", "classes", "in_channels")
 _WHOLE_SPHERE = "EquirectRepresentation", "IcosphereRepresentation"
 """Representations with one view of the whole sphere."""
 
+_OF_NETWORK = {"class_names", "depth_kind", "groups", "inputs", "normalization", "score_kind"}
+"""Fields of checkpoints that describe the network."""
+
 _EXPORTED = "a network written by tangent-export"
 _TRAINED = "a checkpoint written by tangent-train"
 
@@ -62,7 +67,7 @@ class TrainedNetwork:
     Attributes:
         inner: Network as it was trained or imported, in evaluation mode; see `network`.
         class_names: Names of the K + 1 labels, the unknown class first; score k is that of label
-            k + 1.
+            k + 1. Empty for depth networks.
         inputs: Inputs of the network, see `datamodules.core.inputs.Input`.
         normalization: Normalization of RGB and depth.
         level: Level s of the training.
@@ -70,12 +75,14 @@ class TrainedNetwork:
         image_size: Rows and columns of the images in an evaluation of that representation.
         size_multiple: Number that height and width of images must be multiples of.
         fixed_size: Rows and columns of the only image size that the network takes; None if it
-            takes other sizes. Larger images are divided, except for `is_spherical`.
+            takes other sizes. Larger images are divided, or resized for depth networks, except for
+            `is_spherical`.
         photo_level: Level s with the pixels per degree of the photos that an imported network was
             trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
-        score_kind: Kind of the output of `inner`.
+        score_kind: Kind of the output of `inner`, if it predicts classes.
+        depth_kind: Kind of the output of a depth network; None for networks of classes.
         fill: Colors outside the area of partial panoramas in the training.
         settings: Complete section of the config that builds `inner`; None if only the computation
             is known (ONNX).
@@ -94,20 +101,46 @@ class TrainedNetwork:
     photo_level: int | None = None
     groups: Groups | None = None
     score_kind: ScoreKind = "logits"
+    depth_kind: DepthKind | None = None
     fill: Fill = "mean"
     settings: Mapping[str, Any] | None = None
     source: SettingsFile | None = None
 
     @cached_property
-    def network(self) -> ClassScoreNetwork:
-        """Network that returns scores of K classes ``(B, K, h, w)``.
+    def network(self) -> ClassScoreNetwork | DistanceNetwork:
+        """Network that returns scores of K classes ``(B, K, h, w)``, or depth ``(B, 1, h, w)``.
 
         With `groups`, a further score is that of no class. Images are ``(B, C, h, w)`` float32,
         normalized.
         """
         count = len(self.class_names) - 1
         tile = None if self.is_spherical else self.fixed_size
+        if self.depth_kind is not None:
+            return DistanceNetwork(self.inner, self.depth_kind, tile).eval()
         return ClassScoreNetwork(self.inner, count, self.groups, tile, self.score_kind).eval()
+
+    @property
+    def predicts(self) -> str:
+        """Kind of labels that the network predicts, see `datamodules.core.labels`."""
+        return PIXEL_CLASSES if self.depth_kind is None else DISTANCE
+
+    def check_predicts(self, needed: str, remedy: str = "") -> None:
+        """Refuse networks with other predictions than needed.
+
+        Args:
+            needed: Kind of labels, see `datamodules.core.labels`.
+            remedy: Remedy in the message.
+
+        Raises:
+            SettingError: The network predicts another kind of labels.
+        """
+        if self.predicts != needed:
+            raise SettingError(
+                "checkpoint",
+                found=f"a network that predicts {self.predicts}",
+                expected=f"a network that predicts {needed}",
+                remedy=remedy,
+            )
 
     @property
     def is_spherical(self) -> bool:
@@ -152,6 +185,7 @@ class NetworkDescription:
         normalization: ``mean`` and ``std`` of the inputs.
         groups: Indices of scores, see `TrainedNetwork`.
         score_kind: Kind of the output, see `TrainedNetwork`.
+        depth_kind: Kind of the output of a depth network, see `TrainedNetwork`.
         settings: Section of a config that builds the network. Settings that depend on the data (see
             `completed_settings`) and those of other pretrained weights are null.
     """
@@ -161,6 +195,7 @@ class NetworkDescription:
     normalization: Mapping[str, Sequence[float]]
     groups: Groups | None
     score_kind: ScoreKind
+    depth_kind: DepthKind | None
     settings: dict[str, Any]
 
 
@@ -176,6 +211,7 @@ _KINDS = {
     "photo_level": int | None,
     "groups": GROUPS,
     "score_kind": ScoreKind,
+    "depth_kind": DepthKind | None,
     "fill": Fill | None,
     "settings": dict | None,
 }
@@ -245,12 +281,13 @@ def describe_network(path: Path) -> NetworkDescription | None:
             return None
         content = _parse_metadata(path, metadata)
     else:
-        names = ("class_names", "config", "groups", "inputs", "normalization", "score_kind")
+        names = _OF_NETWORK | {"config", "predicts"}
         plain = load_plain(path, f"{_TRAINED}, or a state dict", mmap=True, whole=False)
         if not isinstance(plain, Mapping) or "tangent_train_version" not in plain:
             return None
         content = read_checkpoint(path, names)
         content["settings"] = content["config"].get("network")
+        content["depth_kind"] = _depth_kind(content)
     if not isinstance(content["settings"], Mapping):
         return None
     return NetworkDescription(
@@ -259,6 +296,7 @@ def describe_network(path: Path) -> NetworkDescription | None:
         normalization=content["normalization"],
         groups=content["groups"],
         score_kind=content["score_kind"] or "logits",
+        depth_kind=content["depth_kind"],
         settings=_without_data_settings(content["settings"]),
     )
 
@@ -331,11 +369,11 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     """Load a network, and find by trial the sizes of images that it takes."""
     path = source.path
     content = read_checkpoint(path)
-    if content["predicts"] != PIXEL_CLASSES:
+    if content["predicts"] not in (PIXEL_CLASSES, DISTANCE):
         raise DataError(
             path,
             found=f"a network that predicts {content['predicts'] or 'something else'}",
-            expected=f"a network that predicts {PIXEL_CLASSES}",
+            expected=f"a network that predicts {PIXEL_CLASSES} or {DISTANCE}",
             remedy=f"Networks of all tasks: tangent-evaluate checkpoint={path}.",
         )
     kinds = {"network": dict, "representation": dict, "level": int}
@@ -343,9 +381,9 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     described["settings"] = described.pop("network")
     fill = (content["config"].get("data") or {}).get("fill")
     described["fill"] = fill if fill in get_args(Fill) else None
-    of_network = "class_names", "inputs", "normalization", "groups", "score_kind"
-    names = (*of_network, "fixed_size", "photo_level")
+    names = _OF_NETWORK | {"fixed_size", "photo_level"}
     described |= {"inputs": (), **{n: content[n] for n in names if content[n] is not None}}
+    described["depth_kind"] = _depth_kind(content)
     tensors = {
         name.removeprefix(_PREFIX): tensor
         for name, tensor in content["state_dict"].items()
@@ -359,14 +397,22 @@ def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
     return replace(trained, size_multiple=multiple or 1, fixed_size=fixed)
 
 
+def _depth_kind(content: Mapping[str, Any]) -> DepthKind | None:
+    """Return the kind of a depth network in a checkpoint; None for a network of classes."""
+    kind: DepthKind = content["depth_kind"] or "log_distance"
+    return kind if content["predicts"] == DISTANCE else None
+
+
 def _build_network(
     described: dict[str, Any], tensors: Mapping[str, Tensor], source: SettingsFile
 ) -> nn.Module:
     """Build a network with the tensors of its file; complete its settings in place."""
     if described["settings"] is None:
         raise DataError(source.path, found="no settings of the network", expected=_EXPORTED)
-    channels, classes = len(channel_names(described["inputs"])), len(described["class_names"]) - 1
-    settings = completed_settings(described["settings"], channels, classes, restored=True)
+    is_depth = described.get("depth_kind") is not None
+    channels = len(channel_names(described["inputs"]))
+    outputs = 1 if is_depth else len(described["class_names"]) - 1
+    settings = completed_settings(described["settings"], channels, outputs, restored=True)
     described["settings"] = settings
     network: nn.Module = build_from_config(settings, "network", source)
     try:

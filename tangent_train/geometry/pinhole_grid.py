@@ -145,6 +145,12 @@ class PinholeGrid:
         return columns * self.pitch / 2, rows * self.pitch / 2
 
     @property
+    def plane_positions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Positions y of rows ``(h,)`` and x of columns ``(w,)`` on the image plane."""
+        rows, columns = (np.arange(side, dtype=np.float64) - (side - 1) / 2 for side in self.size)
+        return rows * self.pitch, columns * self.pitch
+
+    @property
     def width_deg(self) -> float:
         """Angle across the middle of an image, between its outer pixel edges, in degrees."""
         return math.degrees(2 * math.atan(self.half_size[0]))
@@ -186,7 +192,7 @@ class PinholeGrid:
         Raises:
             SettingError: A face is out of range.
         """
-        down, right = ((np.arange(side) - (side - 1) / 2) * self.pitch for side in self.size)
+        down, right = self.plane_positions
         x, y = np.meshgrid(right, down)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)

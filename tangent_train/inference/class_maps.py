@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.images.image_files import composed
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
@@ -149,6 +150,7 @@ def map_classes(
             expected=f"names among {', '.join(targets)}",
         )
     target_of = {_plain(n): target for target, names in class_map.classes.items() for n in names}
+    trained.check_predicts(PIXEL_CLASSES, "Leave class_map out.")
     names = trained.class_names[1:]
     groups = trained.groups or [[k] for k in range(len(names))]
     members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}

@@ -22,6 +22,7 @@ import torch
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
+from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import ClassScoreNetwork, network_for_views, plain_scores
 from tangent_train.errors import SettingError, at_least
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -49,7 +50,8 @@ _PIXELS_PER_FORWARD = 2**20
 
 def sees_rays(network: nn.Module) -> bool:
     """Return True if a network takes viewing rays, such as one with cross-image attention."""
-    inner = network.network if isinstance(network, ClassScoreNetwork) else network
+    wrappers = ClassScoreNetwork, DistanceNetwork
+    inner = network.network if isinstance(network, wrappers) else network
     return "rays" in inspect.signature(inner.forward).parameters
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.image_module import Upright
+from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.panoramas import meters_to_steps
 from datamodules.images.gpano import Fill, PanoramaArea
 from datamodules.images.masks import Mask, Masks
@@ -90,6 +91,7 @@ def load(
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
+    original.check_predicts(PIXEL_CLASSES)
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
     chosen = trained, levels, base_level, blend, rotations

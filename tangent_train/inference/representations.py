@@ -459,10 +459,10 @@ def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: floa
     rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
     if depth is not None:
         depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
-    # Crops that cover the whole image do not depend on the principal point.
-    focal = np.diag([*np.diag(matrix)[:2] * scale, 1])
     offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
+    camera = np.diag([*np.diag(matrix)[:2] * scale, 1])
+    camera[:2, 2] = (matrix[:2, 2] + 0.5) * scale + (left, top) - 0.5
     mirrored = InputImage(rgb, depth)
-    crops = wanted.of_camera(focal, mirrored.shape).cover(overlap)
+    crops = wanted.of_camera(camera, mirrored.shape).cover(overlap)
     in_photo = replace(crops, canvas_boxes=(crops.boxes - offset) / factor)
     return SourceViews(mirrored, mirrored.shape, [in_photo])

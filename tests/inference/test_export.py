@@ -86,6 +86,7 @@ def test_everything_known_of_a_network_comes_back(
         "photo_level": None,
         "groups": None,
         "score_kind": "logits",
+        "depth_kind": None,
         "fill": "edge",
         "settings": UNET if suffix == ".safetensors" else None,
         "tangent_train_version": version("tangent-train"),

@@ -23,7 +23,7 @@ from tangent_train.geometry import shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.representations.views import Views
+from tangent_train.rendering.representations.views import Views, lengths_of_rays
 from tangent_train.rendering.resampling import crop
 from tangent_train.rendering.sampling import plane_rays
 
@@ -45,6 +45,8 @@ class PhotoCrops(Views):
         numbers: ``(n,)`` numbers of the crops that are rendered; None for all.
         canvas_boxes: ``(N, 4)`` boxes on the canvas; None if the photo itself is the canvas.
         is_overlapping: See `Views`.
+        camera_matrix: ``(3, 3)`` K of the photo, integer pixel centers; None if it is not a pinhole
+            image.
     """
 
     boxes: NDArray[np.float64]
@@ -53,6 +55,7 @@ class PhotoCrops(Views):
     numbers: NDArray[np.int64] | None = None
     canvas_boxes: NDArray[np.float64] | None = None
     is_overlapping: bool = True
+    camera_matrix: NDArray[np.float64] | None = None
 
     def __getitem__(self, part: slice) -> Self:
         return replace(self, numbers=self.chosen[part])
@@ -75,6 +78,17 @@ class PhotoCrops(Views):
             return crops.flip(-1) if self.mirrored else crops
         crops = np.stack(parts)
         return np.ascontiguousarray(crops[:, :, ::-1]) if self.mirrored else crops
+
+    def ray_lengths(self) -> NDArray[np.float32]:
+        """See `Views`; the optical axis is that of the photo, wherever a crop is."""
+        if self.camera_matrix is None:
+            return super().ray_lengths()
+        x, y = (
+            (self._pixel_centers(axis)[self.chosen] - 0.5 - self.camera_matrix[axis, 2])
+            / self.camera_matrix[axis, axis]
+            for axis in (0, 1)
+        )
+        return lengths_of_rays(x[:, ::-1] if self.mirrored else x, y)
 
     def owned(self) -> NDArray[np.bool_]:
         """Return a mask of the pixels nearer to the crop's center than to any other, ``(n, h, w)``.
@@ -216,7 +230,8 @@ class PhotoSampler:
         centers, half = self.camera_matrix[:2, 2] + 0.5 + shifts, self._extent() / 2
         boxes = np.concatenate([centers - half, centers + half], axis=1)
         inside = boxes.clip(0, np.tile(self.size[::-1], 2))  # rounding may exceed the photo
-        return PhotoCrops(inside, self.representation.image_size, mirrored)
+        size, matrix = self.representation.image_size, self.camera_matrix
+        return PhotoCrops(inside, size, mirrored, camera_matrix=matrix)
 
 
 @registered

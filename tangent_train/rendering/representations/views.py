@@ -73,6 +73,14 @@ class Views:
         """
         return NO_RAYS
 
+    def ray_lengths(self) -> NDArray[np.float32]:
+        """Return distance divided by z-depth at every pixel, ``(1 or n, h, w)``.
+
+        It is √(1 + x² + y²) at the position (x, y) on the image plane at distance 1. In views that
+        are not pinhole images, z-depth is the distance: ``(1, 1, 1)``, a 1.
+        """
+        return np.ones((1, 1, 1), np.float32)
+
     def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return scores ``(n, K, h, w)`` as images on the canvas ``(H, W)``, and their geometry."""
         del shape
@@ -97,6 +105,12 @@ class Views:
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """Return ``(n, H, 2)`` spans of the canvas that contain the owned pixels of each image."""
         raise NotImplementedError
+
+
+def lengths_of_rays(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return √(1 + x² + y²) ``(n, h, w)`` of columns ``(n, w)`` and rows ``(n, h)``."""
+    squares = 1 + x[:, None, :] ** 2 + y[:, :, None] ** 2
+    return np.asarray(np.sqrt(squares), np.float32)
 
 
 class Sampler(Protocol):
@@ -189,6 +203,11 @@ class PinholeViews(Views):
         x, y = grid.half_size
         axes = grid.world_from_camera[self.chosen]
         return (axes * (-x if self.mirrored else x, y, 1)).astype(np.float32)
+
+    def ray_lengths(self) -> NDArray[np.float32]:
+        """See `Views`; equal for all images, mirrored or not."""
+        down, across = self.grid.plane_positions
+        return lengths_of_rays(across[None], down[None])
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
         """See `Views`."""

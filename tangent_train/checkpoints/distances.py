@@ -1,0 +1,171 @@
+"""Convert the output of depth networks to distances along the rays of their images."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.scores import plain_scores
+from tangent_train.errors import SettingError
+
+_FARTHEST_M = 1e4
+
+_MAP = 3
+"""Number of dimensions of depth without an axis of channels."""
+
+
+class DistanceNetwork(nn.Module):
+    """A depth network whose output is checked, for images of any size.
+
+    Args:
+        network: Network that maps images ``(B, C, h, w)`` to depth ``(B, 1, h, w)`` or
+            ``(B, h, w)``, or to a dict with it under ``"out"``.
+        kind: Kind of the network's output.
+        tile: Rows and columns of the only image size that the network takes; other images are
+            resized to it, and their depth back. They are not divided as for classes: the parts of
+            an image would have different scales. None if the network takes other sizes.
+
+    Attributes:
+        kind: See above.
+        tile: See above.
+        num_scores: 1, the number of output channels.
+    """
+
+    num_scores = 1
+
+    def __init__(
+        self, network: nn.Module, kind: DepthKind, tile: tuple[int, int] | None = None
+    ) -> None:
+        super().__init__()
+        self.network = network
+        self.kind: DepthKind = kind
+        self.tile = tile
+
+    def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
+        """Return depth ``(B, 1, h, w)`` of the kind.
+
+        Args:
+            images: Normalized images ``(B, C, h, w)``.
+            *arguments: Further arguments of the network.
+            **settings: Further arguments of the network, by name.
+
+        Raises:
+            SettingError: The network returns other shapes.
+        """
+        size = (images.shape[-2], images.shape[-1])
+        is_resized = self.tile not in (None, size)
+        if is_resized:
+            images = _resized(images, self.tile)
+        depth = plain_scores(self.network(images, *arguments, **settings))
+        if depth.ndim == _MAP:
+            depth = depth[:, None]
+        if depth.shape != (len(images), 1, *images.shape[-2:]):
+            raise SettingError(
+                "depth network",
+                found=f"output {tuple(depth.shape)}, for images {tuple(images.shape)}",
+                expected="one value for each pixel, (B, 1, h, w)",
+            )
+        return _resized(depth, size) if is_resized else depth
+
+
+def _resized(images: Tensor, size: Any) -> Tensor:
+    return functional.interpolate(images, size, mode="bilinear", antialias=True)
+
+
+def is_disparity(kind: DepthKind) -> bool:
+    """Return True if views are blended in disparity, False if in the logarithm of distance."""
+    return kind == "relative_disparity"
+
+
+def is_metric(kind: DepthKind) -> bool:
+    """Return True if distances are in meters, False if only their ratios are known.
+
+    `canonical_inverse` counts as meters: `uncanonical` converts it before anything else.
+    """
+    return not kind.startswith("relative")
+
+
+def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Tensor, DepthKind]:
+    """Convert `canonical_inverse` to `metric_z`; other kinds are returned unchanged.
+
+    The inverse depth C is divided by the focal length in image widths (Bochkovskii et al. 2024,
+    section 3.2). That follows from the rays: at columns of distance d, the second difference of
+    1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as in
+    the authors' code.
+
+    Args:
+        depth: Values of whole images, ``(n, 1, h, w)``.
+        kind: Kind of the values.
+        ray_lengths: ``(1 or n, 1, h, w)``, see `Views.ray_lengths`.
+
+    Returns:
+        Values, and their kind.
+    """
+    if kind != "canonical_inverse":
+        return depth, kind
+    width = ray_lengths.shape[-1]
+    if width == 1:  # not a pinhole image: the radians of an equirectangular image
+        span: Any = 2 * math.pi
+    else:
+        half = (width - 1) // 2
+        left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+        squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+        span = squared.sqrt() * width / half
+    return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+
+
+def _check_kind(kind: DepthKind) -> None:
+    if kind == "canonical_inverse":
+        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
+
+
+def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
+    """Convert depth of a network to the quantity in which views are blended.
+
+    Args:
+        depth: Values of the kind.
+        kind: Kind of the values.
+        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+
+    Returns:
+        Disparity along the ray, 1 / distance, for `relative_disparity`; for other kinds the natural
+        logarithm of the distance. NaN where the depth is not finite, or not positive where its
+        logarithm is taken.
+    """
+    _check_kind(kind)
+    if kind == "log_distance":
+        values = depth
+    elif is_disparity(kind):
+        values = depth / ray_lengths
+    else:
+        distance = depth if kind == "metric_distance" else depth * ray_lengths
+        values = distance.log()
+    return values.where(values.isfinite(), torch.nan)
+
+
+def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
+    """Convert distances along the rays to depth of a kind: the inverse of `distance_of`.
+
+    Args:
+        distance: Distances.
+        kind: Kind of the result.
+        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+    """
+    _check_kind(kind)
+    if kind == "log_distance":
+        return distance.log()
+    if kind == "metric_distance":
+        return distance
+    return ray_lengths / distance if is_disparity(kind) else distance / ray_lengths
+
+
+def distance_of(values: Tensor, kind: DepthKind) -> Tensor:
+    """Convert blended values, see `along_rays`, to distances; NaN where disparity is ≤ 0."""
+    if not is_disparity(kind):
+        return values.exp()
+    return (1 / values).where(values > 0, torch.nan)
