@@ -276,7 +276,7 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
 
     Args:
         parts: Samples of all sets of views.
-        kind: Kind of the values.
+        kind: Kind of the values, after `uncanonical`.
         mode: The correction; None for `scale` of metric and `affine` of relative kinds, and for
             `none` of a single view. `grid` adds a grid of corrections to it.
 
