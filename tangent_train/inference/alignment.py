@@ -384,7 +384,8 @@ def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
         pairs.append(np.stack([order[same], order[same + step]]))
     first, second = np.concatenate(pairs, axis=1)
     a, b = samples.view[first], samples.view[second]
-    _, number, counts = np.unique(a * samples.num_views + b, return_inverse=True, return_counts=True)
+    views = a * samples.num_views + b
+    _, number, counts = np.unique(views, return_inverse=True, return_counts=True)
     kept = counts[number] >= _LEAST_SAMPLES
     return _Pairs(first[kept], second[kept], a[kept], b[kept])
 
