@@ -46,7 +46,9 @@ def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
     return 3 * torch.randn(grid.num_images, classes, *grid.size, generator=generator)
 
 
-def _added(result: ScoreMosaic, scores: torch.Tensor, grid: PinholeGrid) -> ScoreMosaic:
+def _added[Mosaic: (ScoreMosaic, DepthMosaic)](
+    result: Mosaic, scores: torch.Tensor, grid: PinholeGrid
+) -> Mosaic:
     for faces in np.array_split(np.random.default_rng(0).permutation(grid.num_images), 6):
         result.add(scores[faces], PinholeViews(grid, faces))
     return result
