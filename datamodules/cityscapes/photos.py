@@ -106,13 +106,13 @@ class Cityscapes(PhotoDataModule):
     """
 
     class_sets = CLASS_SETS
+    no_depth = "disparities are not read"
 
     inputs: Sequence[Input] = ("rgb",)
     fov: float | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("inputs", "depth" not in self.inputs, "no depth: it is not read")
         fine = self.fov is None or 0 < self.fov < 180
         self.require("fov", fine, "degrees, more than 0 and less than 180; or null")
 

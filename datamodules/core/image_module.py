@@ -10,8 +10,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Literal, get_args
 
-import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import DataLoader
 
@@ -26,12 +24,15 @@ from datamodules.core.inputs import (
     ordered_inputs,
 )
 from datamodules.core.labeled_images import LabeledImages
-from datamodules.core.labels import ClassSet
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES, ClassSet
 from datamodules.core.panoramas import (
     ImageFiles,
     ImageReader,
+    Labels,
     Panorama,
+    PanoramaDistances,
     PanoramaReading,
+    PhotoDistances,
     PhotoReading,
     TestRotation,
     Unknown,
@@ -59,6 +60,12 @@ from tangent_train.geometry import SphereArea, shift_range
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
+_DISTANCES = (
+    "For task=depth, choose data=synthrooms, stanford2d3ds, structured3d, matterport360 or folder, "
+    "or photos: synthrooms_perspective, stanford2d3ds_perspective, structured3d_perspective, "
+    "folder_photos."
+)
+
 
 @dataclass(kw_only=True, eq=False, repr=False)
 class ImageDataModule(SplitDataModule[ImageFiles]):
@@ -68,6 +75,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     unknown pixels (label 0).
 
     Args:
+        labels: `pixel_classes`, or `distance`: depth files give the labels, and there are no
+            classes, see `DISTANCE`.
         inputs: Inputs of the network, `rgb` and optionally others, see `Input`.
         color_jitter: Strength of the color augmentation, 0 (none) to 1, see `jitter_colors`.
         classes: Name of a set of classes of the data set; None for the first.
@@ -76,6 +85,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     Attributes:
         normalizations: Default normalizations, without and with depth.
         class_sets: Sets of classes by name, see `class_sets`; empty if there is only one.
+        no_depth: Reason why depth cannot be an input; empty if it can.
+        no_distances: Reason why distances cannot be the labels, besides `no_depth`.
 
     Raises:
         SettingError: A setting is invalid.
@@ -87,8 +98,11 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     )
 
     class_sets: ClassVar[Mapping[str, ClassSet]] = {}
+    no_depth: ClassVar[str] = ""
+    no_distances: ClassVar[str] = ""
     fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
 
+    labels: str = PIXEL_CLASSES
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: float = 0.0
     classes: str | int | None = None
@@ -96,24 +110,45 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        chosen = next(iter(self.class_sets), None) if self.classes is None else str(self.classes)
-        fine = chosen is None or chosen in self.class_sets
-        self.require("classes", fine, " or ".join(self.class_sets) or "null: no other classes")
-        self.class_set = None if chosen is None else self.class_sets[chosen]
+        self.require_one_of("labels", PIXEL_CLASSES, DISTANCE)
+        class_sets = {} if self.has_distances else self.class_sets
+        chosen = next(iter(class_sets), None) if self.classes is None else str(self.classes)
+        fine = chosen is None or chosen in class_sets
+        self.require("classes", fine, " or ".join(class_sets) or "null: no other classes")
+        self.class_set = None if chosen is None else class_sets[chosen]
         if self.class_set is not None:
             self.class_names = ("unknown", *self.class_set.names)
         self.require_one_of("unknown", "labels", "any_black", "all_black")
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
+        self.require("inputs", not (with_depth and self.no_depth), f"no depth: {self.no_depth}")
+        if self.has_distances:
+            self.class_names = ()
+            reason = self.no_depth or self.no_distances
+            self.require("labels", not reason, f"{PIXEL_CLASSES}: {reason}", _DISTANCES)
+            fine = not with_depth
+            self.require("inputs", fine, "no depth: it is what the network learns", "[rgb]")
         given = self.normalization or self.normalizations[with_depth]
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
+
+    @property
+    def has_distances(self) -> bool:
+        """True if the labels are distances."""
+        return self.labels == DISTANCE
+
+    @property
+    def reads_depth(self) -> bool:
+        """True if depth files are read, as input or labels."""
+        return self.has_distances or "depth" in self.inputs
 
     @abstractmethod
     def find_images(
         self, problems: Problems
     ) -> tuple[ImageReader, Mapping[Split, Sequence[ImageFiles]]]:
         """Return the reader of the data set and the files of each split, not yet opened.
+
+        Depth files are among them if the data set `reads_depth`.
 
         Args:
             problems: Collects problems of the folders.
@@ -133,6 +168,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `LabeledData`."""
         reader, splits = self.find_images(problems)
+        if self.has_distances:
+            splits = {s: [f._replace(labels=None) for f in splits[s]] for s in splits}
         read = self.reading(reader)
         store = Store.of(self.store, read.store_name, read.settings, read.layout)
         index = DatasetIndex(self.noun, splits, read, read.kind, store)
@@ -152,7 +189,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def images(self, split: Split) -> LabeledImages:
         """Return the whole images of a split as arrays, see `LabeledImage`."""
         reading: Any = self.index().read
-        return LabeledImages(self.source(split), reading.reader)
+        return LabeledImages(self.source(split), reading.reader, self.has_distances)
 
     @property
     def in_channels(self) -> int:
@@ -242,7 +279,8 @@ class PanoramaDataModule(ImageDataModule):
     def reading(self, reader: ImageReader) -> PanoramaReading:
         """See `ImageDataModule`."""
         shape, count = self.canvas.image_shape, len(self.class_names)
-        return PanoramaReading(reader, count, shape, self.class_set, self.unknown)
+        kind = PanoramaDistances if self.has_distances else PanoramaReading
+        return kind(reader, count, shape, self.class_set, self.unknown)
 
     def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
         """See `ImageDataModule`; also checks that the panorama has a mask."""
@@ -280,7 +318,7 @@ class PanoramaDataModule(ImageDataModule):
             )
         return transforms
 
-    def recorded(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def recorded(self, labels: Labels) -> Labels:
         """See `LabeledData`: those in the area."""
         return self.canvas.cut(labels)
 
@@ -352,7 +390,8 @@ class PhotoDataModule(ImageDataModule):
 
     def reading(self, reader: ImageReader) -> PhotoReading:
         """See `ImageDataModule`."""
-        return PhotoReading(reader, len(self.class_names), None, self.class_set, self.unknown)
+        kind = PhotoDistances if self.has_distances else PhotoReading
+        return kind(reader, len(self.class_names), None, self.class_set, self.unknown)
 
     def photos(self, split: Split) -> LabeledImages:
         """Return the whole photos of a split as arrays."""

@@ -18,7 +18,7 @@ from torch.utils.data import Dataset
 from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
 from datamodules.core.index import SPLITS, DatasetIndex, Item, Split
 from datamodules.core.inputs import Normalization
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.problems import Problems
 from datamodules.core.reading import SplitReader, Transform
 from tangent_train.console import print_text
@@ -58,17 +58,18 @@ class LabeledData(ABC, Generic[_Item]):
         skip_broken: Read all items first and leave out broken ones, instead of refusing the data.
 
     Attributes:
-        class_names: Name of every label; for pixel labels the first is unknown, not a class.
+        class_names: Name of every label; for pixel labels the first is unknown, not a class. Empty
+            if the labels are distances.
         fact_settings: Settings of the class that scores on the test split depend on, see `facts`.
         labels: Kind of labels of the items, see `datamodules.core.labels`.
         noun: Name of the items, in the plural.
-        label_counts: After `check`, ``(K+1,)`` pixels of each label in the files, by split.
+        label_counts: After `check`, pixels of each of the `label_names` in the files, by split.
 
     Raises:
         SettingError: A setting is invalid.
     """
 
-    labels: ClassVar[str] = PIXEL_CLASSES
+    labels: str = field(init=False, default=PIXEL_CLASSES)
     noun: ClassVar[str]
 
     root: Path = field(kw_only=False)
@@ -196,6 +197,8 @@ class LabeledData(ABC, Generic[_Item]):
         """
         names = getattr(self, "class_names", ())
         setting = f"class_names of {type(self).__name__}"
+        if self.labels == DISTANCE:
+            return
         if not names or (self.labels == PIXEL_CLASSES and names[0] != "unknown"):
             raise SettingError(
                 setting,
@@ -233,7 +236,7 @@ class LabeledData(ABC, Generic[_Item]):
             count = index.check(problems, counts)
             for split in SPLITS:
                 of_split = [counts[i.name] for i in index.splits[split] if i.name in counts]
-                none = np.zeros(len(self.class_names), np.int64)
+                none = np.zeros(len(self.label_names), np.int64)
                 self.label_counts[split] = np.sum([none, *of_split], axis=0)
         return problems, count
 
@@ -341,10 +344,16 @@ class LabeledData(ABC, Generic[_Item]):
         is_here = kind.__module__.partition(".")[0] == __name__.partition(".")[0]
         name = kind.__name__ if is_here else f"{kind.__module__}.{kind.__name__}"
         settings = chain.from_iterable(vars(k).get("fact_settings", ()) for k in kind.__mro__[::-1])
-        classes = str(getattr(self, "classes", None) or self.num_classes)
+        classes = getattr(self, "classes", None) or self.num_classes
+        of_classes = {"classes": str(classes)} if self.class_names else {}
         of_settings = {setting: _fact(getattr(self, setting)) for setting in settings}
         images = {"images": self._test_images} if self._test_images else {}
-        return {"data": name, "classes": classes, **of_settings, **images}
+        return {"data": name, **of_classes, **of_settings, **images}
+
+    @property
+    def label_names(self) -> tuple[str, ...]:
+        """Names of the labels that `check` counts."""
+        return self.class_names or ("unknown", "distance")
 
     @property
     def num_classes(self) -> int:

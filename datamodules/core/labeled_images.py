@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import Dataset
 
-from datamodules.core.panoramas import ImageFiles, ImageReader, steps_to_meters
+from datamodules.core.panoramas import ImageFiles, ImageReader, Labels, steps_to_meters
 from datamodules.core.reading import SplitReader
 from datamodules.core.transforms import RotatedPanoramas
 from tangent_train.geometry import PanoramaPose, SphereArea
@@ -22,9 +22,10 @@ class LabeledImage(NamedTuple):
     Attributes:
         name: Unique short name; ``/`` between groups.
         rgb: ``(H, W, 3)`` uint8.
-        labels: ``(H, W)`` uint8 indices into the class names of the data set, 0 where unknown.
+        labels: ``(H, W)`` uint8 indices into the class names of the data set, 0 where unknown. If
+            the labels are distances: uint16 steps of 1/512 m.
         distance_m: ``(H, W)`` float32 meters from the center of the camera, NaN where missing; None
-            without depth among the inputs of the data set.
+            if depth is neither an input nor the labels of the data set.
         pose: Pose; None if unknown. In a photo's axes, x is the optical axis, y
             points to the right and z up in the image.
         camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
@@ -36,7 +37,7 @@ class LabeledImage(NamedTuple):
 
     name: str
     rgb: NDArray[np.uint8]
-    labels: NDArray[np.uint8]
+    labels: Labels
     distance_m: NDArray[np.float32] | None
     pose: PanoramaPose | None
     camera_matrix: NDArray[np.float64] | None = None
@@ -50,10 +51,12 @@ class LabeledImages(Dataset[LabeledImage]):
     Attributes:
         source: Reader of the split.
         reader: Reader of the data set.
+        has_distances: True if the labels are distances.
     """
 
     source: SplitReader[ImageFiles, Any]
     reader: ImageReader
+    has_distances: bool = False
 
     def __len__(self) -> int:
         return len(self.source)
@@ -69,7 +72,8 @@ class LabeledImages(Dataset[LabeledImage]):
             if pose is not None and isinstance(transform, RotatedPanoramas):
                 rotation = transform.rotation(index)
                 pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
-        distance_m = None if image.depth is None else steps_to_meters(image.depth)
+        depth = image.labels if self.has_distances else image.depth
+        distance_m = None if depth is None else steps_to_meters(depth)
         matrix = getattr(image, "camera_matrix", None)
         return LabeledImage(
             files.name, image.rgb, image.labels, distance_m, pose, matrix, image.area

@@ -59,7 +59,7 @@ class NumberedReader(PngReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """See `ImageReader`; a palette is ignored."""
-        numbers = read_pixels(files.labels, indices=True)
+        numbers = read_pixels(files.parts["labels"], indices=True)
         labels = self.table[numbers]
         strange = np.unique(numbers[labels == _STRANGE])
         if strange.size:

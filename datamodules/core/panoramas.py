@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.labels import ClassSet
+from datamodules.core.labels import DISTANCE, ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
+Labels = NDArray[np.unsignedinteger[Any]]
+"""Labels ``(H, W)``, 0 where unknown: uint8 classes, or uint16 distances in steps of 1/512 m."""
+
 Unknown = Literal["labels", "any_black", "all_black"]
 """Pixels that are unknown in addition to unlabeled pixels; see `mask_black`."""
 
@@ -49,6 +52,7 @@ STEPS_PER_M = 512
 
 
 _MOST_STEPS = np.iinfo(np.uint16).max
+_USUAL_M = (0.05, 100)  # median distances; others are probably in other units
 
 
 class ImageFiles(NamedTuple):
@@ -57,14 +61,14 @@ class ImageFiles(NamedTuple):
     Attributes:
         name: Unique short name; ``/`` between groups.
         rgb: Color image.
-        labels: File of class labels.
-        depth: Depth image, if depth is an input.
+        labels: File of class labels; None if the labels are distances.
+        depth: Depth image, if depth is an input or the labels are distances.
         camera: File with the camera matrix, for photos with one file each.
     """
 
     name: str
     rgb: Path
-    labels: Path
+    labels: Path | None
     depth: Path | None = None
     camera: Path | None = None
 
@@ -161,7 +165,8 @@ class Panorama(NamedTuple):
         rgb: ``(H, W, 3)`` uint8.
         depth: ``(H, W)`` uint16 distance from the center in steps of 1/512 m, 0 where missing; None
             if not read. See `steps_to_meters`.
-        labels: ``(H, W)`` uint8, 0 where unknown.
+        labels: ``(H, W)`` uint8 classes, 0 where unknown; or distances like `depth`, which is then
+            None, see `PanoramaDistances`.
         up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
         area: The part of the sphere that was recorded; None for all of it. Outside, labels and
             depth are 0, and colors are filled.
@@ -171,7 +176,7 @@ class Panorama(NamedTuple):
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.uint16] | None
-    labels: NDArray[np.uint8]
+    labels: Labels
     up: NDArray[np.float64] | None = None
     area: SphereArea | None = None
 
@@ -182,7 +187,7 @@ class Panorama(NamedTuple):
             return limited
         return limited.with_rotation(upright_rotation(self.up))
 
-    def target(self, representation: Representation) -> NDArray[np.uint8]:
+    def target(self, representation: Representation) -> Labels:
         """Return the labels that predictions on the panorama are compared with: all of them."""
         del representation
         return self.labels
@@ -227,9 +232,7 @@ def resize_depth(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[n
     return small
 
 
-def mask_black(
-    labels: NDArray[np.uint8], rgb: NDArray[np.uint8], unknown: Unknown
-) -> NDArray[np.uint8]:
+def mask_black(labels: Labels, rgb: NDArray[np.uint8], unknown: Unknown) -> Labels:
     """Make black pixels unknown.
 
     The paper's released code applies `any_black` in training and evaluation, before resizing. This
@@ -286,7 +289,7 @@ class Photo(NamedTuple):
         rgb: ``(H, W, 3)`` uint8.
         depth: ``(H, W)`` uint16 distance from the center of projection, as in panoramas, in steps
             of 1/512 m, 0 where missing; None if not read. See `distance_from_z_depth`.
-        labels: ``(H, W)`` uint8, 0 where unknown.
+        labels: Classes or distances, as in panoramas.
         camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
         up: None; the up direction of a photo is unknown.
         area: None; a photo has no area of the sphere.
@@ -296,7 +299,7 @@ class Photo(NamedTuple):
 
     rgb: NDArray[np.uint8]
     depth: NDArray[np.uint16] | None
-    labels: NDArray[np.uint8]
+    labels: Labels
     camera_matrix: NDArray[np.float64]
     up: None = None
     area: None = None
@@ -306,7 +309,7 @@ class Photo(NamedTuple):
         height, width = self.labels.shape
         return representation.of_camera(self.camera_matrix, (height, width))
 
-    def target(self, representation: PerspectiveRepresentation) -> NDArray[np.uint8]:
+    def target(self, representation: PerspectiveRepresentation) -> Labels:
         """Return ``(n, d, d)`` labels of the crops; every pixel of the photo is in one crop."""
         (crops,) = self.sampler(representation).view_sets()
         return np.where(crops.owned(), crops.render(self.labels, "nearest"), np.uint8(0))
@@ -381,14 +384,27 @@ class _Reading:
             "labels": Declared("uint8", (height, width), self.num_classes - 1),
         }
 
-    def labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """Return only the labels, checked against the number of classes."""
+    def distances(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Return distances from the center in steps of 1/512 m, 0 where missing."""
+        raise NotImplementedError
+
+    def depth(self, files: ImageFiles) -> NDArray[np.uint16] | None:
+        """Return the distances if depth is an input."""
+        return None if files.depth is None else self.distances(files)
+
+    def labels(self, files: ImageFiles) -> Labels:
+        """Return only the labels."""
+        labels = self.stored_labels(files)
+        if self.unknown == "labels":
+            return labels
+        rgb = self.reader.rgb(files)
+        rgb = rgb if self.shape is None else resize_nearest(rgb, self.shape)
+        return mask_black(labels, rgb, self.unknown)
+
+    def stored_labels(self, files: ImageFiles) -> Labels:
+        """Return the labels of the files, checked against the number of classes."""
         labels = self.reader.labels(files, self.shape)
         labels = labels if self.class_set is None else self.class_set.relabel(labels)
-        if self.unknown != "labels":
-            rgb = self.reader.rgb(files)
-            rgb = rgb if self.shape is None else resize_nearest(rgb, self.shape)
-            labels = mask_black(labels, rgb, self.unknown)
         if labels.max(initial=0) >= self.num_classes:
             raise DataError(
                 files.labels,
@@ -427,8 +443,13 @@ class PanoramaReading(_Reading):
     def __call__(self, files: ImageFiles) -> Panorama:
         """Read one panorama."""
         shape: Any = self.shape
-        depth = None if files.depth is None else resize_depth(self.reader.depth(files), shape)
-        return Panorama(resize_area(self.reader.rgb(files), shape), depth, self.labels(files))
+        rgb = resize_area(self.reader.rgb(files), shape)
+        return Panorama(rgb, self.depth(files), self.labels(files))
+
+    def distances(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Return distances at the size of the result."""
+        depth = self.reader.depth(files)
+        return depth if self.shape is None else resize_depth(depth, self.shape)
 
 
 class PhotoReading(_Reading):
@@ -443,11 +464,66 @@ class PhotoReading(_Reading):
 
     def __call__(self, files: ImageFiles) -> Photo:
         """Read one photo."""
-        camera_matrix = self.reader.camera(files)
-        depth = None
-        if files.depth is not None:
-            depth = distance_from_z_depth(self.reader.depth(files), camera_matrix)
-        return Photo(self.reader.rgb(files), depth, self.labels(files), camera_matrix)
+        camera_matrix, rgb = self.reader.camera(files), self.reader.rgb(files)
+        return Photo(rgb, self.depth(files), self.labels(files), camera_matrix)
+
+    def distances(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Return distances, of which the files hold z-depth."""
+        return distance_from_z_depth(self.reader.depth(files), self.reader.camera(files))
+
+
+class _DistanceLabels(_Reading):
+    """Reads images whose labels are distances; depth is not an input then."""
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """See `ImageReader`."""
+        return {**super().settings, "labels": DISTANCE}
+
+    @property
+    def layout(self) -> Layout:
+        """Arrays of an image in a store."""
+        layout = dict(super().layout)
+        depth = layout.pop("depth")
+        return {**layout, "labels": depth}
+
+    def depth(self, files: ImageFiles) -> None:
+        """Return None."""
+        del files
+
+    def stored_labels(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Return the distances, 0 where missing and from 128 m, which 16 bits cannot hold."""
+        steps = self.distances(files)
+        return np.where(steps < _MOST_STEPS, steps, np.uint16(0))
+
+    def parts(
+        self, label_counts: dict[str, NDArray[np.int64]], warnings: list[str]
+    ) -> dict[str, Callable[[ImageFiles], object]]:
+        """Return functions that decode one file of an image, by part.
+
+        Args:
+            label_counts: Collects the number of pixels without and with a distance.
+            warnings: Collects warnings about units.
+        """
+
+        def count_distances(files: ImageFiles) -> None:
+            steps = replace(self, shape=None).labels(files)
+            known = steps[steps > 0]
+            label_counts[files.name] = np.array([steps.size - known.size, known.size])
+            median_m = np.median(known) / STEPS_PER_M if known.size else 0
+            if not _USUAL_M[0] <= median_m <= _USUAL_M[1]:
+                found = f"median distance {median_m:.3g} m" if known.size else "no distance at all"
+                warnings.append(f"{files.depth}: {found}; check the units and the missing value.")
+
+        return {**super().parts(label_counts, warnings), "depth": count_distances}
+
+
+class PanoramaDistances(_DistanceLabels, PanoramaReading):
+    """Reads panoramas with distances as labels, see `DISTANCE`."""
+
+
+class PhotoDistances(_DistanceLabels, PhotoReading):
+    """Reads photos with distances as labels, see `DISTANCE`."""
 
 
 def check_headers(

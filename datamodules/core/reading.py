@@ -66,12 +66,12 @@ class SplitReader(Generic[_Item, _Image]):
             image = transform(image, index, item)
         return image
 
-    def labels(self, index: int) -> NDArray[np.uint8]:
+    def labels(self, index: int) -> NDArray[Any]:
         """Read the labels of one image, which is faster than the whole image."""
         decode: Any = self._decode
         is_decoded = self._kept or self.transforms or self._store is not None
         image: Any = self.read(index) if is_decoded else None
-        labels: NDArray[np.uint8] = image.labels if is_decoded else decode.labels(self.items[index])
+        labels: NDArray[Any] = image.labels if is_decoded else decode.labels(self.items[index])
         return labels
 
     def keep_in_memory(self, root: object) -> None:

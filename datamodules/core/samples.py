@@ -37,7 +37,7 @@ class TrainingSample(NamedTuple, Generic[_Images]):
         images: As rendered, to save bytes: RGB ``(P, h, w, 3)`` uint8, optionally depth
             ``(P, h, w)`` int16 and elevation ``(P, h, w)`` float32. `normalize` converts them to
             ``(P, C, h, w)`` float32 on the device.
-        labels: ``(P, h, w)`` uint8, 0 where unknown.
+        labels: ``(P, h, w)`` uint8, or int32 for distances, 0 where unknown.
         rays: ``(P, 3, 3)`` float32 viewing rays, see `world_rays`; or ``(0, 3, 3)``.
         index: Index in its split.
     """
@@ -53,8 +53,8 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
 
     Attributes:
         images: Views of all view sets, one set after the other, as in `TrainingSample`.
-        target: uint8 labels, 0 where unknown: ``(H, W)`` of a panorama; ``(N, h, w)`` of the
-            crops of a photo.
+        target: Labels as in `TrainingSample`: ``(H, W)`` of a panorama; ``(N, h, w)`` of the crops
+            of a photo.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
         area: ``(13,)`` float64, the area of a partial panorama, see `SphereArea.numbers`; that of
             the whole sphere for other images.
@@ -97,7 +97,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         rgb, *others = render_inputs(image, views, self.inputs)
         if self.color_jitter:
             rgb = jitter_colors(rgb, self.color_jitter, rng)
-        labels = _tensor(views.render(image.labels, "nearest"))
+        labels = _label_tensor(views.render(image.labels, "nearest"))
         rays = torch.from_numpy(world_rays(views, image.up))
         return TrainingSample((rgb, *others), labels, rays, index)
 
@@ -126,7 +126,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
-        target = torch.tensor(image.target(self.representation))
+        target = _label_tensor(image.target(self.representation))
         area = torch.from_numpy((image.area or _WHOLE).numbers)
         return EvaluationSample(images, target, torch.from_numpy(rotation), area, index)
 
@@ -177,6 +177,11 @@ def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
 def _tensor(array: NDArray[Any]) -> Tensor:
     # The rendered array may be the panorama itself, shared or a read-only file: copy it.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)
+
+
+def _label_tensor(labels: NDArray[Any]) -> Tensor:
+    # torch has few operations on uint16.
+    return _tensor(labels.astype(np.int32) if labels.dtype == np.uint16 else labels)
 
 
 _HUE_SHARE = 0.1

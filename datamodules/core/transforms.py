@@ -65,8 +65,8 @@ def masked(
         files: Files of the panorama.
     """
     del index
-    counts = masks.read(files.name, canvas)
-    return panorama._replace(labels=panorama.labels & counts)
+    labels, counts = panorama.labels, masks.read(files.name, canvas)
+    return panorama._replace(labels=np.where(counts, labels, labels.dtype.type(0)))
 
 
 class PosedUp:

@@ -58,6 +58,7 @@ class DensePASS(PanoramaDataModule):
     """
 
     class_sets = CLASS_SETS
+    no_depth = "DensePASS has no depth images"
 
     inputs: Sequence[Input] = ("rgb",)
     horizon_row: float = _HEIGHT / 2
@@ -68,9 +69,6 @@ class DensePASS(PanoramaDataModule):
         south, north = self.horizon_row - _HEIGHT, self.horizon_row
         self.area = (-180, 180, south * 360 / _WIDTH, north * 360 / _WIDTH)
         super().__post_init__()
-        self.require(
-            "inputs", "depth" not in self.inputs, "no depth: DensePASS has no depth images"
-        )
 
     def find_images(
         self, problems: Problems

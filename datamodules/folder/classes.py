@@ -103,6 +103,10 @@ class FolderClasses:
         return ("colors " if self.in_colors else "values ") + ", ".join(shown)
 
 
+NO_CLASSES = FolderClasses((), np.empty(0, np.int32), np.empty(0, np.uint8), in_colors=False)
+"""Classes of folders whose labels are distances."""
+
+
 def read_classes(path: Path) -> FolderClasses:
     """Read `classes.json`, in one of these forms.
 

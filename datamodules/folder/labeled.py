@@ -24,7 +24,7 @@ from datamodules.core.labeled_data import print_on_rank_zero
 from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras
-from datamodules.folder.classes import UNKNOWN_NAME, read_classes
+from datamodules.folder.classes import NO_CLASSES, UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
 from datamodules.images.gpano import tagged_area
@@ -64,13 +64,18 @@ class LabeledFolder(ImageDataModule):
         self.require("depth_units_per_m", self.depth_units_per_m > 0, "more than 0")
         self.require("test_fraction", 0 < self.test_fraction < 1, "above 0 to below 1")
         self.require("split_seed", self.split_seed >= 0, "0 or more")
-        # Read now, not with the images: the network needs the number of classes.
-        self._classes = read_classes(self.root / "classes.json")
-        self.class_names = (UNKNOWN_NAME, *self._classes.names)
+        self._classes = NO_CLASSES
+        if not self.has_distances:
+            # Read now, not with the images: the network needs the number of classes.
+            self._classes = read_classes(self.root / "classes.json")
+            self.class_names = (UNKNOWN_NAME, *self._classes.names)
 
     def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
-        images = list_images(self.root, problems, with_depth="depth" in self.inputs)
+        with_labels = not self.has_distances
+        images = list_images(
+            self.root, problems, with_labels=with_labels, with_depth=self.reads_depth
+        )
         # Before broken images are left out, so that the splits do not depend on them.
         division = FolderSplits(
             self.root, self.test_fraction, self.validation_fraction, self.split_seed
@@ -80,7 +85,8 @@ class LabeledFolder(ImageDataModule):
         with problems.noted():
             splits = division.divide(images, problems)
         with problems.noted():
-            self._check_classes(problems.without(images)[:_TRIED], problems)
+            some = problems.without(images)[:_TRIED] if with_labels else ()
+            self._check_classes(some, problems)
         return self.make_reader(images, problems), splits
 
     def prepare_data(self) -> None:
@@ -92,7 +98,7 @@ class LabeledFolder(ImageDataModule):
         """See `LabeledData`; also names files that training ignores."""
         problems, count = super().check()
         with problems.noted():
-            note_ignored(self.root, problems)
+            note_ignored(self.root, "depth" if self.has_distances else "labels", problems)
         return problems, count
 
     def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
@@ -115,9 +121,10 @@ class LabeledFolder(ImageDataModule):
         seen: set[int] = set()
         for files in images:
             with problems.noted(files.name):
-                reader.size("labels", files.labels)  # a later check refuses it less clearly
-                stored = read_codes(files.labels, in_colors=classes.in_colors)
-                if classes.decode(stored, files.labels).any():
+                labels = files.parts["labels"]
+                reader.size("labels", labels)  # a later check refuses it less clearly
+                stored = read_codes(labels, in_colors=classes.in_colors)
+                if classes.decode(stored, labels).any():
                     return
                 seen |= set(np.unique(classes.pack(stored)).tolist())
         if seen:

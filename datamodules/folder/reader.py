@@ -61,7 +61,7 @@ class FolderReader(ImageReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Return the labels, by ``classes.json``."""
-        codes = read_codes(files.labels, in_colors=self.classes.in_colors)
+        codes = read_codes(files.parts["labels"], in_colors=self.classes.in_colors)
         codes = codes if shape is None else resize_nearest(codes, shape)
         return self.classes.decode(codes, files.labels)
 
@@ -74,29 +74,34 @@ class FolderReader(ImageReader):
         return self.cameras.matrix(files) if self.cameras else super().camera(files)
 
 
-def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[ImageFiles]:
+def list_images(
+    root: Path, problems: Problems, *, with_labels: bool = True, with_depth: bool
+) -> list[ImageFiles]:
     """List all images of a data set, in the order of their names.
 
     A name is the path of the image in ``images/`` without ending, see `composed`.
 
     Args:
-        root: Folder with ``images/`` and ``labels/``.
+        root: Folder with ``images/``, ``labels/`` and ``depth/``.
         problems: Collects duplicate names and missing or ambiguous files.
-        with_depth: True to list depth files too.
+        with_labels: True to list labels.
+        with_depth: True to list depth files.
 
     Raises:
         DataError: A folder is missing, or there are no images.
     """
-    for folder in (root, root / "images", root / "labels"):
+    labels_in = "labels" if with_labels else "depth"
+    for folder in (root, root / "images", root / labels_in):
         if not folder.is_dir():
-            expected = "a data set: images/, labels/ and classes.json, see docs/how-to/own_data.md"
+            others = "labels/ and classes.json" if with_labels else "depth/"
+            expected = f"a data set: images/, {others}, see docs/how-to/own_data.md"
             raise DataError(folder, found="no such folder", expected=expected)
     found: dict[str, ImageFiles] = {}
     labels = image_files.NamedFiles(root / "labels")
     depths = image_files.NamedFiles(root / "depth") if with_depth else None
     for rgb in image_files.image_paths(root / "images"):
         name = _name(root / "images", rgb)
-        label, depth = labels.folder / f"{name}.png", None
+        label, depth = labels.folder / f"{name}.png" if with_labels else None, None
         with problems.noted(name):
             if name in found:
                 raise DataError(
@@ -105,33 +110,32 @@ def list_images(root: Path, problems: Problems, *, with_depth: bool) -> list[Ima
                     expected="one image of each name: its labels have the same one",
                     remedy="Rename or remove one of them.",
                 )
-            label = labels.path(f"{name}.png")
+            label = labels.path(f"{name}.png") if with_labels else None
             if depths is not None:
-                without = "Or train without depth: data.inputs=[rgb]."
+                without = "Or train without depth: data.inputs=[rgb]." if with_labels else ""
                 depth = image_files.find_depth(depths, name, without)
         found.setdefault(name, ImageFiles(name, rgb, label, depth))
     return [found[name] for name in sorted(found)]
 
 
-def note_ignored(root: Path, problems: Problems) -> None:
+def note_ignored(root: Path, labels: str, problems: Problems) -> None:
     """Note files that training passes over.
 
     Args:
-        root: Folder with ``images/`` and ``labels/``, there or not.
+        root: Folder with ``images/`` and labels, there or not.
+        labels: Folder of the labels in it, ``labels`` or ``depth``.
         problems: They are added.
     """
     files = list(image_files.walk_files(root / "images"))
     names = {_name(root / "images", path) for path in files}
     noted = [
-        (path, "labels of no image", "Name it as its image, or remove it.")
-        for path in image_files.walk_files(root / "labels")
-        if _name(root / "labels", path) not in names
+        (path, f"{labels} of no image", "Name it as its image, or remove it.")
+        for path in image_files.walk_files(root / labels)
+        if _name(root / labels, path) not in names
     ]
     others = [path for path in files if path.suffix.lower() not in image_files.IMAGE_SUFFIXES]
     noted += [(path, "no image", "Convert it; of a video, extract frames.") for path in others]
-    expected = (
-        f"images ({', '.join(image_files.IMAGE_SUFFIXES)}) and labels (.png) of the same names"
-    )
+    expected = f"images ({', '.join(image_files.IMAGE_SUFFIXES)}) and {labels} of the same names"
     for path, found, remedy in noted:
         problems.add(DataError(path, found=found, expected=expected, remedy=remedy), str(path))
 

@@ -118,8 +118,9 @@ class Matterport360(PanoramaDataModule):
         self.require_one_of("release", "360fv", "sfss")
         self.require_one_of("test_split", "test", "val")
         is_sfss = self.release == "sfss"
-        self.classes = str(self.classes or (41 if is_sfss else 20))
-        self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
+        if not self.has_distances:
+            self.classes = str(self.classes or (41 if is_sfss else 20))
+            self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
         super().__post_init__()
 
     def find_images(
@@ -157,7 +158,7 @@ class Matterport360(PanoramaDataModule):
         images = []
         for stem, path in sorted(found.items()):
             labels, depth = (folder / f"{stem}.png" for folder in folders)
-            with_depth = depth if "depth" in self.inputs else None
+            with_depth = depth if self.reads_depth else None
             images.append(ImageFiles(f"{scene}/{stem}", path, labels, with_depth))
         return images
 

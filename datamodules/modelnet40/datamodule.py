@@ -65,7 +65,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
-    labels: ClassVar[str] = IMAGE_CLASS
+    labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
     shapes_per_step: int = 16

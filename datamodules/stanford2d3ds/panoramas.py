@@ -32,6 +32,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
+
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.index import Split, draw_groups
 from datamodules.core.panoramas import ImageFiles
@@ -74,6 +76,8 @@ class StanfordAreas(ImageDataModule):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.label_table = None if self.label_table is None else Path(self.label_table)
+        fine = self.label_table is None or not self.has_distances
+        self.require("label_table", fine, "null: distances have no classes")
         self.require("fold", self.fold in FOLDS, "1, 2 or 3")
         areas, testing = set(self.areas), set(FOLDS[self.fold])
         self.require(
@@ -99,8 +103,9 @@ class StanfordAreas(ImageDataModule):
                     expected="all of " + ", ".join(f"area_{area}" for area in areas),
                     remedy=GET_IT,
                 )
-        with_depth = "depth" in self.inputs
-        listed = [list_pictures(root, area, self.group, with_depth, problems) for area in there]
+        listed = [
+            list_pictures(root, area, self.group, self.reads_depth, problems) for area in there
+        ]
         pictures = [picture for pictures in listed for picture in pictures]
         training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
         rooms: set[tuple[str, str, int]] = set()
@@ -113,7 +118,9 @@ class StanfordAreas(ImageDataModule):
         }
 
     def _reader(self) -> StanfordReader:
-        """Return the reader, with the class table."""
+        """Return the reader, with the class table if the labels are classes."""
+        if self.has_distances:
+            return StanfordReader(LabelTable(np.empty(0, np.uint8)))
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         if self.label_table is not None:
             places = [self.label_table]

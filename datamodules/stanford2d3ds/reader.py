@@ -124,12 +124,12 @@ class StanfordReader(PngReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Return the labels by the class table."""
-        colors = read_rgb(files.labels)
+        colors = read_rgb(files.parts["labels"])
         return self.table.decode(colors if shape is None else resize_nearest(colors, shape))
 
     def label_warning(self, files: ImageFiles) -> str:
         """See `ImageReader`: instances past the end of the class table."""
-        past = self.table.past_end(read_rgb(files.labels))
+        past = self.table.past_end(read_rgb(files.parts["labels"]))
         if not past.size:
             return ""
         return (

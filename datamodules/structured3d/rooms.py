@@ -139,7 +139,7 @@ class Structured3DRooms(ImageDataModule):
                 "/".join((scene, room, *number)),
                 rgb,
                 rgb.with_name("semantic.png"),
-                rgb.with_name("depth.png") if "depth" in self.inputs else None,
+                rgb.with_name("depth.png") if self.reads_depth else None,
                 rgb.with_name("camera_pose.txt") if number else None,
             )
             scene = scene.removeprefix("scene_")

@@ -79,6 +79,7 @@ class SynPASS(PanoramaDataModule):
     """
 
     class_sets = class_sets(CLASSES, {"13": ClassSet(THIRTEEN, CLASSES, _MERGED)})
+    no_depth = "SynPASS has no depth images"
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
@@ -88,7 +89,6 @@ class SynPASS(PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("inputs", "depth" not in self.inputs, "no depth: SynPASS has no depth images")
         given = [self.weather] if isinstance(self.weather, str) else list(self.weather)
         self._times: dict[str, set[str]] = {}
         self._weathers = WEATHERS if given == ["all"] else tuple(given)

@@ -223,7 +223,7 @@ def _make(
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
             "labels": stitcher.stitch(
-                [reader.read_ids(v.labels) for v in views], "nearest", reader.INVALID
+                [reader.read_ids(v.parts["labels"]) for v in views], "nearest", reader.INVALID
             ),
             # Written last: this file marks a complete panorama.
             "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),

@@ -97,8 +97,7 @@ class SynthiaSequences(ImageDataModule):
         for sequence in self.sequences:
             found[sequence] = []
             with problems.noted():
-                with_depth = "depth" in self.inputs
-                found[sequence] = self.list_images(sequence, with_depth=with_depth)
+                found[sequence] = self.list_images(sequence, with_depth=self.reads_depth)
                 if not found[sequence]:
                     raise DataError(
                         reader.sequence_folder(self.root, sequence),
@@ -156,6 +155,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """
 
     formats = reader.PANORAMA_FORMATS
+    no_distances = "published panoramas of OmniSYNTHIA have z-depth of the four views"
     remedy = f"Run tangent-prepare to generate them from the views. {reader.GET_IT}"
 
     panorama_height: int = HEIGHT

@@ -225,7 +225,7 @@ class SynthiaReader(PngReader):
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
         """Return the labels by `CLASSES`, 0 where unknown."""
-        ids = read_ids(files.labels)
+        ids = read_ids(files.parts["labels"])
         return cv2.LUT(resize_nearest(ids, shape or (ids.shape[0], ids.shape[1])), _LABELS)
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16]:

@@ -111,6 +111,7 @@ class Zind(PanoramaDataModule):
     """
 
     class_names = ("unknown", *CLASSES)
+    no_depth = "ZInD has no depth images"
     fact_settings = ("doors",)
 
     inputs: Sequence[Input] = ("rgb",)
@@ -120,7 +121,6 @@ class Zind(PanoramaDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require("inputs", "depth" not in self.inputs, "no depth: ZInD has no depth images")
         self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
         self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
         self.require("split_seed", self.split_seed >= 0, "0 or more")

@@ -8,6 +8,7 @@ from contextlib import redirect_stdout
 from typing import Any
 
 from datamodules.core.class_weights import label_doubts
+from tangent_train.cli.run import needed_labels
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.registry import build_from_config
@@ -24,7 +25,8 @@ def check(settings: Mapping[str, Any]) -> None:
         settings: Composed ``check.yaml``.
     """
     representation = build_from_config(settings["representation"], "representation")
-    data = build_from_config(settings["data"], "data", representation=representation)
+    given = needed_labels(settings)
+    data = build_from_config(settings["data"], "data", representation=representation, **given)
     terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # where progress is printed
         problems, count = data.check()
@@ -40,12 +42,12 @@ def check(settings: Mapping[str, Any]) -> None:
     warnings = sorted(problems.warnings) + [
         doubt
         for split, counts in labeled.items()
-        for doubt in label_doubts(split, counts, data.class_names)
+        for doubt in label_doubts(split, counts, data.label_names)
     ]
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
-            columns = zip(data.class_names, *shares, strict=True)
+            columns = zip(data.label_names, *shares, strict=True)
             Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)

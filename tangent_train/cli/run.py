@@ -16,7 +16,8 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.image_module import ImageDataModule
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import explained, gathered_order
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
@@ -261,7 +262,10 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
-    data = build_from_config(settings["data"], "data", source, representation=representation)
+    given = needed_labels(settings, source)
+    data = build_from_config(
+        settings["data"], "data", source, representation=representation, **given
+    )
     data.check_classes()
     task = resolve_target(settings["task"], "task", source)
     needed = getattr(task, "labels", data.labels)
@@ -272,6 +276,17 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
             expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
         )
     return data
+
+
+def needed_labels(
+    settings: Mapping[str, Any], source: SettingsFile | None = None
+) -> dict[str, Any]:
+    """Return the argument ``labels`` of a data set of images: distances if its task needs them."""
+    data_set = resolve_target(settings["data"], "data", source)
+    task = resolve_target(settings["task"], "task", source)
+    is_needed = getattr(task, "labels", None) == DISTANCE
+    is_possible = isinstance(data_set, type) and issubclass(data_set, ImageDataModule)
+    return {"labels": DISTANCE} if is_needed and is_possible else {}
 
 
 def build_trained(

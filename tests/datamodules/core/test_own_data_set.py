@@ -28,7 +28,7 @@ class ToyReader(PngReader):
     formats = FORMATS
 
     def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        labels: NDArray[np.uint8] = read_pixels(files.labels, indices=True)
+        labels: NDArray[np.uint8] = read_pixels(files.parts["labels"], indices=True)
         return labels if shape is None else cv2.resize(labels, shape[::-1], interpolation=0)
 
 
