@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -30,6 +30,8 @@ from tangent_train.rendering.mosaic import DepthMosaic, ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.views import PinholeViews
 
+Mosaic = TypeVar("Mosaic", ScoreMosaic, DepthMosaic)
+
 RINGS = [{"pitch": pitch, "views": 5} for pitch in (0, 50, -50)]
 GRIDS = [
     (TangentGrid(0, 5), (64, 128)),
@@ -46,9 +48,7 @@ def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
     return 3 * torch.randn(grid.num_images, classes, *grid.size, generator=generator)
 
 
-def _added[Mosaic: (ScoreMosaic, DepthMosaic)](
-    result: Mosaic, scores: torch.Tensor, grid: PinholeGrid
-) -> Mosaic:
+def _added(result: Mosaic, scores: torch.Tensor, grid: PinholeGrid) -> Mosaic:
     for faces in np.array_split(np.random.default_rng(0).permutation(grid.num_images), 6):
         result.add(scores[faces], PinholeViews(grid, faces))
     return result
