@@ -1,51 +1,38 @@
-"""``tangent-predict``: predict the labels of panoramas and photos."""
+"""``tangent-predict``: predict labels of panoramas and photos."""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence, Set
-from contextlib import closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Masks
-from datamodules.images.pixel_files import read_pixels
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
+from tangent_train.cli.predict_labels import LabelPrediction, ReadsImage
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import parse_settings
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
-from tangent_train.inference.class_maps import load_class_map, map_classes
-from tangent_train.inference.confidences import class_thresholds, count_confidences
-from tangent_train.inference.engine import Predictor
-from tangent_train.inference.images import (
-    DepthFolder,
-    InputImage,
-    read_panorama,
-    read_photo,
-    with_up,
-)
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.errors import SettingError, counted
+from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
-from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
     Entry,
-    LabeledImage,
+    PredictedImage,
     PredictionFolder,
-    class_shares,
     is_result_in,
 )
 
@@ -55,9 +42,6 @@ _DECISIVE = (
     "min_confidence", "min_share", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
-
-_COUNTED_IMAGES = 32
-"""Images whose confidences are counted for `min_share`, at most."""
 
 _SAVED_EVERY_S = 10.0
 """Time between summaries: work that may be lost when a process is killed."""
@@ -75,42 +59,46 @@ def predict(config: Mapping[str, Any]) -> None:
     """
     settings = parse_settings(PredictSettings, config)
     _check_projection(settings)
-    _check_confidence(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
-    original, trained = _networks(settings)
-    folder = PredictionFolder(settings.output, trained.class_names, settings.write)
+    trained = load_trained(settings.checkpoint, settings.trust)
+    views = _views(settings, trained)
+    prediction = LabelPrediction(settings, trained, views)
+    if isinstance(views, PanoramaViews):
+        print_text(f"{prediction.announcement} in {views.description(settings.area)}.")
+    results = prediction.results
+    folder = PredictionFolder(settings.output, results, results.kinds(settings.write))
+    _check_videos(inputs, folder)
     names = inputs.names()
     shown = [names[number] for number in evenly_spread(settings.report, len(names))]
-    label = _Labeler(settings, original, trained, folder, shown)
-    if settings.min_share:
-        label.find_thresholds(inputs)
+    images = _Images(settings, prediction, folder, _depth_folder(settings, trained), shown)
+    prediction.prepare(partial(images.examples, inputs))
     if shard is None:
-        done = _label(settings, decisive, inputs, label, folder)
-        _finish(settings, inputs, label, folder, done)
+        done = _predict(settings, decisive, inputs, images, folder)
+        _finish(settings, inputs, images, folder, done)
     else:
-        shared = {**decisive, "write": list(settings.write)}
+        shared = {**decisive, "write": list(folder.kinds)}
         part = PredictionShard(shard, settings.output / "shards", list(inputs.files), shared)
-        done = _label(settings, decisive, inputs.part(shard), label, folder, part)
+        done = _predict(settings, decisive, inputs.part(shard), images, folder, part)
         part.save(done, done=True)
         count, entries = part.finished()
         print_text(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
-            _finish(settings, inputs, label, folder, entries)
+            _finish(settings, inputs, images, folder, entries)
     if failed := sum("error" in entry for entry in done):
         sys.exit(f"tangent-predict: {failed} of {len(done)} images could not be used, see above")
 
 
-def _label(
+def _predict(
     settings: PredictSettings,
     decisive: Mapping[str, Any],
     inputs: Inputs,
-    label: _Labeler,
+    images: _Images,
     folder: PredictionFolder,
     part: PredictionShard | None = None,
 ) -> list[Entry]:
-    """Label all images, or those of a shard; return their entries and those of earlier runs."""
+    """Predict all images, or those of a shard; return their entries and those of earlier runs."""
     summary = None if part is None else part.path
     known = folder.earlier(decisive, summary) if settings.resume else None
     if not (settings.overwrite or known is not None or (part and part.folder.exists())):
@@ -130,8 +118,8 @@ def _label(
     count = len(names)
     print_text(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
-    steps = label, label.read, label.write
-    labeled = set()
+    steps = images.predict, images.read, images.write
+    worked = set()
     saved = -math.inf
     save()
     try:
@@ -139,7 +127,7 @@ def _label(
             for job in done:
                 entry = {"error": job.error} if job.error else job.value
                 entries.append({"file": str(job.path), "name": job.item, **entry})
-                labeled.add(job.path)
+                worked.add(job.path)
                 if time.monotonic() - saved > _SAVED_EVERY_S:
                     save()
                     saved = time.monotonic()
@@ -148,9 +136,9 @@ def _label(
         raise
     finally:
         save()
-        if part is None and not any("classes" in entry for entry in entries):
+        if part is None and not folder.predicted(entries):
             folder.remove_summary()
-    if unmade := _make_videos(inputs, folder, entries, labeled):
+    if unmade := _make_videos(inputs, folder, entries, worked):
         entries += unmade
         save()
     return entries
@@ -159,71 +147,49 @@ def _label(
 def _finish(
     settings: PredictSettings,
     inputs: Inputs,
-    label: _Labeler,
+    images: _Images,
     folder: PredictionFolder,
     entries: Sequence[Entry],
 ) -> None:
-    """Write the report and print the shares of the classes."""
-    used = {entry["name"] for entry in entries if "classes" in entry}
-    if not used:
+    """Write the report and print the table of the results."""
+    if not (predicted := folder.predicted(entries)):
         return
-    pictures = label.pictures(inputs, used)
+    pictures = images.pictures(inputs, {entry["name"] for entry in predicted})
     if pictures:
         folder.write_page(entries, pictures)
-    folder.mean_shares(entries).print()
+    folder.results.table(predicted).print()
     print_text(f"Results are in {settings.output}.")
 
 
-class _Labeler:
-    """Reads images, predicts their labels and writes them.
+class _Images:
+    """Reads images, predicts them and writes the results.
 
     Args:
         settings: Settings of the command.
-        original: Network with its original classes, which estimates the up direction.
-        trained: Network with mapped classes, which predicts the labels.
+        prediction: Predicts one image.
         folder: Output folder.
+        depth: Depth images, for networks that take depth.
         shown: Names of the images in the report.
     """
 
     def __init__(
         self,
         settings: PredictSettings,
-        original: TrainedNetwork,
-        trained: TrainedNetwork,
+        prediction: LabelPrediction,
         folder: PredictionFolder,
+        depth: DepthFolder | None,
         shown: Sequence[str],
     ) -> None:
-        self._settings, self._trained, self._folder = settings, trained, folder
-        self._predictor = _predictor(settings, trained)
-        self._judge = NetworkJudge(original, self._predictor.device)
-        self._depth = _depth_folder(settings, trained)
-        self._masks = Masks(settings.mask)
+        self._settings, self._prediction, self._folder = settings, prediction, folder
+        self._depth, self._masks = depth, Masks(settings.mask)
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
-        self._thresholds: NDArray[np.float64] | None = None
 
-    def find_thresholds(self, inputs: Inputs) -> None:
-        """Find the confidence that each class needs, see `min_share`; some images are predicted.
-
-        Args:
-            inputs: All images, also those of other shards.
-        """
-        settings, names = self._settings, inputs.names()
-        chosen = {names[number] for number in evenly_spread(_COUNTED_IMAGES, len(names))}
-        num_classes = len(self._trained.class_names) - 1
-        counts = np.zeros((num_classes + 1, 1), np.int64)
-        print_text(f"Confidences are counted in {counted(len(chosen), 'images')}.")
-        for job in inputs.missing(set(names) - chosen):
-            with suppress(DataError, SettingError):  # reported when the image is labeled
-                if not job.error:
-                    image, area = self.read(job)
-                    _, scores = self._scores(image, area)
-                    maps: list[Any] = [self._trained.labels(scores.labels()), scores.confidences()]
-                    labels, confidences = maps if area is None else [area.cut(m) for m in maps]
-                    counts = counts + count_confidences(labels, confidences, num_classes)
-        self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
-        least = zip(self._trained.class_names[1:], self._thresholds[1:], strict=True)
-        listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
-        print_text(f"Smallest confidence of each class: {listed}.")
+    def examples(self, inputs: Inputs, count: int) -> tuple[int, Iterator[ReadsImage]]:
+        """Return at most `count` of all images: their number, and functions that read them."""
+        names = inputs.names()
+        chosen = {names[number] for number in evenly_spread(count, len(names))}
+        jobs = inputs.missing(set(names) - chosen)
+        return len(chosen), (partial(self.read, job) for job in jobs if not job.error)
 
     def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
         """Read one image; return it with the area of a panorama, or with None for a photo."""
@@ -234,67 +200,50 @@ class _Labeler:
             return read_photo(image, settings.fov, depth), None
         return read_panorama(image, settings.area, settings.upright, depth)
 
-    def __call__(self, job: Job, progress: Callable[[float], object]) -> LabeledImage:
-        """Predict the labels of one image."""
+    def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
+        """Predict one image."""
         image, area = job.value
-        image, scores = self._scores(image, area, progress)
-        # Not written in another thread: scores take much memory.
-        self._folder.write_probabilities(job.item, scores, area)
-        labels = self._trained.labels(scores.labels())
-        if self._thresholds is not None:
-            is_sure = scores.confidences() >= self._thresholds[labels]
-            labels = np.where(is_sure, labels, labels.dtype.type(0))
-        return LabeledImage(image, labels if area is None else area.cut(labels), area)
-
-    def _scores(
-        self,
-        image: InputImage,
-        area: PanoramaArea | None,
-        progress: Callable[[float], object] = lambda share: None,
-    ) -> tuple[InputImage, ScoreMosaic]:
-        """Predict the scores of one image; return it with its up direction."""
-        if self._settings.upright == "auto" and area is not None:
-            image = with_up(image, self._settings.max_tilt_deg, self._judge)
-        keeps_sums = self._settings.min_share > 0 or "probabilities" in self._settings.write
-        return image, self._predictor.predict(image, progress, probabilities=keeps_sums)
+        return self._prediction(image, area, self._folder.files(job.item), progress)
 
     def write(self, job: Job) -> Entry:
-        """Write the labels of one image; return its entry in the summary."""
-        image, labels, area = labeled = job.value
+        """Write the results of one image; return its entry in the summary."""
+        predicted: PredictedImage = job.value
+        image, pixels, area = predicted.image, predicted.pixels, predicted.area
         is_counted = np.array(True)
         if area is not None:
             is_counted = area.cut(self._masks.read(job.item, area)) > 0
-            labels = np.where(is_counted, labels, labels.dtype.type(0))
-            labeled = LabeledImage(image, labels, area)
+            unknown = pixels.dtype.type(self._folder.results.unknown)
+            predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         folder = self._folder.of_frames if is_video(job.path) else self._folder
-        folder.write(job.item, labeled)
-        rows, columns = labels.shape
+        folder.results.write(folder.files(job.item), predicted)
+        rows, columns = pixels.shape
         entry: Entry = {"rows": rows, "columns": columns}
         if is_video(job.path):
             entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        entry["classes"] = class_shares(labeled, self._folder.class_names, is_counted)
+        entry[folder.results.summary] = folder.results.summarize(predicted, is_counted)
         if job.item in self._shown:
-            self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
+            self._shown[job.item] = folder.results.encode(job.item, predicted)
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
-        """Return the pictures of the report; images labeled by other processes are read again.
+        """Return the pictures of the report; results of other processes are read again.
 
         Args:
             inputs: All images and videos.
-            used: Names of the labeled images and frames.
+            used: Names of the predicted images and frames.
         """
         count, names = self._settings.report, [name for name in inputs.names() if name in used]
         wanted = [names[number] for number in evenly_spread(count, len(names))]
         earlier = {name for name in wanted if self._shown.get(name) is None}
+        results = self._folder.results
         for job in inputs.missing(set(inputs.names()) - earlier):
-            labels = self._folder.files(job.item).get("labels")
-            if labels is not None and not job.error:
+            file = self._folder.files(job.item).get(results.source)
+            if file is not None and not job.error:
                 image, area = self.read(job)
-                labeled = LabeledImage(image, read_pixels(labels, indices=True), area)
-                self._shown[job.item] = self._folder.viewer_image(job.item, labeled)
+                predicted = PredictedImage(image, results.read(file), area)
+                self._shown[job.item] = results.encode(job.item, predicted)
         others = [name for name in self._shown if name not in wanted]
         available = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
         shown = (self._shown[name] for name in names if name in available[:count])
@@ -302,29 +251,18 @@ class _Labeler:
 
 
 def _make_videos(
-    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], labeled: set[Path]
+    inputs: Inputs, folder: PredictionFolder, entries: Sequence[Entry], worked: set[Path]
 ) -> list[Entry]:
-    """Write the result videos of videos whose frames are all labeled; return errors as entries."""
+    """Write the result videos of videos whose frames are all done; return errors as entries."""
     failed = {entry["file"] for entry in entries if "error" in entry}
     videos = [job for job in inputs.videos.values() if str(job.path) not in failed]
 
     def write(job: Job, _: Callable[[float], object]) -> None:
-        again = job.path in labeled
-        folder.write_videos(job.item, job.path, job.value, inputs.every, again=again)
+        again, frames = job.path in worked, [e for e in entries if e["file"] == str(job.path)]
+        folder.write_videos(job.item, job.path, job.value, inputs.every, frames, again=again)
 
     done = run_jobs("Making videos", videos, len(videos), write)
     return [{"file": str(j.path), "name": j.item, "error": j.error} for j in done if j.error]
-
-
-def _networks(settings: PredictSettings) -> tuple[TrainedNetwork, TrainedNetwork]:
-    """Return the network with its original classes, and with those of the class map."""
-    if settings.class_map is None:
-        return (load_trained(settings.checkpoint, settings.trust),) * 2
-    class_map = load_class_map(settings.class_map)
-    trained = load_trained(settings.checkpoint, settings.trust)
-    mapped = map_classes(trained, class_map, settings.unmapped)
-    print_text(f"Class map {class_map.name}: {mapped}.")
-    return trained, mapped.trained
 
 
 def _inputs(settings: PredictSettings) -> Inputs:
@@ -334,40 +272,25 @@ def _inputs(settings: PredictSettings) -> Inputs:
         if settings.projection == "equirectangular":
             panorama_area(path, size, settings.area)
 
-    inputs = Inputs.find(settings, is_result_in(settings.output), check_size)
-    pictures = {"color", "overlay"}.intersection(settings.write)
-    if inputs.videos and pictures and "labels" not in settings.write:
+    return Inputs.find(settings, is_result_in(settings.output), check_size)
+
+
+def _check_videos(inputs: Inputs, folder: PredictionFolder) -> None:
+    results, source = folder.results, folder.results.source
+    pictures = set(results.pictures).intersection(folder.kinds)
+    if inputs.videos and pictures and source not in folder.kinds:
         raise SettingError(
             "write",
-            found=f"{' and '.join(sorted(pictures))} of a video without labels",
-            expected="labels too: videos of pictures are made from the labels of all frames",
+            found=f"{' and '.join(sorted(pictures))} of a video without {source}",
+            expected=f"{source} too: videos of pictures are made from the {source} of all frames",
         )
-    return inputs
 
 
-def _predictor(settings: PredictSettings, trained: TrainedNetwork) -> Predictor:
+def _views(settings: PredictSettings, trained: TrainedNetwork) -> PanoramaViews | PhotoViews:
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
-    views: PanoramaViews | PhotoViews
-    if settings.projection == "equirectangular":
-        views = PanoramaViews(trained, *how, settings.views, settings.fill)
-        print_text(f"A panorama is labeled in {views.description(settings.area)}.")
-    else:
-        views = PhotoViews(trained, *how)
-    device, count = settings.device, settings.images_per_forward
-    # With `min_share`, a threshold of each class replaces it.
-    least = 0.0 if settings.min_share else settings.min_confidence
-    return Predictor(trained, views, device, count, least)
-
-
-def _check_confidence(settings: PredictSettings) -> None:
-    if not 0 <= settings.min_share < 1:
-        raise SettingError("min_share", found=settings.min_share, expected="0 to below 1")
-    if settings.min_share and not 0 < settings.min_confidence <= 1:
-        raise SettingError(
-            "min_confidence",
-            found=settings.min_confidence,
-            expected="above 0 to 1 with min_share, which lowers it for single classes",
-        )
+    if settings.projection == "perspective":
+        return PhotoViews(trained, *how)
+    return PanoramaViews(trained, *how, settings.views, settings.fill)
 
 
 def _check_projection(settings: PredictSettings) -> None:

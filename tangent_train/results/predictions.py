@@ -1,26 +1,23 @@
-"""Write the files of predictions: label maps, pictures, a summary and a report page."""
+"""Write the files of predictions: pixels, pictures, a summary and a report page."""
 
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from datamodules.folder.classes import UNKNOWN_NAME
-from datamodules.images.image_files import composed
-from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
 from datamodules.images.videos import write_video
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.results.html import EncodedImage, encode_image, write_report
-from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
-from tangent_train.results.tables import Table, percent
+from tangent_train.results.html import EncodedImage, write_report
+from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -29,23 +26,13 @@ if TYPE_CHECKING:
 
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.inference.images import InputImage
-    from tangent_train.rendering.mosaic import ScoreMosaic
 
-
-_ROWS_AT_ONCE = 64
-_SUMMARY = "summary.json"
-_RESULTS = (
-    "labels", "color", "overlay", "probabilities",
-    "classes.json", _SUMMARY, "summary.csv", "report.html", "shards",
-)  # fmt: skip
-
-OutputKind = Literal["labels", "color", "overlay", "probabilities"]
-"""Kinds of output of an image, each in a separate folder."""
-
-_PICTURES: tuple[OutputKind, ...] = ("color", "overlay")
+_SUMMARY, _CLASSES = "summary.json", "classes.json"
+_FILES = (_SUMMARY, _CLASSES, "summary.csv", "report.html", "shards")
+_FOLDERS = ("labels", "color", "overlay", "probabilities", "depth", "points")
 
 Entry = dict[str, Any]
-"""Entry of an image: file, name, rows, columns and ``classes``, or file, name and error."""
+"""Entry of an image: file, name, rows, columns and its summary, or file, name and error."""
 
 
 def frame_name(video: str, number: int) -> str:
@@ -55,56 +42,33 @@ def frame_name(video: str, number: int) -> str:
 
 def is_result_in(output: Path) -> Callable[[Path], bool]:
     """Return a function that is True for files of predictions in an output folder."""
-    results = [(output / name).resolve() for name in _RESULTS]
+    results = [(output / name).resolve() for name in (*_FOLDERS, *_FILES)]
     return lambda path: any(path.resolve().is_relative_to(result) for result in results)
 
 
-class LabeledImage(NamedTuple):
-    """An image with its labels.
+class PredictedImage(NamedTuple):
+    """An image with its predicted pixels.
 
     Attributes:
         image: Photo, or image of the whole sphere.
-        labels: Labels ``(h, w)`` of the image, or of its area; 0 is unknown.
-        area: Part of the sphere that the labels cover; None for photos.
+        pixels: Prediction ``(h, w)`` for the image, or for its area; see `ImageResults`.
+        area: Part of the sphere that the prediction covers; None for photos.
     """
 
     image: InputImage
-    labels: NDArray[np.unsignedinteger]
+    pixels: NDArray[Any]
     area: PanoramaArea | None = None
 
 
-def class_shares(
-    labeled: LabeledImage, class_names: Sequence[str], counted: NDArray[np.bool_] | bool = True
-) -> dict[str, float]:
-    """Return the share of the solid angle of each class, including the unknown class.
-
-    Args:
-        labeled: Panorama or photo.
-        class_names: Names of the K + 1 labels, the unknown class first.
-        counted: Mask ``(H, W)`` that is True for counted pixels; all by default.
-
-    Returns:
-        Shares by name; they add up to 1, or are all 0 if everything is masked.
-    """
-    labels, count = labeled.labels, len(class_names)
-    total, is_counted = np.zeros(count), np.broadcast_to(counted, labels.shape)
-    for line, weights, mask in zip(labels, _solid_angles(labeled), is_counted, strict=True):
-        total += np.bincount(line, weights * mask, minlength=count)
-    shares = dict.fromkeys(class_names, 0.0)  # another class may be called unknown too
-    for name, share in zip(class_names, total / (total.sum() or 1), strict=True):
-        shares[name] += float(share)
-    return shares
-
-
-def _solid_angles(labeled: LabeledImage) -> Iterator[NDArray[np.float64]]:
+def solid_angles(predicted: PredictedImage) -> Iterator[NDArray[np.float64]]:
     """Yield the relative solid angles of the pixels row by row, which saves memory.
 
     A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
     """
-    image, (height, width) = labeled.image, labeled.labels.shape
+    image, (height, width) = predicted.image, predicted.pixels.shape
     if image.camera_matrix is None:
         rows = equirect_solid_angles((image.rgb.shape[0], image.rgb.shape[1])).ravel()
-        for weight in rows if labeled.area is None else rows[labeled.area.places()[0]]:
+        for weight in rows if predicted.area is None else rows[predicted.area.places()[0]]:
             yield np.full(width, weight)
         return
     (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
@@ -113,24 +77,107 @@ def _solid_angles(labeled: LabeledImage) -> Iterator[NDArray[np.float64]]:
         yield (1 + x**2 + ((row - cy) / fy) ** 2) ** -1.5
 
 
+class ImageResults(ABC):
+    """Files, pictures and summary of the predictions of one kind of network.
+
+    Attributes:
+        summary: Name of the summary of an image in its `Entry`.
+        suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
+            predicted pixels, from which pictures are made.
+        usual: Kinds that are written by default.
+        pictures: Kinds that are videos for the frames of a video.
+        unknown: Value of unknown pixels.
+        columns: Names in the summary of an image that ``summary.csv`` lists.
+        class_names: Names of the labels; empty without classes.
+    """
+
+    summary: ClassVar[str]
+    suffixes: Mapping[str, str]
+    usual: ClassVar[Sequence[str]]
+    pictures: ClassVar[Sequence[str]]
+    unknown: ClassVar[float]
+    columns: Sequence[str]
+    class_names: Sequence[str] = ()
+
+    def kinds(self, write: Sequence[str] | None) -> Sequence[str]:
+        """Return the kinds of output of the setting `write`.
+
+        Raises:
+            SettingError: A kind belongs to other networks.
+        """
+        if foreign := set(write or ()).difference(self.suffixes):
+            raise SettingError(
+                "write",
+                found=", ".join(sorted(foreign)),
+                expected=f"{', '.join(self.suffixes)} for a network that predicts {self.source}",
+            )
+        return self.usual if write is None else write
+
+    @property
+    def source(self) -> str:
+        """Kind of output that holds the predicted pixels."""
+        return next(iter(self.suffixes))
+
+    def write_description(self, folder: Path) -> None:  # noqa: B027, most have none
+        """Write files that describe the predictions of all images."""
+
+    @abstractmethod
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write the files of one image by kind, except for those written while predicting."""
+
+    @abstractmethod
+    def read(self, file: Path) -> NDArray[Any]:
+        """Read the predicted pixels from a file that `write` wrote."""
+
+    @abstractmethod
+    def paint(
+        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
+    ) -> NDArray[np.uint8]:
+        """Return a picture ``(h, w, 3)`` for a video.
+
+        Args:
+            kind: One of `pictures`.
+            rgb: Frame of the video.
+            pixels: Its prediction.
+            entries: Entries of all frames of the video.
+        """
+
+    @abstractmethod
+    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
+        """Return the summary of one image.
+
+        Args:
+            predicted: Image with its prediction.
+            is_counted: Mask ``(h, w)``, or of any shape that fits, that is True for counted pixels.
+        """
+
+    @abstractmethod
+    def table(self, entries: Sequence[Entry]) -> Table:
+        """Return a table of the summaries of all images."""
+
+    @abstractmethod
+    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
+        """Compress an image for the report, to 0.1 to a few megabytes."""
+
+
 @dataclass(frozen=True)
 class PredictionFolder:
     """Output folder of predictions.
 
     Attributes:
         path: Folder.
-        class_names: Names of the K + 1 labels, the unknown class first.
+        results: Files of the kind of network.
         kinds: Kinds of output to write.
     """
 
     path: Path
-    class_names: Sequence[str]
-    kinds: Sequence[OutputKind]
+    results: ImageResults
+    kinds: Sequence[str]
 
     def files(self, name: str) -> dict[str, Path]:
         """Return the files of one image by kind."""
-        suffixes = {kind: ".npy" if kind == "probabilities" else ".png" for kind in self.kinds}
-        return {kind: self.path / kind / f"{name}{suffix}" for kind, suffix in suffixes.items()}
+        suffixes = self.results.suffixes
+        return {kind: self.path / kind / f"{name}{suffixes[kind]}" for kind in self.kinds}
 
     def check(self, *, resume: bool) -> None:
         """Refuse a folder with earlier results.
@@ -141,7 +188,8 @@ class PredictionFolder:
         Raises:
             SettingError: The folder has earlier results.
         """
-        existing = [path for name in _RESULTS if (path := self.path / name).exists()]
+        names = (*self.results.suffixes, *_FILES)
+        existing = [path for name in names if (path := self.path / name).exists()]
         if existing:
             without, keep = "a folder without earlier results", " resume=true to keep them,"
             raise SettingError(
@@ -168,7 +216,7 @@ class PredictionFolder:
         """
         try:
             content = parse_json((summary or self.path / _SUMMARY).read_bytes())
-            entries = {entry["name"]: entry for entry in content["images"] if "classes" in entry}
+            entries = {entry["name"]: entry for entry in self.predicted(content["images"])}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):
             return None
@@ -181,6 +229,10 @@ class PredictionFolder:
             )
         return {name: entry for name, entry in entries.items() if self._is_complete(name, entry)}
 
+    def predicted(self, entries: Sequence[Entry]) -> list[Entry]:
+        """Return the entries of predicted images, without those of errors."""
+        return [entry for entry in entries if self.results.summary in entry]
+
     def _is_complete(self, name: str, entry: Entry) -> bool:
         folder = self.of_frames if "frame" in entry else self
         return all(file.is_file() for file in folder.files(name).values())
@@ -188,78 +240,46 @@ class PredictionFolder:
     @property
     def of_frames(self) -> PredictionFolder:
         """The same folder for frames of a video, without pictures, which become videos."""
-        return replace(self, kinds=[kind for kind in self.kinds if kind not in _PICTURES])
-
-    def write(self, name: str, labeled: LabeledImage) -> None:
-        """Write labels and pictures of one image, as far as `kinds` contains them.
-
-        Args:
-            name: Name of the image, see `short_names`.
-            labeled: Image with its labels.
-        """
-        (image, labels, area), files = labeled, self.files(name)
-        if "labels" in files:
-            write_pixels(files["labels"], labels)
-        if "color" in files:
-            write_pixels(files["color"], colorize(labels, len(self.class_names)))
-        if "overlay" in files:
-            rgb = image.rgb if area is None else area.cut(image.rgb)
-            write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+        return replace(self, kinds=[k for k in self.kinds if k not in self.results.pictures])
 
     def write_videos(
-        self, name: str, path: Path, size: tuple[int, int, int], every: int, *, again: bool
+        self,
+        name: str,
+        path: Path,
+        size: tuple[int, int, int],
+        every: int,
+        entries: Sequence[Entry],
+        *,
+        again: bool,
     ) -> None:
-        """Write videos of pictures, as far as `kinds` contains them, from the frames' labels.
+        """Write videos of pictures, as far as `kinds` contains them, from the frames' pixels.
 
         Args:
             name: Name of the video.
             path: File of the video.
             size: Number of frames, rows and columns.
-            every: The first and then every n-th frame have labels.
+            every: The first and then every n-th frame have predictions.
+            entries: Entries of these frames.
             again: True to replace existing videos.
 
         Raises:
-            DataError: The video, or the labels of a frame, cannot be read.
+            DataError: The video, or the prediction of a frame, cannot be read.
         """
-        for kind in _PICTURES:
+
+        def painted(kind: str, number: int, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+            file = self.of_frames.files(frame_name(name, number))[self.results.source]
+            return self.results.paint(kind, rgb, self.results.read(file), entries)
+
+        for kind in self.results.pictures:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and (again or not file.exists()):
-                write_video(file, path, size, partial(self._painted, name, kind), every)
-
-    def _painted(
-        self, name: str, kind: OutputKind, number: int, rgb: NDArray[np.uint8]
-    ) -> NDArray[np.uint8]:
-        labels = read_pixels(self.of_frames.files(frame_name(name, number))["labels"], indices=True)
-        count = len(self.class_names)
-        return colorize(labels, count) if kind == "color" else mixed_picture(rgb, labels, count)
-
-    def write_probabilities(
-        self, name: str, scores: ScoreMosaic, area: PanoramaArea | None = None
-    ) -> None:
-        """Write the probabilities of one image if `kinds` contains them.
-
-        Args:
-            name: Name of the image, see `short_names`.
-            scores: Scores of the photo, or of the whole sphere.
-            area: Part of the sphere to write; None for all.
-        """
-        file = self.files(name).get("probabilities")
-        if file is None:
-            return
-        everywhere = np.arange(scores.shape[0]), np.arange(scores.shape[1])
-        rows, columns = everywhere if area is None else area.places()
-        shape = (len(rows), len(columns), len(self.class_names) - 1)
-        with array_file(file, shape, np.float16) as array:
-            for start in range(0, len(rows), _ROWS_AT_ONCE):
-                part = slice(start, start + _ROWS_AT_ONCE)
-                probabilities = scores.probabilities(rows[part]).cpu().numpy()
-                array[part] = probabilities[:, columns, : shape[-1]]
+                write_video(file, path, size, partial(painted, kind), every)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
-        """Write ``summary.json``, ``summary.csv`` and ``classes.json`` (labels by name).
+        """Write ``summary.json``, ``summary.csv`` and the description of the predictions.
 
-        ``classes.json`` lacks classes that are called unknown. ``summary.json`` is the first file
-        in a folder, so that a killed prediction can be continued.
+        ``summary.json`` is the first file in a folder, so that a killed prediction can be
+        continued.
 
         Args:
             settings: Settings of the prediction.
@@ -267,41 +287,21 @@ class PredictionFolder:
         """
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
-        names = dict.fromkeys(self.class_names)
-        labels: dict[str, list[int]] = {}
-        for label, name in enumerate(map(composed, self.class_names)):
-            if name != UNKNOWN_NAME:
-                labels.setdefault(name, []).append(label)
-        lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
-        write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
-        columns = ("file", "rows", "columns")
+        self.results.write_description(self.path)
+        columns, names = ("file", "rows", "columns"), dict.fromkeys(self.results.columns)
+        summaries = (entry.get(self.results.summary, {}) for entry in entries)
         rows = [
-            [*map(e.get, columns), *(e.get("classes", {}).get(n) for n in names), e.get("error")]
-            for e in entries
+            [*map(entry.get, columns), *map(summary.get, names), entry.get("error")]
+            for entry, summary in zip(entries, summaries, strict=True)
         ]
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
 
     def remove_summary(self) -> None:
         """Remove the files of `write_summary`, so that the command can be repeated."""
-        for name in ("summary.csv", "classes.json", _SUMMARY):
+        for name in ("summary.csv", _CLASSES, _SUMMARY):
             (self.path / name).unlink(missing_ok=True)
         with suppress(OSError):  # the folder has other files
             self.path.rmdir()
-
-    def mean_shares(self, entries: Sequence[Entry]) -> Table:
-        """Return the mean of `class_shares` over the images for classes that occur, sorted."""
-        shares = [entry["classes"] for entry in entries if "classes" in entry]
-        count = max(1, len(shares))
-        mean = {name: sum(of[name] for of in shares) / count for name in self.class_names}
-        seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
-        rows = [[name, percent(mean[name])] for name in seen]
-        return Table("Mean over the images", ["class", "solid angle, %"], rows)
-
-    def viewer_image(self, name: str, labeled: LabeledImage) -> EncodedImage:
-        """Compress an image for `write_page`, to 0.1 to a few megabytes."""
-        (image, labels, area), count = labeled, len(self.class_names)
-        placed = labels if area is None else area.place(labels)
-        return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)
 
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.
@@ -310,7 +310,7 @@ class PredictionFolder:
             entries: Entries of all images.
             shown: Compressed images for the viewer.
         """
-        tables = [self.mean_shares(entries)]
+        tables = [self.results.table(self.predicted(entries))]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
         if failed:
             tables.append(
@@ -321,6 +321,6 @@ class PredictionFolder:
             "Predictions",
             tables=tables,
             images=shown,
-            class_names=self.class_names,
+            class_names=self.results.class_names,
             notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
         )

@@ -1,0 +1,143 @@
+"""Predict labels of images: the part of ``tangent-predict`` for networks of classes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.images.gpano import PanoramaArea
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.cli.command_settings import PredictSettings
+from tangent_train.console import print_text
+from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.inference.class_maps import load_class_map, map_classes
+from tangent_train.inference.confidences import class_thresholds, count_confidences
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage, with_up
+from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.results.label_results import LabelResults
+from tangent_train.results.predictions import PredictedImage
+
+ReadsImage = Callable[[], tuple[InputImage, PanoramaArea | None]]
+"""Reads a panorama with its area, or a photo with None."""
+
+_COUNTED_IMAGES = 32
+"""Images whose confidences are counted for `min_share`, at most."""
+
+
+class LabelPrediction:
+    """Predicts the labels of images.
+
+    Args:
+        settings: Settings of the command.
+        original: Network with its original classes, which estimates the up direction. The network
+            of `class_map` predicts the labels.
+        views: Views of an image.
+
+    Attributes:
+        results: Files, pictures and summary of the predictions.
+
+    Raises:
+        SettingError: A setting does not suit the network.
+    """
+
+    announcement = "A panorama is labeled"
+
+    def __init__(
+        self, settings: PredictSettings, original: TrainedNetwork, views: PanoramaViews | PhotoViews
+    ) -> None:
+        _check_confidence(settings)
+        self._settings, self._trained = settings, original
+        if settings.class_map is not None:
+            class_map = load_class_map(settings.class_map)
+            mapped = map_classes(original, class_map, settings.unmapped)
+            print_text(f"Class map {class_map.name}: {mapped}.")
+            self._trained = mapped.trained
+        # With `min_share`, a threshold of each class replaces it.
+        least = 0.0 if settings.min_share else settings.min_confidence
+        how = settings.device, settings.images_per_forward, least
+        self._predictor = Predictor(self._trained, views, *how)
+        self._judge = NetworkJudge(original, self._predictor.device)
+        self._thresholds: NDArray[np.float64] | None = None
+        self.results = LabelResults(self._trained.class_names)
+
+    def prepare(self, examples: Callable[[int], tuple[int, Iterator[ReadsImage]]]) -> None:
+        """Find the confidence that each class needs, see `min_share`; some images are predicted.
+
+        Args:
+            examples: Function that returns at most a number of images: their number, and functions
+                that read them.
+        """
+        settings, names = self._settings, self._trained.class_names[1:]
+        if not settings.min_share:
+            return
+        counts = np.zeros((len(names) + 1, 1), np.int64)
+        count, images = examples(_COUNTED_IMAGES)
+        print_text(f"Confidences are counted in {counted(count, 'images')}.")
+        for read in images:
+            with suppress(DataError, SettingError):  # reported when the image is labeled
+                image, area = read()
+                _, scores = self._scores(image, area)
+                maps: list[Any] = [self._trained.labels(scores.labels()), scores.confidences()]
+                labels, confidences = maps if area is None else [area.cut(m) for m in maps]
+                counts = counts + count_confidences(labels, confidences, len(names))
+        self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
+        least = zip(names, self._thresholds[1:], strict=True)
+        listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
+        print_text(f"Smallest confidence of each class: {listed}.")
+
+    def __call__(
+        self,
+        image: InputImage,
+        area: PanoramaArea | None,
+        files: Mapping[str, Path],
+        progress: Callable[[float], object],
+    ) -> PredictedImage:
+        """Predict the labels of one image; write its probabilities if `files` contains them.
+
+        Args:
+            image: Panorama of the whole sphere, or photo.
+            area: Part of the sphere to predict; None for photos.
+            files: Files of the image by kind of output.
+            progress: See `Predictor.predict`.
+        """
+        image, scores = self._scores(image, area, progress)
+        if "probabilities" in files:
+            # Not written in another thread: scores take much memory.
+            self.results.write_probabilities(files["probabilities"], scores, area)
+        labels = self._trained.labels(scores.labels())
+        if self._thresholds is not None:
+            is_sure = scores.confidences() >= self._thresholds[labels]
+            labels = np.where(is_sure, labels, labels.dtype.type(0))
+        return PredictedImage(image, labels if area is None else area.cut(labels), area)
+
+    def _scores(
+        self,
+        image: InputImage,
+        area: PanoramaArea | None,
+        progress: Callable[[float], object] = lambda share: None,
+    ) -> tuple[InputImage, ScoreMosaic]:
+        """Predict the scores of one image; return it with its up direction."""
+        settings = self._settings
+        if settings.upright == "auto" and area is not None:
+            image = with_up(image, settings.max_tilt_deg, self._judge)
+        keeps_sums = settings.min_share > 0 or "probabilities" in (settings.write or ())
+        return image, self._predictor.predict(image, progress, probabilities=keeps_sums)
+
+
+def _check_confidence(settings: PredictSettings) -> None:
+    if not 0 <= settings.min_share < 1:
+        raise SettingError("min_share", found=settings.min_share, expected="0 to below 1")
+    if settings.min_share and not 0 < settings.min_confidence <= 1:
+        raise SettingError(
+            "min_confidence",
+            found=settings.min_confidence,
+            expected="above 0 to 1 with min_share, which lowers it for single classes",
+        )

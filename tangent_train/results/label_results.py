@@ -1,0 +1,137 @@
+"""Write predicted labels: label maps, probabilities, pictures and shares of the classes."""
+
+from __future__ import annotations
+
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.images.image_files import composed
+from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
+from tangent_train.files import write_text
+from tangent_train.results.html import EncodedImage, encode_image
+from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
+from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
+from tangent_train.results.tables import Table, percent
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+    from datamodules.images.gpano import PanoramaArea
+    from tangent_train.rendering.mosaic import ScoreMosaic
+
+_ROWS_AT_ONCE = 64
+
+
+def class_shares(
+    labeled: PredictedImage, class_names: Sequence[str], counted: NDArray[np.bool_] | bool = True
+) -> dict[str, float]:
+    """Return the share of the solid angle of each class, including the unknown class.
+
+    Args:
+        labeled: Panorama or photo with its labels.
+        class_names: Names of the K + 1 labels, the unknown class first.
+        counted: Mask ``(H, W)`` that is True for counted pixels; all by default.
+
+    Returns:
+        Shares by name; they add up to 1, or are all 0 if everything is masked.
+    """
+    labels, count = labeled.pixels, len(class_names)
+    total, is_counted = np.zeros(count), np.broadcast_to(counted, labels.shape)
+    for line, weights, mask in zip(labels, solid_angles(labeled), is_counted, strict=True):
+        total += np.bincount(line, weights * mask, minlength=count)
+    shares = dict.fromkeys(class_names, 0.0)  # another class may be called unknown too
+    for name, share in zip(class_names, total / (total.sum() or 1), strict=True):
+        shares[name] += float(share)
+    return shares
+
+
+class LabelResults(ImageResults):
+    """Results of a network that predicts labels; see `ImageResults`.
+
+    Args:
+        class_names: Names of the K + 1 labels, the unknown class first.
+    """
+
+    summary = "classes"
+    usual = ("labels", "color", "overlay")
+    pictures = ("color", "overlay")
+    unknown = 0
+
+    def __init__(self, class_names: Sequence[str]) -> None:
+        self.class_names = self.columns = class_names
+        pictures = dict.fromkeys(("labels", "color", "overlay"), ".png")
+        self.suffixes = pictures | {"probabilities": ".npy"}
+
+    def write_description(self, folder: Path) -> None:
+        """Write ``classes.json`` (labels by name), without classes that are called unknown."""
+        labels: dict[str, list[int]] = {}
+        for label, name in enumerate(map(composed, self.class_names)):
+            if name != UNKNOWN_NAME:
+                labels.setdefault(name, []).append(label)
+        lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
+        write_text(folder / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
+
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write labels and pictures."""
+        image, labels, area = predicted
+        if "labels" in files:
+            write_pixels(files["labels"], labels)
+        if "color" in files:
+            write_pixels(files["color"], colorize(labels, len(self.class_names)))
+        if "overlay" in files:
+            rgb = image.rgb if area is None else area.cut(image.rgb)
+            write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+
+    def write_probabilities(
+        self, file: Path, scores: ScoreMosaic, area: PanoramaArea | None = None
+    ) -> None:
+        """Write the probabilities of one image.
+
+        Args:
+            file: Array of float16 ``(rows, columns, K)``.
+            scores: Scores of the photo, or of the whole sphere.
+            area: Part of the sphere to write; None for all.
+        """
+        everywhere = np.arange(scores.shape[0]), np.arange(scores.shape[1])
+        rows, columns = everywhere if area is None else area.places()
+        shape = (len(rows), len(columns), len(self.class_names) - 1)
+        with array_file(file, shape, np.float16) as array:
+            for start in range(0, len(rows), _ROWS_AT_ONCE):
+                part = slice(start, start + _ROWS_AT_ONCE)
+                probabilities = scores.probabilities(rows[part]).cpu().numpy()
+                array[part] = probabilities[:, columns, : shape[-1]]
+
+    def read(self, file: Path) -> NDArray[Any]:
+        """Read labels."""
+        return read_pixels(file, indices=True)
+
+    def paint(
+        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
+    ) -> NDArray[np.uint8]:
+        """Color the labels, or overlay the frame with them."""
+        count = len(self.class_names)
+        return colorize(pixels, count) if kind == "color" else mixed_picture(rgb, pixels, count)
+
+    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
+        """Return the shares of the classes."""
+        return class_shares(predicted, self.class_names, is_counted)
+
+    def table(self, entries: Sequence[Entry]) -> Table:
+        """Return the mean of `class_shares` over the images for classes that occur, sorted."""
+        shares, count = [entry["classes"] for entry in entries], max(1, len(entries))
+        mean = {name: sum(of[name] for of in shares) / count for name in self.class_names}
+        seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
+        rows = [[name, percent(mean[name])] for name in seen]
+        return Table("Mean over the images", ["class", "solid angle, %"], rows)
+
+    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
+        """Compress an image with its labels."""
+        (image, labels, area), count = predicted, len(self.class_names)
+        placed = labels if area is None else area.place(labels)
+        return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)
