@@ -44,8 +44,8 @@ VIEWS: dict[str, dict[str, Any]] = {
     "tangent": TANGENT | {"level": 5, "levels": [5, 4], "rotations": 2},
     "ring": RING,
     "cube": CUBE | {"level": 5, "margin": 3},
-    "equirectangular": ERP | {"level": 6, "rotations": 2},
-    "icosphere": ICOSPHERE | {"level": 5},
+    "equirectangular": ERP | {"level": 5, "rotations": 2},
+    "icosphere": ICOSPHERE,
 }
 
 
@@ -77,8 +77,16 @@ def _true_depth(representation: dict[str, Any], kind: DepthKind) -> list[tuple[A
     return found
 
 
-@pytest.mark.parametrize("kind", get_args(DepthKind))
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *(("ring", kind) for kind in get_args(DepthKind)),
+        ("tangent", "relative_depth"),
+        ("cube", "metric_z"),
+        ("equirectangular", "canonical_inverse"),
+        ("icosphere", "relative_disparity"),
+    ],
+)
 def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind) -> None:
     """Every view of every kind has its own scale, which only overlaps reveal."""
     outputs = _true_depth(VIEWS[name], kind)
@@ -124,9 +132,9 @@ def test_the_sky_and_unknown_pixels_are_unknown() -> None:
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, depth.where(up < 0.6, 0).where(up > -0.8, torch.nan)))
     found = combine_depth(outputs, SHAPE, "relative_disparity", "feather").distance.numpy()
-    up = equirect_directions(SHAPE)[..., 2]
-    assert np.isnan(found[(up > 0.75) | (up < -0.92)]).all()
-    inside = (up < 0.45) & (up > -0.7)
+    heights = equirect_directions(SHAPE)[..., 2]
+    assert np.isnan(found[(heights > 0.75) | (heights < -0.92)]).all()
+    inside = (heights < 0.45) & (heights > -0.7)
     ratio = found[inside] / _truth()[inside]
     np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02)
 
