@@ -51,7 +51,7 @@ def unpacked(image: dict[str, Any], kind: str) -> NDArray[np.float64]:
 
 
 def test_points_of_a_panorama_lie_on_the_walls_of_the_room(tmp_path: Path) -> None:
-    """Their error is at most half a step of the logarithm, as `DistanceScale` states."""
+    """The bound is half a step of the logarithm, as `DistanceScale` states."""
     directions = equirect_directions(SIZE)
     distance = np.linalg.norm(exit_points(np.zeros(3), directions), axis=-1)
     truth = np.where(directions[..., 2] > 0.9, np.nan, 1.1 * distance)

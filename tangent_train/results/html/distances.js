@@ -3,7 +3,7 @@
 class Distances {
   constructor(scale, sphere, colors) {
     Object.assign(this, scale, { sphere, colors });
-    this.noun = sphere || !scale.camera ? "distance" : "depth";
+    this.noun = sphere || !scale.camera ? "distance" : "z-depth";
     this.unit = scale.is_metric ? "m" : "relative";
     this.logs = [scale.near, scale.far, ...scale.limits].map(Math.log);
   }
