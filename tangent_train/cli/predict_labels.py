@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from datamodules.images.gpano import PanoramaArea
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.command_settings import PredictSettings
+from tangent_train.cli.settings import check_unread
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
@@ -53,6 +54,9 @@ class LabelPrediction:
     def __init__(
         self, settings: PredictSettings, original: TrainedNetwork, views: PanoramaViews | PhotoViews
     ) -> None:
+        check_unread(
+            settings, "for networks of classes", align=None, depth_format=None, points=None
+        )
         _check_confidence(settings)
         self._settings, self._trained = settings, original
         if settings.class_map is not None:
