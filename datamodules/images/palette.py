@@ -1,4 +1,4 @@
-"""Colors of classes."""
+"""Colors of classes and of distances."""
 
 from __future__ import annotations
 
@@ -48,5 +48,19 @@ def class_colors(num_classes: int) -> NDArray[np.uint8]:
         away = np.minimum(away, distances[:, 0] + 3 * distances[:, 1:].min(axis=1))
         chosen.append(int(away.argmax()))
     colors = (srgb[chosen[:num_classes]] * 255).round().astype(np.uint8)
+    colors.setflags(write=False)
+    return colors
+
+
+@lru_cache
+def distance_colors() -> NDArray[np.uint8]:
+    """Return 256 RGB colors from the nearest to the farthest distance, not writable.
+
+    They are viridis from its bright end: equal steps look equally large, and near is brighter than
+    far without color vision too.
+    """
+    ramp = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
+    colors: NDArray[np.uint8] = np.asarray(cv2.applyColorMap(ramp, cv2.COLORMAP_VIRIDIS), np.uint8)
+    colors = np.ascontiguousarray(colors[:, 0, ::-1])
     colors.setflags(write=False)
     return colors

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.images.gpano import PanoramaArea, black_outside
-from datamodules.images.palette import class_colors
+from datamodules.images.palette import class_colors, distance_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]
@@ -35,6 +35,35 @@ def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
         num_classes: Number of labels, K + 1.
     """
     return class_colors(num_classes)[labels]
+
+
+def distance_limits(*distances: NDArray[np.floating]) -> tuple[float, float]:
+    """Return the ends of the color scale: percentiles 1 and 99 of the known distances.
+
+    Args:
+        distances: Maps that share one scale; NaN, infinite and 0 are unknown.
+    """
+    known = np.concatenate([d[np.isfinite(d) & (d > 0)] for d in distances])
+    near, far = np.percentile(known, (1, 99)).tolist() if known.size else (1.0, 1.0)
+    return near, max(far, 1.01 * near)
+
+
+def colorize_distance(
+    distance: NDArray[np.floating], limits: tuple[float, float] | None = None
+) -> _Image:
+    """Color distances ``(H, W)`` as RGB ``(H, W, 3)``: near bright, far dark, unknown black.
+
+    Colors change with the logarithm of the distance, as relative differences do.
+
+    Args:
+        distance: Distances in any unit; NaN, infinite and 0 are unknown.
+        limits: Distances of the first and the last color; by default `distance_limits`.
+    """
+    near, far = limits or distance_limits(distance)
+    is_known = np.isfinite(distance) & (distance > 0)
+    place = np.log(np.where(is_known, distance, near) / near) / np.log(far / near)
+    colors = distance_colors()[np.rint(255 * place.clip(0, 1)).astype(np.uint8)]
+    return np.asarray(colors * is_known[..., None], np.uint8)
 
 
 def prediction_panel(

@@ -60,7 +60,7 @@ def test_names_stay_text_wherever_they_stand(nasty_page: str) -> None:
     # title, heading, note; table: title, note, header, 2 cells; 2 thumbnails with notes.
     assert sum(NASTY in text for text in reader.texts) == 12
     assert "b" not in reader.tags
-    assert reader.tags.count("script") == 5, "2 images, classes, shader, viewer"
+    assert reader.tags.count("script") == 6, "2 images, classes, colors, shader, viewer"
     images = [json.loads(s) for s in reader.scripts if s.startswith('{"name"')]
     assert [image["name"] for image in images] == [NASTY, NASTY]
     (classes,) = (json.loads(s) for s in reader.scripts if s.startswith("[{"))

@@ -1,4 +1,5 @@
-// Mouse and fingers on the picture: drag, pinch, wheel, double click.
+// Mouse and fingers on the picture: drag, with the right button or two fingers too, pinch, wheel,
+// double click.
 
 class Gestures {
   constructor(viewer) {
@@ -10,6 +11,9 @@ class Gestures {
     for (const type of [...types, "dblclick"]) {
       this.canvas.addEventListener(type, (event) => this[type](event));
     }
+    this.canvas.addEventListener("contextmenu", (event) => {
+      if (viewer.inPoints) event.preventDefault(); // the right button moves the scene
+    });
     this.canvas.addEventListener("wheel", (event) => this.wheel(event), { passive: false });
   }
 
@@ -19,7 +23,7 @@ class Gestures {
   }
 
   pointerdown(event) {
-    if (event.button !== 0) return;
+    if (event.button !== 0 && !(event.button === 2 && this.viewer.inPoints)) return;
     this.pressed.set(event.pointerId, this.position(event));
     this.canvas.setPointerCapture(event.pointerId);
     this.canvas.classList.add("grabbed");
@@ -34,7 +38,8 @@ class Gestures {
       const [middle, spread] = this.grip();
       this.pressed.set(event.pointerId, this.pointer);
       const [moved, wider] = this.grip();
-      view.pan(moved[0] - middle[0], moved[1] - middle[1]);
+      const drag = this.pressed.size > 1 || event.buttons === 2 ? "shift" : "pan";
+      view[drag](moved[0] - middle[0], moved[1] - middle[1]);
       if (spread > 0 && wider > 0) view.zoom(wider / spread, ...moved);
     }
     this.viewer.redraw();
@@ -73,12 +78,7 @@ class Gestures {
   }
 
   dblclick(event) {
-    const { view } = this.viewer;
-    const [x, y] = this.position(event);
-    const at = view.locate(x, y);
-    if (!at) return;
-    if (view.projection !== "flat") Object.assign(view, at);
-    view.zoom(2, x, y);
+    this.viewer.view.approach(...this.position(event));
     this.viewer.redraw();
   }
 }

@@ -15,19 +15,21 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.palette import class_colors
+from datamodules.images.palette import class_colors, distance_colors
 from tangent_train.files import atomic_path
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.results.html.distances import DistanceScale, camera_in_sides, pack_distances
 from tangent_train.results.tables import Table
 
 MOST_PIXELS = 4096
 """The longer side of an image in the report."""
 
+_MOST_DISTANCES = 2048
 _THUMBNAIL_PIXELS = 216
 _JPEG = (cv2.IMWRITE_JPEG_QUALITY, 88)
 _PNG = (cv2.IMWRITE_PNG_COMPRESSION, 6)
 
-_SCRIPTS = ("view.js", "surfaces.js", "gestures.js", "viewer.js")
+_SCRIPTS = ("view.js", "distances.js", "surfaces.js", "gestures.js", "viewer.js")
 _SCRIPT = '<script>\n"use strict";\n{{\n{}}}\n</script>'
 """Block of the scripts, whose names are not in the page's global scope."""
 
@@ -36,7 +38,7 @@ _PLACEHOLDER = re.compile(r"\{\{(\w+)\}\}")
 
 
 class EncodedImage(NamedTuple):
-    """A compressed image of the viewer, with its label maps; see `encode_image`.
+    """A compressed image of the viewer, with maps of labels or distances; see `encode_image`.
 
     Attributes:
         name: Name in the list of images.
@@ -46,10 +48,12 @@ class EncodedImage(NamedTuple):
         height: Rows of the image before compression.
         input: JPEG of the image.
         thumbnail: Small JPEG of the image.
-        prediction: 8-bit gray PNG of predicted labels, which may have fewer pixels.
-        truth: 8-bit gray PNG of true labels, which may have fewer pixels.
+        prediction: 8-bit gray PNG of predicted labels, or RGB PNG of distances, which may have
+            fewer pixels.
+        truth: The same of the truth.
         shares: ``(label, share of the truth, share of the prediction)`` of the labels that occur,
             without shares of missing maps; by solid angle for panoramas.
+        scale: Scale of the distances; None for labels.
     """
 
     name: str
@@ -62,22 +66,28 @@ class EncodedImage(NamedTuple):
     prediction: bytes | None
     truth: bytes | None
     shares: tuple[tuple[float, ...], ...]
+    scale: DistanceScale | None = None
 
 
 def encode_image(
     name: str,
     rgb: NDArray[np.uint8],
-    class_count: int,
+    class_count: int = 0,
     *,
     prediction: NDArray[np.integer] | None = None,
     truth: NDArray[np.integer] | None = None,
+    distance: NDArray[np.floating] | None = None,
+    true_distance: NDArray[np.floating] | None = None,
+    is_metric: bool = True,
+    camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
     note: str = "",
 ) -> EncodedImage:
     """Compress an image for the report, to a few megabytes at most.
 
     Images whose longer side exceeds `MOST_PIXELS` are downsampled: colors by area averaging, labels
-    by nearest neighbor.
+    by nearest neighbor. Distances, which compress less, have at most 2048. An image has labels or
+    distances.
 
     Args:
         name: Name in the list of images.
@@ -85,30 +95,46 @@ def encode_image(
         class_count: Number of labels, K + 1, with the unknown class 0; at most 256.
         prediction: Predicted labels ``(h, w)``, which may have another size than the image.
         truth: True labels ``(h, w)``; 0 is unknown.
+        distance: Predicted distances ``(h, w)`` from the center along the rays, of photos too; NaN
+            and 0 are unknown.
+        true_distance: True distances ``(h, w)``, on the scale of the predicted ones.
+        is_metric: True for distances in meters; False for distances up to a scale.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for z-depth and points.
         sphere: True for a panorama.
         note: Line below the name.
     """
-    maps = {"truth": truth, "prediction": prediction}
-    small = {
-        name: _shrunk(labels.astype(np.uint8, copy=False), MOST_PIXELS, cv2.INTER_NEAREST_EXACT)
-        for name, labels in maps.items()
-        if labels is not None
-    }
-    pngs = {name: cv2.imencode(".png", labels, _PNG)[1].tobytes() for name, labels in small.items()}
+    labels = _shrunk_maps(truth, prediction, MOST_PIXELS, np.uint8)
+    shares = _shares(list(labels.values()), class_count, sphere=sphere)
+    distances = _shrunk_maps(true_distance, distance, _MOST_DISTANCES, np.float32)
+    scale, packed = None, labels
+    if distances:
+        camera = None if camera_matrix is None else camera_in_sides(camera_matrix, rgb.shape)
+        scale, packed = pack_distances(distances, camera, sphere=sphere, is_metric=is_metric)
+    pngs = {key: cv2.imencode(".png", array, _PNG)[1].tobytes() for key, array in packed.items()}
     jpeg, thumbnail = _jpeg(rgb, MOST_PIXELS), _jpeg(rgb, _THUMBNAIL_PIXELS)
     height, width = rgb.shape[:2]
     both = pngs.get("prediction"), pngs.get("truth")
-    shares = _shares(list(small.values()), class_count, sphere=sphere)
-    return EncodedImage(name, note, sphere, width, height, jpeg, thumbnail, *both, shares)
+    return EncodedImage(name, note, sphere, width, height, jpeg, thumbnail, *both, shares, scale)
 
 
-def _shrunk(pixels: NDArray[np.uint8], side: int, interpolation: int) -> NDArray[np.uint8]:
+def _shrunk_maps(
+    truth: NDArray[Any] | None, prediction: NDArray[Any] | None, side: int, dtype: type[np.generic]
+) -> dict[str, NDArray[Any]]:
+    maps = {"truth": truth, "prediction": prediction}
+    return {
+        key: _shrunk(array.astype(dtype, copy=False), side, cv2.INTER_NEAREST_EXACT)
+        for key, array in maps.items()
+        if array is not None
+    }
+
+
+def _shrunk(pixels: NDArray[Any], side: int, interpolation: int) -> NDArray[Any]:
     """Downsample an image so that its longer side has at most `side` pixels."""
     scale = side / max(pixels.shape[:2])
     if scale >= 1:
         return pixels
     height, width = (max(1, round(length * scale)) for length in pixels.shape[:2])
-    resized: Any = cv2.resize(pixels, (width, height), interpolation=interpolation)
+    resized: NDArray[Any] = cv2.resize(pixels, (width, height), interpolation=interpolation)
     return resized
 
 
@@ -173,7 +199,12 @@ def write_report(
 def _viewer(class_names: Sequence[str]) -> str:
     colors = class_colors(len(class_names)).tolist()[: len(class_names)]  # empty without classes
     classes = [{"name": name, "rgb": rgb} for name, rgb in zip(class_names, colors, strict=True)]
-    parts = {"images": _IMAGES, "classes": _json(classes), "shader": _resource("viewer.frag")}
+    parts = {
+        "images": _IMAGES,
+        "classes": _json(classes),
+        "distances": _json(distance_colors().tolist()),
+        "shader": _resource("viewer.glsl"),
+    }
     return _filled(_resource("viewer.html"), parts)
 
 
@@ -184,7 +215,7 @@ def _write_image(file: TextIO, image: EncodedImage) -> None:
         f'{_base64(image.thumbnail)}"><span class="name">{html.escape(image.name)}</span>{note}'
         '</button>\n<script type="application/json">'
     )
-    content = image._asdict()
+    content = image._asdict() | {"scale": image.scale and image.scale._asdict()}
     del content["thumbnail"]
     file.write(f"{_json(content)}</script></li>\n")
 

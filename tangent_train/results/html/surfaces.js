@@ -1,14 +1,17 @@
 // What draws: WebGL 2, or where there is none the flat image on an ordinary canvas.
 
 const LAYERS = ["input", "truth", "prediction", "error", "overlay"];
-const LABELS = ["truth", "prediction"];
+const MAPS = ["truth", "prediction"];
+const WRONG = [214, 39, 40];
+const UNLABELED = [110, 110, 110];
+const WORST = Math.log(1.25); // relative error of a distance that is wholly red
 
 async function decode(base64, type, mostPixels) {
   const text = atob(base64);
   const bytes = new Uint8Array(text.length);
   for (let k = 0; k < text.length; k++) bytes[k] = text.charCodeAt(k);
   const blob = new Blob([bytes], { type });
-  // Class indices must arrive as they are in the file.
+  // Class indices and distances must arrive as they are in the file.
   const exact = { premultiplyAlpha: "none", colorSpaceConversion: "none" };
   const whole = await createImageBitmap(blob, exact);
   const shrink = mostPixels / Math.max(whole.width, whole.height);
@@ -22,10 +25,14 @@ async function decode(base64, type, mostPixels) {
 
 async function decodeImage(data, mostPixels) {
   const image = { input: await decode(data.input, "image/jpeg", mostPixels) };
-  for (const kind of LABELS) {
+  for (const kind of MAPS) {
     image[kind] = data[kind] ? await decode(data[kind], "image/png", mostPixels) : null;
   }
   return image;
+}
+
+function mix(a, b, share) {
+  return a.map((value, k) => value + share * (b[k] - value));
 }
 
 function pixelAt(u, v, width, height) {
@@ -49,27 +56,28 @@ class GlSurface {
     const { gl } = this;
     this.mostPixels = gl.getParameter(gl.MAX_TEXTURE_SIZE);
     this.textures = {};
-    this.program = this.link();
-    gl.useProgram(this.program);
+    const source = document.getElementById("shader").textContent;
+    // One triangle that covers the canvas.
+    const corners = `void main() {
+      gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1);
+    }`;
+    this.image = this.link(corners, source);
+    const points = `#define POINTS\n${source}`;
+    this.points = this.link(`#define VERTEX\n${points}`, points);
+    gl.disable(gl.DITHER); // colors of points are numbers
     this.framebuffer = gl.createFramebuffer();
-    ["input", ...LABELS, "classes"].forEach((name, unit) => {
+    ["input", ...MAPS, "colors"].forEach((name, unit) => {
       this.textures[name] = this.texture(unit);
       this.set("uniform1i", `u${name[0].toUpperCase()}${name.slice(1)}`, unit);
     });
   }
 
-  link() {
+  link(vertices, fragments) {
     const { gl } = this;
-    // One triangle that covers the canvas.
-    const corners = `#version 300 es
-      void main() {
-        gl_Position = vec4(gl_VertexID == 1 ? 3 : -1, gl_VertexID == 2 ? 3 : -1, 0, 1);
-      }`;
-    const fragments = document.getElementById("shader").textContent.trim();
     const program = gl.createProgram();
-    for (const [kind, source] of [[gl.VERTEX_SHADER, corners], [gl.FRAGMENT_SHADER, fragments]]) {
+    for (const [kind, source] of [[gl.VERTEX_SHADER, vertices], [gl.FRAGMENT_SHADER, fragments]]) {
       const shader = gl.createShader(kind);
-      gl.shaderSource(shader, source);
+      gl.shaderSource(shader, `#version 300 es\n${source}`);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
     }
@@ -92,11 +100,16 @@ class GlSurface {
     return texture;
   }
 
+  // In both programs, as far as they use it.
   set(method, name, ...values) {
-    this.gl[method](this.gl.getUniformLocation(this.program, name), ...values);
+    const { gl } = this;
+    for (const program of [this.image, this.points]) {
+      gl.useProgram(program);
+      gl[method](gl.getUniformLocation(program, name), ...values);
+    }
   }
 
-  load(image, sphere) {
+  load(image, sphere, distances) {
     const { gl } = this;
     gl.pixelStorei(gl.UNPACK_COLORSPACE_CONVERSION_WEBGL, gl.NONE);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
@@ -109,39 +122,81 @@ class GlSurface {
     this.set("uniform1i", "uSphere", sphere);
     this.set("uniform1i", "uHasTruth", image.truth !== null);
     this.set("uniform1i", "uHasPrediction", image.prediction !== null);
+    this.set("uniform1i", "uHasDistances", distances !== null);
+    if (distances) this.set("uniform4f", "uScale", ...distances.logs);
+    if (distances?.camera) this.set("uniform4f", "uCamera", ...distances.camera);
     this.sizes = {};
-    LABELS.forEach((kind, k) => {
+    MAPS.forEach((kind, k) => {
       gl.activeTexture(gl.TEXTURE1 + k);
       const map = image[kind] ?? new ImageData(1, 1);
-      gl.texImage2D(gl.TEXTURE_2D, 0, gl.R8, gl.RED, gl.UNSIGNED_BYTE, map);
+      gl.texImage2D(gl.TEXTURE_2D, 0, gl.RG8, gl.RG, gl.UNSIGNED_BYTE, map);
       this.sizes[kind] = image[kind] && [map.width, map.height];
     });
     for (const bitmap of Object.values(image)) bitmap?.close();
   }
 
-  paint(classes, hidden) {
+  paint(colors, hidden) {
     const { gl } = this;
-    const colors = new Uint8Array(4 * 256);
-    classes.forEach(({ rgb }, k) => colors.set([...rgb, hidden.has(k) ? 0 : 255], 4 * k));
+    const entries = new Uint8Array(4 * 256);
+    colors.forEach((rgb, k) => entries.set([...rgb, hidden.has(k) ? 0 : 255], 4 * k));
     gl.activeTexture(gl.TEXTURE3);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, colors);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA8, 256, 1, 0, gl.RGBA, gl.UNSIGNED_BYTE, entries);
   }
 
-  draw(view, layer, opacity) {
+  draw(view, layer, opacity, pointer) {
     const { gl } = this;
     gl.viewport(0, 0, gl.canvas.width, gl.canvas.height);
     this.set("uniform2f", "uCanvas", gl.canvas.width, gl.canvas.height);
-    this.set("uniform2f", "uCenter", view.u, view.v);
     this.set("uniform1f", "uReach", view.reach);
-    this.set("uniform1f", "uAspect", view.image.aspect);
     this.set("uniform1f", "uOpacity", opacity);
-    this.set("uniform1i", "uProjection", PROJECTIONS[view.projection].index);
     this.set("uniform1i", "uLayer", LAYERS.indexOf(layer));
+    if (view instanceof Scene) {
+      this.drawPoints(view, layer === "truth" || !this.sizes.prediction, pointer);
+      return;
+    }
+    this.set("uniform2f", "uCenter", view.u, view.v);
+    this.set("uniform1f", "uAspect", view.image.aspect);
+    this.set("uniform1i", "uProjection", PROJECTIONS[view.projection].index);
+    gl.useProgram(this.image);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // Class index of a label map at {u, v}, read back from the texture; null without such a map.
-  classAt(kind, { u, v }) {
+  // Without buffers: a vertex computes its place from its number.
+  drawPoints({ axes, eye, radius, canvas }, byTruth, pointer) {
+    const { gl } = this;
+    for (const [name, vector] of Object.entries({ eye, ...axes })) {
+      this.set("uniform3f", `u${name[0].toUpperCase()}${name.slice(1)}`, ...vector);
+    }
+    this.set("uniform1f", "uNear", 0.002 * radius);
+    this.set("uniform1i", "uByTruth", byTruth);
+    const [width, height] = this.sizes[byTruth ? "truth" : "prediction"];
+    const draw = (pick, ...background) => {
+      this.set("uniform1i", "uPick", pick);
+      gl.useProgram(this.points);
+      gl.clearColor(...background, 1);
+      gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
+      gl.drawArrays(gl.POINTS, 0, width * height);
+    };
+    gl.enable(gl.DEPTH_TEST);
+    // Which point is at the pointer: this pixel, in the colors of the points' numbers.
+    const [x, y] = pointer ?? canvas.map((side) => side / 2);
+    const column = Math.floor((x / canvas[0]) * gl.canvas.width);
+    const row = gl.canvas.height - 1 - Math.floor((y / canvas[1]) * gl.canvas.height);
+    gl.enable(gl.SCISSOR_TEST);
+    gl.scissor(column, row, 1, 1);
+    draw(true, 0, 0, 0);
+    gl.disable(gl.SCISSOR_TEST);
+    const pixel = new Uint8Array(4);
+    gl.readPixels(column, row, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
+    const number = pixel[0] + 256 * pixel[1] + 65536 * pixel[2] - 1;
+    const [u, v] = [(number % width) + 0.5, Math.floor(number / width) + 0.5];
+    this.picked = number < 0 ? null : { u: u / width, v: v / height };
+    draw(false, 0.086, 0.094, 0.11);
+    gl.disable(gl.DEPTH_TEST);
+  }
+
+  // Red and green of a map at {u, v}, read back from the texture; null without such a map.
+  valueAt(kind, { u, v }) {
     const { gl } = this;
     if (!this.sizes?.[kind]) return null;
     const [width, height] = this.sizes[kind];
@@ -152,7 +207,7 @@ class GlSurface {
     const [column, row] = pixelAt(u, v, width, height);
     gl.readPixels(column, row, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, pixel);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    return pixel[0];
+    return pixel;
   }
 }
 
@@ -163,7 +218,8 @@ class FlatSurface {
     this.mostPixels = 1024;
   }
 
-  load(image) {
+  load(image, sphere, distances) {
+    this.distances = distances;
     const [width, height] = [image.input.width, image.input.height];
     this.sheet = new OffscreenCanvas(width, height);
     this.pixels = {};
@@ -179,8 +235,8 @@ class FlatSurface {
     this.painted = null;
   }
 
-  paint(classes, hidden) {
-    [this.classes, this.hidden, this.painted] = [classes, hidden, null];
+  paint(colors, hidden) {
+    [this.colors, this.hidden, this.painted] = [colors, hidden, null];
   }
 
   draw(view, layer, opacity) {
@@ -200,36 +256,48 @@ class FlatSurface {
   }
 
   compose(layer, opacity) {
-    const { truth, prediction, input } = this.pixels;
+    const { input } = this.pixels;
     const result = new ImageData(this.sheet.width, this.sheet.height);
+    const shown = this.distances ? this.ofDistances : this.ofLabels;
     for (let k = 0; k < input.length; k += 4) {
       const under = [input[k], input[k + 1], input[k + 2]];
-      const color = this.shown(layer, opacity, under, truth?.[k] ?? 0, prediction?.[k]);
+      const values = MAPS.map((kind) => this.pixels[kind]?.subarray(k, k + 2));
+      const color = layer === "input" ? under : shown.call(this, layer, opacity, under, ...values);
       result.data.set([...color, 255], k);
     }
     this.sheet.getContext("2d").putImageData(result, 0, 0);
   }
 
   // One pixel, as in the shader.
-  shown(layer, opacity, under, truth, prediction) {
-    if (layer === "input") return under;
-    const index = layer === "truth" || layer === "error" ? truth : (prediction ?? truth);
+  ofLabels(layer, opacity, under, [truth] = [0], [prediction] = [truth]) {
+    const index = layer === "truth" || layer === "error" ? truth : prediction;
     const visible = !this.hidden.has(index);
-    const { rgb } = this.classes[index];
     const gray = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
-    if (layer === "overlay") {
-      return visible && index ? under.map((c, k) => c + opacity * (rgb[k] - c)) : under;
-    }
+    if (layer === "overlay") return visible && index ? mix(under, this.colors[index], opacity) : under;
     if (!visible) return Array(3).fill(0.4 * gray);
-    if (layer !== "error") return rgb;
-    if (!truth) return [110, 110, 110];
-    return truth === prediction ? Array(3).fill(191.25 + 0.25 * gray) : [214, 39, 40];
+    if (layer !== "error") return this.colors[index];
+    if (!truth) return UNLABELED;
+    return truth === prediction ? Array(3).fill(191.25 + 0.25 * gray) : WRONG;
   }
 
-  classAt(kind, { u, v }) {
+  ofDistances(layer, opacity, under, ...values) {
+    const [truth, prediction] = values.map((bytes) => (bytes ? this.distances.log(...bytes) : null));
+    const gray = 0.299 * under[0] + 0.587 * under[1] + 0.114 * under[2];
+    if (layer === "error") {
+      if (truth === null || prediction === null) return UNLABELED;
+      const share = Math.min(Math.abs(prediction - truth) / WORST, 1);
+      return mix(Array(3).fill(191.25 + 0.25 * gray), WRONG, share);
+    }
+    const log = layer === "truth" || !values[1] ? truth : prediction;
+    if (log === null) return layer === "overlay" ? under : Array(3).fill(0.4 * gray);
+    const color = this.distances.color(log);
+    return layer === "overlay" ? mix(under, color, opacity) : color;
+  }
+
+  valueAt(kind, { u, v }) {
     if (!this.pixels?.[kind]) return null;
     const { width, height } = this.sheet;
     const [column, row] = pixelAt(u, v, width, height);
-    return this.pixels[kind][4 * (row * width + column)];
+    return this.pixels[kind].subarray(4 * (row * width + column));
   }
 }

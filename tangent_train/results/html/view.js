@@ -122,6 +122,17 @@ class View {
     this.keepInside();
   }
 
+  shift(dx, dy) {
+    this.pan(dx, dy);
+  }
+
+  approach(x, y) {
+    const at = this.locate(x, y);
+    if (!at) return;
+    if (this.projection !== "flat") Object.assign(this, at);
+    this.zoom(2, x, y);
+  }
+
   // Zoom in by a factor; on flat images the point at (x, y) stays where it is.
   zoom(factor, x = this.canvas[0] / 2, y = this.canvas[1] / 2) {
     const before = this.onPlane(x, y);

@@ -5,10 +5,12 @@ class Viewer {
     this.section = section;
     this.canvas = this.find("canvas");
     this.classes = JSON.parse(document.getElementById("classes").textContent);
+    this.nearToFar = JSON.parse(document.getElementById("distances").textContent);
     this.hidden = new Set();
     this.layer = "overlay";
     this.opacity = 0.55;
-    this.view = new View();
+    this.views = [new View(), new Scene()];
+    this.inPoints = false;
     this.surface = this.open();
     this.connect();
     this.choose(this.items[0]);
@@ -16,6 +18,10 @@ class Viewer {
 
   find(selector) {
     return this.section.querySelector(selector);
+  }
+
+  get view() {
+    return this.views[Number(this.inPoints)];
   }
 
   get items() {
@@ -26,14 +32,14 @@ class Viewer {
     try {
       const surface = GlSurface.open(this.canvas);
       if (surface) return surface;
-      this.say("This browser offers no WebGL 2: images are shown flat.");
+      this.say("This browser offers no WebGL 2: images are shown flat, without points.");
     } catch (error) {
-      this.say(`WebGL does not work here, images are shown flat. ${error.message}`);
+      this.say(`WebGL does not work here, images are shown flat, without points. ${error.message}`);
       const fresh = this.canvas.cloneNode(); // one that had a context cannot have another
       this.canvas.replaceWith(fresh);
       this.canvas = fresh;
     }
-    this.view.projection = "flat";
+    this.views[0].projection = "flat";
     return new FlatSurface(this.canvas);
   }
 
@@ -69,17 +75,26 @@ class Viewer {
 
   show(data, image) {
     this.data = data;
+    this.distances = data.scale && new Distances(data.scale, data.sphere, this.nearToFar);
     const aspect = image.input.width / image.input.height;
-    this.surface.load(image, data.sphere);
-    this.surface.paint(this.classes, this.hidden);
-    this.view.show({ sphere: data.sphere, aspect });
-    if (this.surface.projections.length === 1) this.view.projection = "flat";
-    this.view.resize(this.canvas.clientWidth, this.canvas.clientHeight);
+    this.surface.load(image, data.sphere, this.distances);
+    this.paint();
+    const [view, scene] = this.views;
+    view.show({ sphere: data.sphere, aspect });
+    if (this.surface.projections.length === 1) view.projection = "flat";
+    this.find(".points").hidden = this.surface.projections.length === 1 || !this.distances?.hasPoints;
+    if (this.find(".points").hidden) this.inPoints = false;
+    else scene.show(data.scale, data.sphere);
     this.find(".caption").textContent = [data.name, data.note].filter(Boolean).join(" · ");
     this.offerLayers();
     this.offerProjections();
     this.fillLegend();
     this.redraw();
+  }
+
+  paint() {
+    const colors = this.distances?.colors ?? this.classes.map(({ rgb }) => rgb);
+    this.surface.paint(colors, this.distances ? new Set() : this.hidden);
   }
 
   offers(layer) {
@@ -102,25 +117,50 @@ class Viewer {
     this.layer = layer;
     this.find(`input[name=layer][value=${layer}]`).checked = true;
     this.find(".opacity").hidden = layer !== "overlay";
-    this.find(".errors").hidden = layer !== "error";
+    this.find(".errors").hidden = layer !== "error" || this.distances !== null;
+    this.fillScale();
     this.redraw();
   }
 
   offerProjections() {
     const select = this.find(".projection");
-    select.hidden = !this.data.sphere || this.surface.projections.length === 1;
-    select.value = this.view.projection;
+    const several = this.data.sphere && this.surface.projections.length > 1;
+    select.hidden = !several || this.inPoints;
+    select.value = this.views[0].projection;
+    this.find(".points").setAttribute("aria-pressed", String(this.inPoints));
+  }
+
+  turnPoints() {
+    if (this.find(".points").hidden) return;
+    this.inPoints = !this.inPoints;
+    this.offerProjections();
   }
 
   // Legend ------------------------------------------------------------------------------------
 
   fillLegend() {
-    const columns = LABELS.filter((kind) => this.data[kind]);
+    const columns = this.distances ? [] : MAPS.filter((kind) => this.data[kind]);
     this.find(".legend").hidden = columns.length === 0;
     this.find(".shares").textContent = columns.length ? `share of ${columns.join(" / ")}, %` : "";
     const entries = this.data.shares.map(([index, ...shares]) => this.legendEntry(index, shares));
     this.find(".legend strong").textContent = `Classes (${entries.length})`;
     this.find(".legend ul").replaceChildren(...entries);
+  }
+
+  fillScale() {
+    const scale = this.find(".scale");
+    scale.hidden = !this.distances || this.layer === "input";
+    if (scale.hidden) return;
+    const { noun, unit, limits, colors } = this.distances;
+    const isError = this.layer === "error";
+    const shown = (isError ? [Array(3).fill(242), WRONG] : colors).map((rgb) => `rgb(${rgb.join(" ")})`);
+    const middle = Math.sqrt(limits[0] * limits[1]); // colors follow the logarithm
+    const numbers = [limits[0], middle, limits[1]].map((value) => this.distances.number(value));
+    const ends = isError ? ["0", "0.11", "≥ 0.22"] : numbers;
+    const title = isError ? "|ln(prediction / truth)|" : `${noun}, ${unit}`;
+    scale.querySelector(".title").textContent = title;
+    scale.querySelector(".ramp").style.background = `linear-gradient(to right, ${shown.join(", ")})`;
+    scale.querySelectorAll(".ends span").forEach((end, k) => (end.textContent = ends[k]));
   }
 
   legendEntry(index, shares) {
@@ -139,7 +179,7 @@ class Viewer {
       box.checked = checked;
       this.hidden[checked ? "delete" : "add"](Number(box.value));
     }
-    this.surface.paint(this.classes, this.hidden);
+    this.paint();
     this.redraw();
   }
 
@@ -159,31 +199,50 @@ class Viewer {
     const height = Math.max(1, Math.round(canvas.clientHeight * density));
     if (canvas.width !== width || canvas.height !== height) Object.assign(canvas, { width, height });
     view.resize(canvas.clientWidth, canvas.clientHeight);
-    this.surface.draw(view, this.layer, this.opacity);
+    this.surface.draw(view, this.layer, this.opacity, this.gestures.pointer);
+    this.find(".looking").textContent = this.inPoints ? this.seenFrom(view) : this.lookingAt(view);
+    this.readOut();
+  }
+
+  lookingAt(view) {
     const closer = (view.limits.most / view.extent).toFixed(1);
     const zoom = view.projection === "flat" ? `× ${closer}` : `${view.extent.toFixed(0)}° wide`;
-    this.find(".looking").textContent = `Looking at ${this.place(view)} · ${zoom}`;
-    this.readOut();
+    return `Looking at ${this.place(view)} · ${zoom}`;
+  }
+
+  seenFrom({ longitude, latitude, away }) {
+    const along = this.degrees(longitude, latitude);
+    return `Looking along ${along} · ${this.distances.text(away)} to the middle`;
   }
 
   place({ u, v }) {
     const { sphere, width, height } = this.data;
     if (!sphere) return `column ${Math.floor(u * width)}, row ${Math.floor(v * height)}`;
-    const degrees = (value) => `${value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "−")}°`;
-    return `longitude ${degrees((u - 0.5) * 360)}, latitude ${degrees((0.5 - v) * 180)}`;
+    return this.degrees((u - 0.5) * 360, (0.5 - v) * 180);
+  }
+
+  degrees(...angles) {
+    const text = (value) => `${value.toFixed(1).replace(/^-0\.0$/, "0.0").replace("-", "−")}°`;
+    const [longitude, latitude] = angles.map(text);
+    return `longitude ${longitude}, latitude ${latitude}`;
   }
 
   readOut() {
     const { pointer } = this.gestures;
-    const at = pointer ? this.view.locate(...pointer) : this.view;
-    const found = [];
-    for (const kind of at ? LABELS : []) {
-      const index = this.surface.classAt(kind, at);
-      if (index !== null) found.push(`${kind}: ${this.classes[index]?.name ?? index}`);
-    }
-    const where = pointer && at ? this.place(at) : "in the middle";
+    const inImage = () => (pointer ? this.view.locate(...pointer) : this.view);
+    const at = this.inPoints ? this.surface.picked : inImage();
+    const found = at ? MAPS.map((kind) => this.valueText(kind, at)).filter(Boolean) : [];
+    const where = at && (pointer || this.inPoints) ? this.place(at) : "in the middle";
     const shown = at && (pointer || found.length);
     this.find(".readout").textContent = shown ? [where, ...found].join(" · ") : "";
+  }
+
+  valueText(kind, at) {
+    const bytes = this.surface.valueAt(kind, at);
+    if (!bytes) return null;
+    if (!this.distances) return `${kind}: ${this.classes[bytes[0]]?.name ?? bytes[0]}`;
+    const log = this.distances.log(bytes[0], bytes[1]);
+    return `${kind}: ${log === null ? "unknown" : this.distances.text(Math.exp(log))}`;
   }
 
   // Events ------------------------------------------------------------------------------------
@@ -231,6 +290,7 @@ class Viewer {
       out: () => this.view.zoom(1 / 1.3),
       reset: () => this.view.reset(),
       full: () => this.fullScreen(),
+      points: () => this.turnPoints(),
     };
     if (button.closest(".gallery")) this.choose(button);
     actions[button.dataset.action]?.();
@@ -250,11 +310,12 @@ class Viewer {
     if (elsewhere && event.key.startsWith("Arrow")) return; // moves between radio buttons
     const { view } = this;
     const step = view.half / 8;
+    const drag = event.shiftKey ? "shift" : "pan";
     const actions = {
-      ArrowLeft: () => view.pan(step, 0),
-      ArrowRight: () => view.pan(-step, 0),
-      ArrowUp: () => view.pan(0, step),
-      ArrowDown: () => view.pan(0, -step),
+      ArrowLeft: () => view[drag](step, 0),
+      ArrowRight: () => view[drag](-step, 0),
+      ArrowUp: () => view[drag](0, step),
+      ArrowDown: () => view[drag](0, -step),
       "+": () => view.zoom(1.25),
       "=": () => view.zoom(1.25),
       "-": () => view.zoom(0.8),
@@ -263,6 +324,7 @@ class Viewer {
       PageUp: () => this.neighbor(-1),
       PageDown: () => this.neighbor(1),
       f: () => this.fullScreen(),
+      p: () => this.turnPoints(),
     };
     LAYERS.forEach((layer, k) => (actions[k + 1] = () => this.setLayer(layer)));
     if (!actions[event.key]) return;
