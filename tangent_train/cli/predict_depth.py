@@ -6,14 +6,13 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from datamodules.core.panoramas import ray_lengths
 from datamodules.images.gpano import PanoramaArea
 from tangent_train.checkpoints.distances import is_metric
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
 from tangent_train.errors import SettingError
-from tangent_train.inference.engine import DepthPredictor
+from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.results.depth_results import DepthResults
@@ -55,15 +54,13 @@ class DepthPrediction:
     ) -> PredictedImage:
         """Predict the depth of one image, see `DepthResults`."""
         found = self._predictor.predict(image, progress)
-        depth, facts = found.distance, {}
-        if image.camera_matrix is not None:
-            depth = (depth / ray_lengths(image.camera_matrix, depth.shape)).astype(depth.dtype)
-        if (report := found.report) is not None:
-            facts = {
-                "align": report.mode,
-                "views": report.views,
-                "step_before": report.step_before,
-                "step_after": report.step_after,
-                "views_without_overlap": len(report.isolated),
-            }
+        depth = found.depth(image.camera_matrix).cpu().numpy()
+        report = found.report
+        facts = {
+            "align": report.mode,
+            "views": report.views,
+            "step_before": report.step_before,
+            "step_after": report.step_after,
+            "views_without_overlap": len(report.isolated),
+        }
         return PredictedImage(image, depth if area is None else area.cut(depth), area, facts)
