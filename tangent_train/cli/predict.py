@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Masks
 from datamodules.images.tangent_folders import panorama_area
@@ -21,8 +20,12 @@ from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
-from tangent_train.cli.predict_depth import DepthPrediction
-from tangent_train.cli.predict_labels import LabelPrediction, ReadsImage
+from tangent_train.cli.predict_kinds import (
+    PREDICTIONS,
+    DepthPrediction,
+    LabelPrediction,
+    ReadsImage,
+)
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import check_unread, parse_settings
 from tangent_train.console import print_text
@@ -37,12 +40,6 @@ from tangent_train.results.predictions import (
     PredictionFolder,
     is_result_in,
 )
-
-_Prediction = LabelPrediction | DepthPrediction
-_PREDICTIONS: dict[str, type[_Prediction]] = {
-    PIXEL_CLASSES: LabelPrediction,
-    DISTANCE: DepthPrediction,
-}
 
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
@@ -71,7 +68,7 @@ def predict(config: Mapping[str, Any]) -> None:
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_trained(settings.checkpoint, settings.trust)
     views = _views(settings, trained)
-    prediction = _PREDICTIONS[trained.predicts](settings, trained, views)
+    prediction = PREDICTIONS[trained.predicts](settings, trained, views)
     if isinstance(views, PanoramaViews):
         print_text(f"{prediction.announcement} in {views.description(settings.area)}.")
     results = prediction.results
@@ -183,7 +180,7 @@ class _Images:
     def __init__(
         self,
         settings: PredictSettings,
-        prediction: _Prediction,
+        prediction: LabelPrediction | DepthPrediction,
         folder: PredictionFolder,
         depth: DepthFolder | None,
         shown: Sequence[str],

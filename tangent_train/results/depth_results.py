@@ -27,18 +27,17 @@ _POINTS = 500_000
 _SAMPLES = 2**16
 """Pixels whose median is that of an image."""
 
-_DIGITS = 4
 _ROWS = {
     "known": "known pixels, % of the solid angle",
-    "nearest": "nearest",
-    "median": "median",
-    "farthest": "farthest",
-    "too_far": "too far for depth files, % of the solid angle",
+    "too_far": "too far for 16 bits, unknown in depth files, %",
+    "nearest": "nearest{unit}",
+    "median": "median{unit}",
+    "farthest": "farthest{unit}",
     "step_before": "median step between views before alignment, %",
     "step_after": "median step between views after alignment, %",
-    "views_without_overlap": "views without overlap",
+    "isolated": "views without overlap",
 }
-"""Names of the table's rows, by name in the summary."""
+"""Rows of the table, by name in the summary; shares are in percent."""
 
 
 def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
@@ -125,16 +124,14 @@ class DepthResults(ImageResults):
         self._is_metric = is_metric
         self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
 
-    @property
-    def _unit(self) -> str:
-        return "m" if self._is_metric else "relative"
-
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write depth, a colored picture and points."""
         if "depth" in files:
             write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
         if "color" in files:
-            write_pixels(files["color"], distance_picture(predicted.pixels, self._unit))
+            write_pixels(
+                files["color"], distance_picture(predicted.pixels, "m" if self._is_metric else "")
+            )
         if "points" in files:
             from trimesh import PointCloud  # half a second
 
@@ -151,7 +148,7 @@ class DepthResults(ImageResults):
         self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
     ) -> NDArray[np.uint8]:
         """Color depth by the range of all frames of the video."""
-        ranges = [entry["depth"]["colors"] for entry in entries if entry["depth"]["known"]]
+        ranges = [c for entry in entries if (c := entry["depth"].get("colors"))]
         near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
         return colorize_distance(pixels, (min(near), max(far)))
 
@@ -160,29 +157,27 @@ class DepthResults(ImageResults):
         depth, shares = predicted.pixels, np.zeros(3)
         counts = np.broadcast_to(is_counted, depth.shape)
         for line, weights, counted in zip(depth, solid_angles(predicted), counts, strict=True):
-            masks = np.stack([counted, np.isfinite(line), line > self._most])
-            shares += masks @ weights
+            shares += np.stack([counted, np.isfinite(line), line > self._most]) @ weights
         known, too_far = shares[1:] / (shares[0] or 1)
-        samples = depth[tuple(spread_pixels(predicted, _SAMPLES))]
-        ends = (np.nanmin, np.nanmax) if known else ()
-        nearest, farthest = (end(depth) for end in ends) if known else (None, None)
-        distances = nearest, np.median(samples) if known else None, farthest
-        names = ("known", "too_far", "nearest", "median", "farthest")
-        facts = dict(zip(names, map(_rounded, (known, too_far, *distances)), strict=True))
-        colors = [_rounded(limit) for limit in distance_limits(depth)]
-        return {"unit": self._unit, **facts, "colors": colors, **predicted.facts}
+        facts = {"known": known, "too_far": too_far, **predicted.facts}
+        summary: dict[str, Any] = {"unit": "m" if self._is_metric else "relative"}
+        if known:
+            median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
+            facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
+            summary["colors"] = [float(f"{limit:.4g}") for limit in distance_limits(depth)]
+        return summary | {
+            name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
+            for name, value in facts.items()
+        }
 
     def table(self, entries: Sequence[Entry]) -> Table:
         """Return the means of the summaries over the images."""
-        rows = []
+        rows, unit = [], ", m" if self._is_metric else ""
         for name, title in _ROWS.items():
             values = [v for e in entries if (v := e["depth"].get(name)) is not None]
-            share = title.partition(", ")[2].startswith("%")
-            if values and (any(values) or name == "known"):
-                unit = (
-                    ", m" if self._is_metric and name in ("nearest", "median", "farthest") else ""
-                )
-                rows.append([title + unit, f"{np.mean(values) * (100 if share else 1):.3g}"])
+            if any(values):
+                mean = np.mean(values) * (100 if "%" in title else 1)
+                rows.append([title.format(unit=unit), f"{mean:.3g}"])
         kind = "depth in meters" if self._is_metric else "relative depth: the median is 1"
         return Table(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
 
@@ -193,9 +188,5 @@ class DepthResults(ImageResults):
             distance = area.place(distance)  # 0 outside: unknown
         elif image.camera_matrix is not None:
             distance = distance * ray_lengths(image.camera_matrix, distance.shape)
-        how = {"is_metric": self._is_metric, "camera_matrix": image.camera_matrix}
+        how: dict[str, Any] = {"is_metric": self._is_metric, "camera_matrix": image.camera_matrix}
         return encode_image(name, image.rgb, distance=distance, sphere=area is not None, **how)
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else float(f"{value:.{_DIGITS}g}")

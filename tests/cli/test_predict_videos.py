@@ -240,8 +240,9 @@ def test_depth_of_an_interrupted_video(
 ) -> None:
     """It is the same as without interruption; the video has one range of colors."""
     video = _write_video(tmp_path / "in" / "walk.mp4")
-    settings = {"checkpoint": write_depth_checkpoint(tmp_path / "net.ckpt"), "input": video}
-    settings |= {"write": "[depth,color,points]", "points": 100, "report": 2}
+    checkpoint = write_depth_checkpoint(tmp_path / "net.ckpt")
+    settings: dict[str, Any] = {"checkpoint": checkpoint, "input": video}
+    settings |= {"write": "[depth,color,points]", "points": 100, "align": "none"}
     predict(**settings, output="whole")
 
     def interrupted(path: Path, *arguments: int) -> Any:
@@ -255,8 +256,8 @@ def test_depth_of_an_interrupted_video(
         with pytest.raises(SystemExit):
             predict(**settings)
     assert "4 of 7 images are done. Continue with resume=true" in capsys.readouterr().out
-    with pytest.raises(SystemExit, match="resume: found align=none, which differs"):
-        predict(**settings, resume="true", align="none")
+    with pytest.raises(SystemExit, match="resume: found align=scale, which differs"):
+        predict(**(settings | {"align": "scale"}), resume="true")
     kept = tmp_path / "out" / "depth" / "walk" / "000003.png"
     before = kept.stat().st_mtime_ns
     entries = predict(**settings, resume="true")
@@ -269,8 +270,8 @@ def test_depth_of_an_interrupted_video(
     near = min(entry["depth"]["colors"][0] for entry in entries.values())
     far = max(entry["depth"]["colors"][1] for entry in entries.values())
     depth = np.stack([read_png(path) for path in sorted(kept.parent.glob("*.png"))]) / 1000
-    expected = np.stack([colorize_distance(frame, (near, far)) for frame in depth])
+    colors = np.stack([colorize_distance(frame, (near, far)) for frame in depth])
     made, _ = _decoded(tmp_path / "out" / "color" / "walk.mp4")
-    assert np.abs(made - expected.astype(float)).mean() < 8
+    assert np.abs(made - colors.astype(float)).mean() < 8
     with pytest.raises(SystemExit, match="write: found color of a video without depth"):
         predict(**(settings | {"write": "[color]"}), output="other")
