@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from models.fcn_resnet import FCNResNet as FCNResNet
     from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
     from models.hexunet import HexUNet as HexUNet
+    from models.huggingface import HuggingFaceDepthNetwork as HuggingFaceDepthNetwork
     from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
     from models.icocnn import IcoCNN as IcoCNN
     from models.icosphere_unet import IcosphereUNet as IcosphereUNet
@@ -35,6 +36,7 @@ _FILES = {
     "FCNResNet": "fcn_resnet",
     "HarmonicNetwork": "harmonic_network",
     "HexUNet": "hexunet",
+    "HuggingFaceDepthNetwork": "huggingface",
     "HuggingFaceNetwork": "huggingface",
     "IcoCNN": "icocnn",
     "IcosphereUNet": "icosphere_unet",

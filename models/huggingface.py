@@ -1,7 +1,8 @@
-"""Segmentation networks from transformers, built from plain settings."""
+"""Networks for segmentation and depth from transformers, built from plain settings."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from inspect import signature
 from typing import Any
@@ -12,13 +13,20 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.unet import check_sides
-from tangent_train.errors import SettingError, of_extra
+from tangent_train.errors import SettingError, of_extra, width_height
 from tangent_train.registry import registered
 from tangent_train.setting_rules import flat_settings
 
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
 _Section = Mapping[str, _Values | Mapping[str, _Values]]
+_Config = Mapping[str, _Values | _Section | Sequence[Mapping[str, _Values]]]
+
+SEGMENTATION = "SEMANTIC_SEGMENTATION", "UNIVERSAL_SEGMENTATION"
+"""Tasks of networks that return classes, in the names of transformers' mappings."""
+
+DEPTH = "DEPTH_ESTIMATION"
+"""Task of networks that return depth."""
 
 _MASK2FORMER = (384, 384)
 """Rows and columns to which Mask2Former's masks are resized before they are added
@@ -74,8 +82,78 @@ def _patch_size(config: Any) -> int:
     return int(size if isinstance(size, int) else max(size))
 
 
+class _TransformersNetwork(nn.Module):
+    """A network from transformers with random weights, built from plain settings.
+
+    Args:
+        config: `architecture` of the network, with ``model_type``.
+        tasks: Names of its possible tasks in the names of transformers' mappings and classes.
+        bgr: True if the network takes BGR images.
+        **labels: Further settings of the network.
+
+    Attributes:
+        network: The network of transformers.
+
+    Raises:
+        SettingError: transformers lacks the network or is missing, or `config` holds more than its
+            `architecture`.
+    """
+
+    def __init__(
+        self, config: Mapping[str, Any], tasks: Sequence[str], bgr: bool, **labels: Any
+    ) -> None:
+        super().__init__()
+        known = architecture(config)
+        unknown = dict(flat_settings(config)).keys() - dict(flat_settings(known)).keys()
+        if unknown:
+            raise SettingError(
+                f"network.config.{min(unknown)}",
+                found="a value",
+                expected=f"settings that transformers declares for {known['model_type']}",
+            )
+        import transformers as hf
+
+        kind = known["model_type"]
+        fitting = [task for task in tasks if kind in network_types(task)]
+        if not fitting:
+            names = sorted({name for task in tasks for name in network_types(task)})
+            words = " or ".join(task.lower().replace("_", " ") for task in tasks)
+            raise SettingError(
+                "network.config.model_type",
+                found=kind,
+                expected=f"a network for {words} ({', '.join(names)})",
+            )
+        made = hf.AutoConfig.for_model(**known, **labels)
+        auto: Any = getattr(hf, f"AutoModelFor{fitting[0].title().replace('_', '')}")
+        self.network: Any = auto.from_config(made, trust_remote_code=False)
+        self._bgr = bgr
+        self._patch = _patch_size(made)
+
+    def _prepared(self, images: Tensor) -> Tensor:
+        """Return images with the network's order of channels.
+
+        Raises:
+            SettingError: The images cannot be divided into the network's patches.
+        """
+        if self._bgr:
+            images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
+        check_sides(images, self._patch, type(self.network).__name__)
+        return images
+
+
+def network_types(task: str) -> set[str]:
+    """Return the ``model_type`` of all networks that transformers has for a task.
+
+    Args:
+        task: Name of the task in the name of the mapping, e.g. ``DEPTH_ESTIMATION``.
+    """
+    import transformers
+
+    return {made.model_type for made in getattr(transformers, f"MODEL_FOR_{task}_MAPPING")}
+
+
 @registered
-class HuggingFaceNetwork(nn.Module):
+class HuggingFaceNetwork(_TransformersNetwork):
     """Network from transformers for semantic or universal segmentation, with random weights.
 
     Args:
@@ -95,40 +173,13 @@ class HuggingFaceNetwork(nn.Module):
 
     def __init__(
         self,
-        config: Mapping[str, _Values | _Section],
+        config: _Config,
         num_classes: int,
         bgr: bool = False,
         task: Sequence[int] | None = None,
     ) -> None:
-        super().__init__()
-        known = architecture(config)
-        unknown = dict(flat_settings(config)).keys() - dict(flat_settings(known)).keys()
-        if unknown:
-            raise SettingError(
-                f"network.config.{min(unknown)}",
-                found="a value",
-                expected=f"settings that transformers declares for {known['model_type']}",
-            )
-        import transformers as hf
-
-        kind = config.get("model_type")
-        semantic = {made.model_type for made in hf.MODEL_FOR_SEMANTIC_SEGMENTATION_MAPPING}
-        universal = {made.model_type for made in hf.MODEL_FOR_UNIVERSAL_SEGMENTATION_MAPPING}
-        if kind not in semantic | universal:
-            raise SettingError(
-                "network.config.model_type",
-                found=kind,
-                expected="a network for semantic segmentation "
-                f"({', '.join(sorted(semantic | universal))})",
-            )
-        made = hf.AutoConfig.for_model(**known, num_labels=num_classes)
-        self.is_universal = kind not in semantic
-        auto: Any = hf.AutoModelForSemanticSegmentation
-        if self.is_universal:
-            auto = hf.AutoModelForUniversalSegmentation
-        self.network: Any = auto.from_config(made, trust_remote_code=False)
-        self._bgr = bgr
-        self._patch = _patch_size(made)
+        super().__init__(config, SEGMENTATION, bgr, num_labels=num_classes)
+        self.is_universal = config["model_type"] not in network_types(SEGMENTATION[0])
         tokens = None if task is None else torch.tensor([list(task)])
         self._task: Tensor | None
         self.register_buffer("_task", tokens, persistent=False)
@@ -144,10 +195,8 @@ class HuggingFaceNetwork(nn.Module):
         Raises:
             SettingError: The images cannot be divided into the network's patches.
         """
-        if self._bgr:
-            images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
+        images = self._prepared(images)
         size = (images.shape[-2], images.shape[-1])
-        check_sides(images, self._patch, type(self.network).__name__)
         task = {} if self._task is None else {"task_inputs": self._task.expand(len(images), -1)}
         returned = self.network(pixel_values=images, **task)
         masks = returned.get("masks_queries_logits", returned.get("pred_masks"))
@@ -162,3 +211,67 @@ class HuggingFaceNetwork(nn.Module):
         scores = torch.einsum("bqc,bqhw->bchw", of_masks, masks.float().sigmoid())
         scores = functional.interpolate(scores, size, mode="bilinear")
         return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
+
+
+_BILINEAR = ("depth_pro", "tipsv2_dpt")
+"""Networks whose depth is resized bilinearly, others bicubically, as in the library: see
+``post_process_depth_estimation`` of their image processors."""
+
+
+@registered
+class HuggingFaceDepthNetwork(_TransformersNetwork):
+    """Network from transformers for depth of photos, with random weights.
+
+    Args:
+        config: `architecture` of the network, with ``model_type``.
+        bgr: True if the network takes BGR images.
+        padded: True if images are mirrored at their borders and then reduced to their size, as the
+            image processor of ZoeDepth does.
+
+    Attributes:
+        network: The network of transformers.
+
+    Raises:
+        SettingError: transformers lacks the network or is missing, or `config` holds more than its
+            `architecture`.
+    """
+
+    def __init__(self, config: _Config, bgr: bool = False, padded: bool = False) -> None:
+        super().__init__(config, (DEPTH,), bgr)
+        self._padded = padded
+        self._resizing = "bilinear" if config["model_type"] in _BILINEAR else "bicubic"
+        made = self.network.config
+        self._voting = len(getattr(made, "bin_configurations", ())) > 1
+        ratios = getattr(made, "scaled_images_ratios", None)
+        self._side = None if ratios is None else round(made.patch_size / min(ratios))
+
+    def forward(
+        self, images: Float[Tensor, "batch channels height width"]
+    ) -> Float[Tensor, "batch 1 height width"]:
+        """Return the network's depth of every pixel, after the library's post-processing.
+
+        Raises:
+            SettingError: The images cannot be divided into the network's patches.
+        """
+        images = self._prepared(images)
+        size = height, width = images.shape[-2], images.shape[-1]
+        if self._side is not None and size != (self._side, self._side):  # Depth Pro
+            raise SettingError(
+                f"image size for {type(self.network).__name__}",
+                found=width_height(size),
+                expected=width_height((self._side, self._side)),
+            )
+        # Reflected pixels at each border (``ZoeDepthImageProcessor._pad_images``).
+        down, right = (int(3 * math.sqrt(n / 2)) if self._padded else 0 for n in size)
+        if self._padded:
+            borders = (right, right, down, down)
+            images = functional.pad(images, borders, mode="reflect")
+            images = functional.interpolate(images, size, mode="bilinear", align_corners=True)
+        # ZoeDepth's networks for two kinds of scenes choose one for all images of a call.
+        parts = torch.split(images, 1) if self._voting else [images]
+        depth = torch.cat([self.network(pixel_values=part)["predicted_depth"] for part in parts])
+        depth = depth[:, None]
+        whole = height + 2 * down, width + 2 * right
+        if depth.shape[-2:] != whole:
+            depth = functional.interpolate(depth, whole, mode=self._resizing)
+        return depth[..., down : down + height, right : right + width]

@@ -34,13 +34,20 @@ ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "lab
 """
 
 DepthKind = Literal[
-    "log_distance", "metric_distance", "metric_z", "relative_depth", "relative_disparity"
+    "log_distance",
+    "metric_distance",
+    "metric_z",
+    "canonical_inverse",
+    "relative_depth",
+    "relative_disparity",
 ]
 """Output of a depth network, a channel of values at the pixels of its images.
 
 * `log_distance`: natural logarithm of the distance along the ray in meters; trained by `DepthTask`.
 * `metric_distance`: distance along the ray in meters.
 * `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
+* `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of
+  Depth Pro; z-depth is proportional to the focal length.
 * `relative_depth`: z-depth up to a scale and a shift per image.
 * `relative_disparity`: 1 / z-depth up to a scale and a shift per image.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -11,6 +12,8 @@ from torch.nn import functional
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.scores import plain_scores
 from tangent_train.errors import SettingError
+
+_FARTHEST_M = 1e4
 
 _MAP = 3
 """Number of dimensions of depth without an axis of channels."""
@@ -80,8 +83,45 @@ def is_disparity(kind: DepthKind) -> bool:
 
 
 def is_metric(kind: DepthKind) -> bool:
-    """Return True if distances are in meters, False if only their ratios are known."""
+    """Return True if distances are in meters, False if only their ratios are known.
+
+    `canonical_inverse` counts as meters: `uncanonical` converts it before anything else.
+    """
     return not kind.startswith("relative")
+
+
+def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Tensor, DepthKind]:
+    """Convert `canonical_inverse` to `metric_z`; other kinds are returned unchanged.
+
+    The inverse depth C is divided by the focal length in image widths (Bochkovskii et al. 2024,
+    section 3.2). That follows from the rays: at columns of distance d, the second difference of
+    1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as in
+    the authors' code.
+
+    Args:
+        depth: Values of whole images, ``(n, 1, h, w)``.
+        kind: Kind of the values.
+        ray_lengths: ``(1 or n, 1, h, w)``, see `Views.ray_lengths`.
+
+    Returns:
+        Values, and their kind.
+    """
+    if kind != "canonical_inverse":
+        return depth, kind
+    width = ray_lengths.shape[-1]
+    if width == 1:  # not a pinhole image: the radians of an equirectangular image
+        span: Any = 2 * math.pi
+    else:
+        half = (width - 1) // 2
+        left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+        squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+        span = squared.sqrt() * width / half
+    return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+
+
+def _check_kind(kind: DepthKind) -> None:
+    if kind == "canonical_inverse":
+        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
 
 
 def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
@@ -97,6 +137,7 @@ def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
         logarithm of the distance. NaN where the depth is not finite, or not positive where its
         logarithm is taken.
     """
+    _check_kind(kind)
     if kind == "log_distance":
         values = depth
     elif is_disparity(kind):
@@ -115,6 +156,7 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
         kind: Kind of the result.
         ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
     """
+    _check_kind(kind)
     if kind == "log_distance":
         return distance.log()
     if kind == "metric_distance":

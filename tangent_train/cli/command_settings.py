@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import datamodules
-from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.content import DepthKind, ScoreKind
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.errors import DataError
 
@@ -185,6 +185,7 @@ class ImportSettings:
     unknown_classes: tuple[str, ...]
     unknown_wins: bool
     scores: ScoreKind | None
+    depth: DepthKind | None
     image_size: tuple[int, ...] | None
     views: str | dict[str, Any] | None
     levels: tuple[int, ...] | None

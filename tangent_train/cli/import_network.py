@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from rich import get_console
 from rich.text import Text
 
-from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.content import DepthKind, ScoreKind
 from tangent_train.cli.command_settings import ImportSettings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
@@ -37,6 +37,18 @@ _OUTPUTS: dict[ScoreKind, str] = {
     "labels": "label maps, of which other values are unknown",
 }
 
+_DEPTHS: dict[DepthKind, str] = {
+    "log_distance": "the logarithm of the distance in meters",
+    "metric_distance": "the distance along each ray in meters",
+    "metric_z": "z-depth in meters",
+    "canonical_inverse": "1 / z-depth in meters, times the focal length of a view in widths",
+    "relative_depth": "z-depth up to a scale and a shift of each view",
+    "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
+}
+
+_OF_CLASSES = ("classes", "unknown_classes", "scores")
+"""Settings that depth networks do not have, beside ``unknown_wins``."""
+
 
 def import_network(config: Mapping[str, Any]) -> None:
     """Write a photo network as a checkpoint and print what was understood.
@@ -59,6 +71,8 @@ def import_network(config: Mapping[str, Any]) -> None:
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings, config["normalization"])
+        _check_kind(settings, network)
+        remarks = list(network.remarks)
         trained = photo_networks.import_network(
             network,
             output,
@@ -70,9 +84,10 @@ def import_network(config: Mapping[str, Any]) -> None:
             unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
+            remark=remarks.append,
         )
     print_text(_understood(output, trained, settings))
-    for remark in network.remarks:
+    for remark in remarks:
         print_text(remark)
 
 
@@ -89,26 +104,40 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
 
 def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
-    name, classes = settings.network, settings.classes
+    name, classes, depth = settings.network, settings.classes, settings.depth
     if name in _LIBRARIES:
         with elsewhere():
             library = import_module(f"tangent_train.inference.photo_networks.{name}")
         model, weights = settings.model, settings.weights
         network: PhotoNetwork = library.load(
-            model=model, weights=weights, classes=classes, normalization=normalization
+            model=model, weights=weights, classes=classes, normalization=normalization, depth=depth
         )
         return network
     from tangent_train.inference.photo_networks import own_files
 
     if name == "onnx":
-        return own_files.load_onnx(settings.file, classes, normalization)
+        return own_files.load_onnx(settings.file, classes, normalization, depth)
     try:
         config: Any = compose("import", [f"+network@section={name}"])
     except MissingConfigException as error:
         known = ", ".join((*_LIBRARIES, "onnx", *(error.options or ())))
         raise SettingError("network", found=name, expected=f"of {known}") from error
     section: Any = OmegaConf.to_container(config.section)
-    return own_files.load_config(section, settings.weights, classes, normalization)
+    return own_files.load_config(section, settings.weights, classes, normalization, depth)
+
+
+def _check_kind(settings: ImportSettings, network: PhotoNetwork) -> None:
+    """Refuse settings of depth networks for one that predicts classes, and the reverse."""
+    is_depth = network.depth_kind is not None
+    given = [name for name in (_OF_CLASSES if is_depth else ("depth",)) if getattr(settings, name)]
+    given += ["unknown_wins"] * (is_depth and not settings.unknown_wins)
+    for name in given:
+        predicted = "depth" if is_depth else "classes"
+        raise SettingError(
+            name,
+            found=getattr(settings, name),
+            expected=f"its default, because the network predicts {predicted}",
+        )
 
 
 def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:
@@ -120,10 +149,11 @@ def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -
     numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
     size = width_height(trained.fixed_size) if trained.fixed_size else "any"
     multiple = f", multiples of {trained.size_multiple}" if trained.size_multiple > 1 else ""
+    kind = trained.depth_kind
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB",
-        f"{len(names)} classes: {', '.join(names)}",
-        f"the network returns {_OUTPUTS[trained.score_kind]}",
+        f"{len(names)} classes: {', '.join(names)}" if kind is None else f"depth: {kind}",
+        f"the network returns {_OUTPUTS[trained.score_kind] if kind is None else _DEPTHS[kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
         f"panoramas: {PanoramaViews(trained).description()}",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any, get_args
 
@@ -17,6 +18,7 @@ from tangent_train.checkpoints.distances import (
     distance_of,
     from_distance,
     is_disparity,
+    uncanonical,
 )
 from tangent_train.checkpoints.scores import network_for_views, size_multiple_of
 from tangent_train.checkpoints.trained import describe_network, load_trained
@@ -30,6 +32,12 @@ def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> 
     """A plane 2 m in front of the camera: its z-depth is 2 m, its distance 2 m · ray length."""
     lengths = torch.linspace(1, 3, 12, dtype=torch.float64).reshape(1, 3, 4)
     distance = 2 * lengths
+    if kind == "canonical_inverse":
+        with pytest.raises(ValueError, match="uncanonical first"):
+            from_distance(distance, kind, lengths)
+        with pytest.raises(ValueError, match="uncanonical first"):
+            along_rays(distance, kind, lengths)
+        return
     output = from_distance(distance, kind, lengths)
     expected: Any = {
         "log_distance": distance.log(),
@@ -43,6 +51,24 @@ def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> 
     blended = 1 / distance if is_disparity(kind) else distance.log()
     torch.testing.assert_close(values, blended)
     torch.testing.assert_close(distance_of(values, kind), distance)
+
+
+def test_canonical_depth_is_multiplied_by_the_focal_length_in_widths() -> None:
+    """For views of 90°, 10°, mirrored crops beside the axis, and equirectangular images."""
+    depth = torch.linspace(0.1, 2, 96, dtype=torch.float64).reshape(2, 1, 6, 8)
+    for fov_deg, shift, columns in ((90, 0.0, 8), (10, 0.4, 8), (10, 0.4, 7)):
+        pitch = 2 * math.tan(math.radians(fov_deg) / 2) / columns
+        x = (torch.arange(columns) - (columns - 1) / 2) * pitch + shift
+        y = (torch.arange(6) - 2.5) * pitch
+        lengths = (1 + x**2 + y[:, None] ** 2).sqrt()[None, None].float()
+        found, kind = uncanonical(depth[..., :columns], "canonical_inverse", lengths.flip(-1))
+        assert kind == "metric_z"
+        torch.testing.assert_close(
+            found, 1 / (depth[..., :columns] * columns * pitch), rtol=1e-4, atol=0
+        )
+    whole, kind = uncanonical(depth, "canonical_inverse", torch.ones(1, 1, 1, 1))
+    torch.testing.assert_close(whole, 1 / (depth * 2 * math.pi))
+    assert uncanonical(depth, "relative_depth", lengths) == (depth, "relative_depth")
 
 
 def test_values_without_a_distance_are_unknown() -> None:

@@ -1,4 +1,4 @@
-"""Load segmentation networks of transformers, from the Hugging Face hub or a folder."""
+"""Load networks of transformers for segmentation or depth, from the hub or a folder."""
 
 from __future__ import annotations
 
@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.inputs import Normalization
-from models.huggingface import HuggingFaceNetwork, architecture
+from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
+from tangent_train.checkpoints.content import DepthKind
 from tangent_train.errors import DataError, first_line
 from tangent_train.imports import hide_output, offline
+from tangent_train.inference.photo_networks.depth_kinds import declared_kind
 from tangent_train.inference.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
@@ -25,6 +27,13 @@ from tangent_train.registry import SettingsFile, build_from_config
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is semantic"
+_LEFT_OUT = ("use_auxiliary_head", "use_fov_model")
+"""Parts of networks that are not used: a head for training, and the field of view of Depth Pro,
+which is known here."""
+
+_PADDED = "zoedepth"
+"""Network whose images are padded before they are resized, see `HuggingFaceDepthNetwork`."""
+
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
 _SIDE = 32
@@ -37,8 +46,15 @@ _LISTED = 4
 """Largest number of wrong tensors in a message."""
 
 
-def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
-    """Load a network of transformers for semantic or universal segmentation.
+def load(
+    *,
+    model: str | None,
+    classes: Path | None,
+    normalization: Any,
+    depth: DepthKind | None = None,
+    **_: Any,
+) -> PhotoNetwork:
+    """Load a network of transformers for semantic or universal segmentation, or for depth.
 
     Code from the model's author is not run, and weights are only read from safetensors files.
 
@@ -46,6 +62,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
         model: Name on the hub, or a folder written by ``save_pretrained``.
         classes: JSON file of the class names; None for the names in the model's config.
         normalization: See `Normalization.of`; None for that of the model's image processor.
+        depth: Kind of depth; None for that of the model's config.
 
     Raises:
         DataError: A file is missing, or cannot be fetched or used.
@@ -53,24 +70,27 @@ def load(*, model: str | None, classes: Path | None, normalization: Any, **_: An
     """
     folder = saved_folder(model)
     with offline():
-        return _from_folder(folder, classes, normalization)
+        return _from_folder(folder, classes, normalization, depth)
 
 
-def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> PhotoNetwork:
+def _from_folder(
+    folder: Path, classes: Path | None, normalization: Any, depth: DepthKind | None
+) -> PhotoNetwork:
     config, path = json_in(folder, "config.json"), folder / "config.json"
+    described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
+    kind = declared_kind(config, path, depth) if _predicts_depth(config, path, depth) else None
     labels = config.get("id2label")
     if isinstance(labels, dict):
         labels = {index: str(name).strip() for index, name in labels.items()}
-    names = names_of(labels, path, _NAMES)
-    described = architecture(config | {"use_auxiliary_head": False})
+    names = names_of(labels, path, _NAMES) if kind is None else ()
     processor = _processor(folder)
-    settings = {
-        "_target_": "models.HuggingFaceNetwork",
-        "config": described,
-        "num_classes": len(names),
-        "bgr": bool(processor.get("do_flip_channel_order")),
-    }
-    if config.get("model_type") == "oneformer":
+    settings = {"config": described, "bgr": bool(processor.get("do_flip_channel_order"))}
+    if kind is None:
+        settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
+    else:
+        padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
+        settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
+    if described["model_type"] == "oneformer":
         settings["task"] = _task(folder, config)
     network = build_from_config(settings, "network", SettingsFile(path))
     if len(names) == 1 and network.is_universal:
@@ -87,7 +107,28 @@ def _from_folder(folder: Path, classes: Path | None, normalization: Any) -> Phot
         normalization=given or Normalization(processor["mean"], processor["std"]),
         image_size=_image_size(processor, folder),
         score_kind="logits",
+        depth_kind=kind,
         remarks=remarks,
+    )
+
+
+def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | None) -> bool:
+    """Return True for a depth network; if transformers has both, its architecture decides."""
+    kind = config["model_type"]
+    tasks = [task for task in (DEPTH, *SEGMENTATION) if kind in network_types(task)]
+    if DEPTH not in tasks or len(tasks) == 1:
+        return DEPTH in tasks
+    names = ", ".join(map(str, config.get("architectures") or ()))
+    if "DepthEstimation" in names or "Segmentation" in names:
+        return "DepthEstimation" in names
+    if depth is not None:
+        return True
+    raise DataError(
+        path,
+        found=f"architectures: {names or 'none'}",
+        expected=f"a {kind} network …ForDepthEstimation or …ForSemanticSegmentation",
+        remedy="Set depth=, e.g. metric_z, to import its depth. For its classes, name the second "
+        "architecture in the file.",
     )
 
 
@@ -223,7 +264,7 @@ def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
     return [token * mask for token, mask in masked]
 
 
-def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folder: Path) -> None:
+def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> None:
     """Load weights with transformers, which maps tensor names of its older versions."""
     inner = network.network
     with hide_output():
@@ -241,7 +282,7 @@ def _load_tensors(network: HuggingFaceNetwork, tensors: dict[str, Tensor], folde
         raise DataError(
             folder,
             found=f"other weights: {', '.join(wrong[:_LISTED])}",
-            expected=f"weights of {type(inner).__name__} as described in config.json, for the "
-            "classes in its id2label",
+            expected=f"weights of {type(inner).__name__} as described in config.json"
+            + ", for the classes in its id2label" * hasattr(network, "is_universal"),
         )
     inner.load_state_dict(loaded.state_dict())

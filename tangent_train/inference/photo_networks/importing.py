@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
 from datamodules.images.image_files import composed
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import (
     ClassScoreNetwork,
     Groups,
@@ -27,6 +29,7 @@ from tangent_train.checkpoints.trained import (
 from tangent_train.errors import SettingError, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import vertex_resolution
+from tangent_train.inference.photo_networks.depth_kinds import try_depth
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
 from tangent_train.inference.representations import (
@@ -52,6 +55,7 @@ def import_network(
     unknown_wins: bool = True,
     image_size: tuple[int, int] | None = None,
     score_kind: ScoreKind | None = None,
+    remark: Callable[[str], object] = lambda sentence: None,
 ) -> TrainedNetwork:
     """Try a photo network, write it as a checkpoint and read it again.
 
@@ -68,6 +72,7 @@ def import_network(
             training, and for other sizes if it supports them.
         score_kind: Kind of the network's output; None for the kind that its library declares, or to
             find it by trial.
+        remark: Called with each sentence about something that looks wrong.
 
     Returns:
         The network, read from the file.
@@ -84,17 +89,25 @@ def import_network(
         )
     if image_size is not None:
         network = replace(network, image_size=image_size, fixed_size=True)
-    kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
-    names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
-    scores = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
-    multiple = None if network.fixed_size else size_multiple_of(scores, 3)
+    tried: DistanceNetwork | ClassScoreNetwork
+    if network.depth_kind is not None:
+        outputs: dict[str, Any] = {"class_names": (), "depth_kind": network.depth_kind}
+        tried = DistanceNetwork(network.network, network.depth_kind)
+        for sentence in try_depth(network):
+            remark(sentence)
+    else:
+        kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
+        names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
+        outputs = {"class_names": tuple(names), "groups": groups, "score_kind": kind}
+        tried = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
+    multiple = None if network.fixed_size else size_multiple_of(tried, 3)
     # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
     seen = photo_network_settings(side, levels, base_level, views)
     size = build_from_config(seen, "representation").image_size
     described = TrainedNetwork(
         inner=network.network,
-        class_names=tuple(names),
+        **outputs,
         inputs=("rgb",),
         normalization=network.normalization,
         level=seen["level"],
@@ -103,8 +116,6 @@ def import_network(
         size_multiple=multiple or 1,
         fixed_size=None if multiple else network.image_size,
         photo_level=_photo_level(network.image_size[1], fov_deg),
-        groups=groups,
-        score_kind=kind,
         settings=network.settings,
     )
     check_size(described, described.image_size)

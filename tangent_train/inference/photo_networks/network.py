@@ -10,7 +10,7 @@ from typing import Any
 from torch import nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.content import DepthKind, ScoreKind
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 from tangent_train.registry import is_class_name
@@ -25,14 +25,16 @@ class PhotoNetwork:
 
     Attributes:
         network: Maps normalized RGB images ``(B, 3, h, w)`` to scores ``(B, K, h, w)``, to a dict
-            that contains them under ``"out"``, or to label maps ``(B, h, w)``.
+            that contains them under ``"out"``, to label maps ``(B, h, w)``,
+            or to depth ``(B, 1, h, w)`` or ``(B, h, w)``.
         settings: Section of a config that builds the network; None for an ONNX file.
-        score_names: Name of each score.
+        score_names: Name of each score; none for depth.
         normalization: Normalization of the images.
         image_size: Rows and columns of the training images.
         fixed_size: True if the network only takes images of this size.
         score_kind: Kind of the network's output if its library declares it; None to find it by
             trial.
+        depth_kind: Kind of depth that the network predicts; None for classes.
         remarks: Sentences to print for the user.
     """
 
@@ -43,6 +45,7 @@ class PhotoNetwork:
     image_size: tuple[int, int] = USUAL_SIZE
     fixed_size: bool = False
     score_kind: ScoreKind | None = None
+    depth_kind: DepthKind | None = None
     remarks: Sequence[str] = ()
 
 

@@ -9,19 +9,23 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors, tensors_for
+from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.trained import completed_settings
 from tangent_train.errors import SettingError
 from tangent_train.inference.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
 from tangent_train.registry import build_from_config
 
 
-def load_onnx(file: Path | None, classes: Path | None, normalization: Any) -> PhotoNetwork:
+def load_onnx(
+    file: Path | None, classes: Path | None, normalization: Any, depth: DepthKind | None = None
+) -> PhotoNetwork:
     """Load a network from an ONNX file, see `OnnxNetwork`.
 
     Args:
         file: ONNX file.
         classes: JSON file of the class names.
         normalization: See `Normalization.of`.
+        depth: Kind of depth; None for a network that predicts classes.
 
     Raises:
         DataError: A file cannot be used.
@@ -33,10 +37,11 @@ def load_onnx(file: Path | None, classes: Path | None, normalization: Any) -> Ph
     return PhotoNetwork(
         network=network,
         settings=None,
-        score_names=class_names_in(classes),
+        score_names=() if depth else class_names_in(classes),
         normalization=Normalization.of(normalization, 3),
         image_size=network.image_size or USUAL_SIZE,
         fixed_size=network.image_size is not None,
+        depth_kind=depth,
     )
 
 
@@ -45,6 +50,7 @@ def load_config(
     weights: str | Path | None,
     classes: Path | None,
     normalization: Any,
+    depth: DepthKind | None = None,
 ) -> PhotoNetwork:
     """Load a network that is described by a config of ``configs/network``.
 
@@ -53,6 +59,7 @@ def load_config(
         weights: File of the network's state dict.
         classes: JSON file of the class names.
         normalization: See `Normalization.of`.
+        depth: Kind of depth; None for a network that predicts classes.
 
     Raises:
         DataError: A file cannot be used.
@@ -60,8 +67,9 @@ def load_config(
     """
     if weights is None:
         raise SettingError("weights", found="none", expected="a file with the network's tensors")
-    names = class_names_in(classes)
-    whole = completed_settings(settings, 3, len(names), restored=True)
+    names = () if depth else class_names_in(classes)
+    whole = completed_settings(settings, 3, 1 if depth else len(names), restored=True)
     network = build_from_config(whole, "network")
     load_tensors(network, tensors_for(network, Path(weights)), weights)
-    return PhotoNetwork(network, whole, names, Normalization.of(normalization, 3))
+    normalized = Normalization.of(normalization, 3)
+    return PhotoNetwork(network, whole, names, normalized, depth_kind=depth)

@@ -85,8 +85,8 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     network.network.eval()
     stated, named = network.score_kind, len(network.score_names)
     kind, tried = stated, []
-    for image in _images(network):
-        tried.append(_scores(network, image).movedim(1, 0).flatten(1))
+    for image in trial_images(network):
+        tried.append(trial_output(network, image).movedim(1, 0).flatten(1))
         kind = stated or _kind_of(tried, named)
         if kind in _CERTAIN:
             break
@@ -132,7 +132,7 @@ def try_network(network: PhotoNetwork) -> tuple[ScoreKind, int]:
     return kind, count
 
 
-def _images(network: PhotoNetwork) -> Iterator[Tensor]:
+def trial_images(network: PhotoNetwork) -> Iterator[Tensor]:
     """Yield normalized images: black, white, noise, and noise far beyond the range of colors."""
     mean, std = (
         torch.tensor(values, dtype=torch.float32)[:, None, None]
@@ -145,8 +145,12 @@ def _images(network: PhotoNetwork) -> Iterator[Tensor]:
     yield _WILD * torch.randn(shape, generator=generator)
 
 
-def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
-    """Return scores ``(1, K, h, w)`` as float32; label maps have K = 1."""
+def trial_output(network: PhotoNetwork, image: Tensor) -> Tensor:
+    """Return scores ``(1, K, h, w)`` as float32; label maps and depth have K = 1.
+
+    Raises:
+        SettingError: The network does not take the image, or returns another shape.
+    """
     try:
         scores = plain_scores(network.network(image))
     except Exception as error:  # networks raise many kinds about images they do not take
@@ -165,7 +169,7 @@ def _scores(network: PhotoNetwork, image: Tensor) -> Tensor:
         raise SettingError(
             "output of the network",
             found=tuple(scores.shape),
-            expected=f"scores (1, K, {rows}, {columns}) or labels (1, {rows}, {columns})",
+            expected=f"scores (1, K, {rows}, {columns}), or labels or depth (1, {rows}, {columns})",
         )
     return scores.float()
 

@@ -93,13 +93,15 @@ def eomt() -> Made:
     return transformers.EomtForUniversalSegmentation(config), processor
 
 
-def saved(make: Callable[[], Made], folder: Path, **processor_settings: Any) -> Made:
+def saved(
+    make: Callable[[], Made], folder: Path, noise: float = 0.1, **processor_settings: Any
+) -> Made:
     """A network whose scores differ between pixels, saved with its processor."""
     torch.manual_seed(0)
     network, processor = make()
     with torch.no_grad():
         for parameter in network.parameters():
-            parameter.add_(0.1 * torch.randn_like(parameter))
+            parameter.add_(noise * torch.randn_like(parameter))
     for name, value in processor_settings.items():
         setattr(processor, name, value)
     network.save_pretrained(folder)

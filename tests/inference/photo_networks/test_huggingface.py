@@ -34,7 +34,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_segformer_keeps_its_normalization(tmp_path: Path) -> None:
     """The processor has an unusual factor and normalization."""
-    settings = {
+    settings: dict[str, Any] = {
         "rescale_factor": 1 / 128,
         "image_mean": [0.4, 0.5, 0.6],
         "image_std": [0.2, 0.3, 0.4],
