@@ -89,4 +89,5 @@ def test_keypoints_are_compared_with_predicted_depth(run: Run, tmp_path: Path) -
     pair = StanfordPairs(root, pairs="rooms").read(0)
     for side, camera in ((pair.left, "a"), (pair.right, "b")):
         (path,) = (tmp_path / "out" / "depth").glob(f"camera_{camera}*")
+        assert side.distance_m is not None
         np.testing.assert_allclose(side.distance_m, read_depth_m(path, 512), atol=1e-6)
