@@ -17,12 +17,14 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import uncanonical
-from tangent_train.checkpoints.trained import describe_network
+from tangent_train.checkpoints.trained import describe_network, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import PhotoNetwork, huggingface, import_network
 from tangent_train.inference.photo_networks.depth_kinds import declared_kind, try_depth
 from tests.inference.photo_networks import depth_networks as depth
 from tests.inference.photo_networks.huggingface_networks import change_json, imported, saved
+from tests.security.attacks import undeclared_settings
+from tests.security.watch import watched
 
 CONFIG = Path("config.json")
 
@@ -131,6 +133,29 @@ def test_broken_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "preprocessor_config.json").unlink()
     with pytest.raises(DataError, match=r"no preprocessor_config\.json"):
         imported(tmp_path)
+
+
+def test_undeclared_settings_are_left_out_or_refused(tmp_path: Path) -> None:
+    """All at once when a folder is imported; each of them in a checkpoint."""
+    saved(depth.depth_anything, tmp_path)
+    imported(tmp_path)
+    content = torch.load(tmp_path / "imported.ckpt", weights_only=True)
+    attacks = list(undeclared_settings(tmp_path / "forbidden"))
+    every = {name: value for attack in attacks for name, value in attack.items()}
+    inside = json.loads((tmp_path / "config.json").read_text())["backbone_config"]
+    change_json(tmp_path / "config.json", **every, backbone_config=inside | every)
+    with watched(tmp_path / "forbidden") as happened:
+        assert imported(tmp_path).depth_kind == "relative_disparity"
+        inner = content["config"]["network"]["config"]
+        for section in (inner, inner["backbone_config"]):
+            for attack in attacks:
+                section.update(attack)
+                torch.save(content, tmp_path / "hostile.ckpt")
+                with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
+                    load_trained(tmp_path / "hostile.ckpt")
+                for name in attack:
+                    del section[name]
+    assert happened == []
 
 
 def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:
