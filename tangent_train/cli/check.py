@@ -48,7 +48,9 @@ def check(settings: Mapping[str, Any]) -> None:
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
             columns = zip(data.label_names, *shares, strict=True)
-            Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
+            kind = "class" if data.class_names else "label"
+            rows = list(map(list, columns))
+            Table(f"Pixels of each {kind}, %", [kind, *labeled], rows).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     if getattr(data, "area", None) is not None:

@@ -127,7 +127,8 @@ class Run:
             content = read_checkpoint(checkpoint)
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
-        if getattr(self.data, "upright", None) == "auto":
+        by_classes = self.task.predicts == PIXEL_CLASSES  # else upright=auto is by the image alone
+        if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
@@ -243,11 +244,13 @@ def build(
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
-    if getattr(data, "upright", None) == "auto" and task.predicts != PIXEL_CLASSES:
+    can_align = task.predicts in (PIXEL_CLASSES, DISTANCE)
+    if getattr(data, "upright", None) == "auto" and not can_align:
         raise SettingError(
             "data.upright",
             found=f"auto, with {type(task).__name__}",
-            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES}",
+            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES} or "
+            f"{DISTANCE}",
         )
     try_network(task, data.in_channels)
     if trains:

@@ -217,8 +217,8 @@ class RenderedViews:
         return lambda part: self(views[part])
 
 
-class Predictor:
-    """Predicts the class scores of whole panoramas or photos.
+class ViewPredictor:
+    """Passes the views of whole panoramas or photos to a network, a few at a time.
 
     Args:
         trained: The network; it is moved to the device.
@@ -227,14 +227,12 @@ class Predictor:
         images_per_forward: Number of views per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
             a panorama at once, and their scores are kept in memory.
-        min_confidence: Pixels with a lower confidence, from 0 to 1, are unknown.
 
     Attributes:
         device: Device of the network, the views and the mosaic.
 
     Raises:
-        SettingError: The device does not exist, `min_confidence` is not between 0 and 1, or
-            `images_per_forward` is less than 1.
+        SettingError: The device does not exist, or `images_per_forward` is less than 1.
     """
 
     def __init__(
@@ -243,10 +241,7 @@ class Predictor:
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         images_per_forward: int | None = None,
-        min_confidence: float = 0.0,
     ) -> None:
-        if not 0 <= min_confidence <= 1:
-            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
@@ -259,10 +254,50 @@ class Predictor:
         self._per_forward = views_per_forward(view_sets.image_size)
         if images_per_forward is not None:
             self._per_forward = at_least("images_per_forward", images_per_forward, 1)
-        self._network = network_for_views(
-            trained.network, getattr(view_sets, "distortion_aware", None)
-        )
-        self._trained, self._view_sets = trained, view_sets
+        aware = getattr(view_sets, "distortion_aware", None)
+        network: Any = network_for_views(trained.network, aware)
+        self._sees_rays = sees_rays(network)
+        if self._sees_rays:
+            network = partial(network, images_per_chunk=self._per_forward)
+        self._network, self._trained, self._view_sets = network, trained, view_sets
+
+    def _sets(self, image: InputImage) -> list[tuple[Views, ViewImages, Tensor | None]]:
+        """Return the sets of views of an image, see `fill`."""
+        sets: list[tuple[Views, ViewImages, Tensor | None]] = []
+        for shown, shape, views, rotation in self._view_sets(image):
+            rendered = RenderedViews(self._trained, shown, shape, self.device)
+            rays: Iterable[Tensor | None] = [None] * len(views)
+            if self._sees_rays:
+                rays = upright_rays(views, rotation, self.device)
+            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
+        return sets
+
+
+class Predictor(ViewPredictor):
+    """Predicts the class scores of whole panoramas or photos.
+
+    Args:
+        trained: See `ViewPredictor`.
+        view_sets: Selects the views of an image.
+        device: See `ViewPredictor`.
+        images_per_forward: See `ViewPredictor`.
+        min_confidence: Pixels with a lower confidence, from 0 to 1, are unknown.
+
+    Raises:
+        SettingError: See `ViewPredictor`; or `min_confidence` is not between 0 and 1.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        view_sets: PanoramaViews | PhotoViews,
+        device: str = "cpu",
+        images_per_forward: int | None = None,
+        min_confidence: float = 0.0,
+    ) -> None:
+        if not 0 <= min_confidence <= 1:
+            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
+        super().__init__(trained, view_sets, device, images_per_forward)
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
 
@@ -284,19 +319,12 @@ class Predictor:
             The scores. Score k belongs to label k + 1; the last score may belong to no class, see
             `TrainedNetwork.groups`.
         """
-        network: Any = self._network
-        sets: list[tuple[Views, ViewImages, Tensor | None]] = []
-        if sees_rays(network):
-            network = partial(network, images_per_chunk=self._per_forward)
-        for shown, shape, views, rotation in self._view_sets(image):
-            rendered = RenderedViews(self._trained, shown, shape, self.device)
-            rays: Iterable[Tensor | None] = [None] * len(views)
-            if sees_rays(self._trained.network):
-                rays = upright_rays(views, rotation, self.device)
-            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
+        sets = self._sets(image)
         count = sum(len(views) for views, _, _ in sets)
         mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
-        return fill(mosaic, network, sets, self._per_forward, lambda done: progress(done / count))
+        return fill(
+            mosaic, self._network, sets, self._per_forward, lambda done: progress(done / count)
+        )
 
     def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
         """Return an empty mosaic, which reuses the memory of an earlier one if possible."""

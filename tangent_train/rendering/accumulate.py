@@ -113,7 +113,7 @@ def zero_sums(
     Raises:
         SettingError: They do not fit on the disk (of the folder TMPDIR).
     """
-    whole = (*shape, -(-channels // kernels.LANES) * kernels.LANES)
+    whole = (*shape, kernels.padded(channels))
     nbytes = math.prod(whole) * 4
     if nbytes <= _IN_MEMORY_BYTES:
         if spare is None or spare.shape != whole:

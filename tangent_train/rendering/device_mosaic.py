@@ -1,4 +1,4 @@
-"""Class scores of a canvas, accumulated by torch on any device.
+"""Class scores or values of a canvas, accumulated by torch on any device.
 
 The same sums as in `kernels`, but with the classes first: ``(K, H, W)``. On a GPU every call takes
 longer than its computation on few pixels, so the positions of all pixels that some images cover are
@@ -69,6 +69,7 @@ class DeviceSums:
         num_classes: K.
         device: A torch device.
         averaged: True to keep sums; False to keep only labels.
+        softmax: True to add probabilities; False to add the scores.
 
     Attributes:
         sums: ``(K, H, W)`` float32; ``(0, H, W)`` if they are not kept.
@@ -81,9 +82,11 @@ class DeviceSums:
         device: torch.device | str,
         *,
         averaged: bool,
+        softmax: bool = True,
     ) -> None:
         self._shape = shape
         self._averaged = averaged
+        self._softmax = softmax
         self._num_classes = num_classes
         channels = num_classes if averaged else 0
         self.sums = torch.zeros((channels, *shape), dtype=torch.float32, device=device)
@@ -101,7 +104,7 @@ class DeviceSums:
         height, _ = self._shape
         geometry = images.geometry(self._shape, slice(0, height), np.empty((0, 0), np.uint8))
         spans = geometry.spans if owner is None else images.owned_spans(self._shape)
-        if owner is None:
+        if owner is None and self._softmax:
             scores = _softmax(scores)
         numbers = _on_device(images.chosen, scores.device)
         offsets_at = _offsets_in(geometry, scores)
@@ -126,7 +129,7 @@ class DeviceSums:
     def _add(self, sampled: Tensor, index: Tensor, weight: Tensor, *, is_owner: bool) -> None:
         """Add scores or probabilities ``(1, K, 1, P)`` of one image to P pixels of the canvas."""
         if self._averaged:
-            sampled = _softmax(sampled) if is_owner else sampled
+            sampled = _softmax(sampled) if is_owner and self._softmax else sampled
             # The pixels of an image are distinct, so the order of additions does not vary.
             self._sums.index_add_(1, index, sampled[0, :, 0].mul_(weight))
             return

@@ -6,7 +6,8 @@ homogeneous pixels, proportional to ``(u, v, 1)``; a ray is in front of the imag
 number is positive.
 
 Sums are arrays ``(H, W, Kp)``: the K scores of a pixel are adjacent in memory, followed by zeros up
-to a multiple of `LANES`, so that loops over them compile to vector code without a remainder.
+to a multiple of `LANES`, so that loops over them compile to vector code without a remainder. One or
+two channels, such as depth and its weight, take 2 numbers.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from numpy.typing import NDArray
 from tangent_train.rendering.compiled import njit_exact, njit_fast
 
 LANES = 16
-"""Kp, the number of scores stored per pixel, is a multiple of this."""
+"""Kp, the number of scores stored per pixel, is a multiple of this, or `_PAIR`."""
+
+_PAIR = 2
 
 _TILE_SCORES = 2**18
 """Number of sums in a tile: they fit into the processor's cache."""
@@ -99,6 +102,12 @@ class _Taps(NamedTuple):
     b: Array
     c: Array
     d: Array
+
+
+@njit_fast
+def padded(channels: int) -> int:
+    """Return the number Kp of numbers that are stored for some channels."""
+    return _PAIR if channels <= _PAIR else -(-channels // LANES) * LANES
 
 
 @njit_fast
@@ -390,6 +399,19 @@ def _add_samples(
 
 
 @njit_fast
+def _add_pairs(patch: Array, width: int, taps: _Taps, pixel: Array, sums: Array) -> None:
+    """Add samples of two channels, see `_add_samples`."""
+    below = np.uint64(_PAIR) * np.uint64(width)
+    for p in range(len(pixel)):
+        at, to = np.uint64(_PAIR) * np.uint64(taps.first[p]), np.uint64(_PAIR) * np.uint64(pixel[p])
+        a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
+        for k in range(np.uint64(_PAIR)):
+            upper = a * patch[at + k] + b * patch[at + np.uint64(_PAIR) + k]
+            lower = c * patch[at + below + k] + d * patch[at + below + np.uint64(_PAIR) + k]
+            sums[to + k] += upper + lower
+
+
+@njit_fast
 def _add_probabilities(
     tile: Tile, covered: Array, owner: Array, num_classes: int, sums: Array, total: Array
 ) -> None:
@@ -501,9 +523,12 @@ def _add_to_tile(
         _weigh(n, (wide, -top * wide - left), buffers, taps)
         size = high * wide * classes
         patch = _at_least(patch, size)
-        part, blocks = patch[:size], classes // LANES
+        part, blocks = patch[:size], classes // LANES  # 0 for pairs
         _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
-        _add_samples(part, wide, blocks, taps, buffers.pixel[:n], sums.reshape(-1))
+        if blocks == 0:
+            _add_pairs(part, wide, taps, buffers.pixel[:n], sums.reshape(-1))
+        else:
+            _add_samples(part, wide, blocks, taps, buffers.pixel[:n], sums.reshape(-1))
     return patch
 
 
@@ -533,11 +558,11 @@ def add_images(
         labels: ``(H, W)`` classes of the largest sums, written if `total` is empty.
     """
     num_classes, width = scores.shape[1], canvas.columns.shape[1]
-    classes, afterwards = -(-num_classes // LANES) * LANES, softmax and len(canvas.owner) > 0
+    classes, afterwards = padded(num_classes), softmax and len(canvas.owner) > 0
     owns, covered = np.ones(_count(canvas), np.bool_), np.zeros(_count(canvas), np.bool_)
     for image in canvas.images:
         covered[image] = True
-    pixels = max(64, _TILE_SCORES // classes)
+    pixels = max(64, _TILE_SCORES // max(LANES, classes))
     buffers, taps, patch = _tile_buffers(pixels), _tap_buffers(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
     for tile in _tiles(start, stop, canvas, pixels):

@@ -19,7 +19,7 @@ from tangent_train.rendering import (
     TangentRepresentation,
     device_mosaic,
 )
-from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.mosaic import DepthMosaic, ScoreMosaic
 from tests.fake_gpu import fake_gpu
 
 TILT = rotation_about((1, 2, 0), 0.9)
@@ -88,6 +88,27 @@ def _scores(sets: Any, classes: int) -> list[torch.Tensor]:
         coarse = 4 * torch.randn(len(views), classes, 5, 5, generator=generator)
         found.append(torch.nn.functional.interpolate(coarse, size, mode="bicubic"))
     return found
+
+
+@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_torch_blends_depth_as_the_compiled_kernels_do(name: str, blend: Blend) -> None:
+    make, shape = SETS[name]
+    sets, found = make(blend), []
+    depth = [scores.where(scores > -2, torch.nan) for scores in _scores(sets, 1)]
+    for backend in ("numba", "torch"):
+        mosaic = DepthMosaic(shape, blend, backend=backend)
+        for views, of_set in zip(sets, depth, strict=True):
+            for start in range(0, len(views), 7):
+                mosaic.add(of_set[start : start + 7], views[start : start + 7])
+        found.append(mosaic.values())
+    expected, values = found
+    unknown = expected.isnan()
+    # Weights at the limit differ by rounding.
+    assert (values.isnan() == unknown).double().mean() > 0.9999
+    assert unknown.double().mean() < 0.4
+    both = ~unknown & ~values.isnan()
+    torch.testing.assert_close(values[both], expected[both], atol=1e-3, rtol=0)
 
 
 @pytest.mark.parametrize("name", SETS)

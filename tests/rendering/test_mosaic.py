@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pytest
@@ -26,9 +26,11 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.mosaic import DepthMosaic, ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.views import PinholeViews
+
+Mosaic = TypeVar("Mosaic", ScoreMosaic, DepthMosaic)
 
 RINGS = [{"pitch": pitch, "views": 5} for pitch in (0, 50, -50)]
 GRIDS = [
@@ -46,7 +48,7 @@ def _scores(grid: PinholeGrid, classes: int = 7) -> torch.Tensor:
     return 3 * torch.randn(grid.num_images, classes, *grid.size, generator=generator)
 
 
-def _added(result: ScoreMosaic, scores: torch.Tensor, grid: PinholeGrid) -> ScoreMosaic:
+def _added(result: Mosaic, scores: torch.Tensor, grid: PinholeGrid) -> Mosaic:
     for faces in np.array_split(np.random.default_rng(0).permutation(grid.num_images), 6):
         result.add(scores[faces], PinholeViews(grid, faces))
     return result
@@ -136,6 +138,30 @@ def test_large_sums_are_in_a_file_and_equal(monkeypatch: pytest.MonkeyPatch) -> 
     result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
     assert isinstance(result.sums, np.memmap)
     np.testing.assert_array_equal(_probabilities(result), expected)
+
+
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+@pytest.mark.parametrize(("grid", "shape"), GRIDS)
+def test_depth_is_the_weighted_mean_of_known_pixels(
+    grid: TangentGrid, shape: tuple[int, int], blend: Blend
+) -> None:
+    depth = _scores(grid, 1)
+    depth[torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.2] = torch.nan
+    depth[0] = torch.inf
+    depth[torch.from_numpy(grid.directions()[:, None] @ (0.6, 0, 0.8) > 0.7)] = torch.nan
+    result = _added(DepthMosaic(shape, blend), depth, grid)
+    assert result.sums.shape[2] == 2, "16 numbers per pixel would be half a gigabyte at level 10"
+    known = depth.isfinite()
+    pair = torch.cat([depth.where(known, 0), known.float()], dim=1).double()
+    total, weight = tangent_to_equirect(pair, grid, shape, blend)
+    values = result.values()
+    least = 0.5 if blend == "nearest" else 0.05
+    seen = weight > least + 1e-6
+    torch.testing.assert_close(values[seen].double(), (total / weight)[seen], atol=1e-4, rtol=1e-4)
+    if blend == "nearest":
+        assert values[weight < least - 1e-6].isnan().all()
+    assert values[weight < 1e-9].isnan().all()
+    assert values.isnan().any()
 
 
 def _photo_crops(blend: Blend) -> tuple[PhotoCrops, tuple[int, int]]:

@@ -1,0 +1,523 @@
+"""Bring the depth of the views of a panorama to one scale.
+
+A depth network estimates each view on its own, up to an error of its scale, or up to an unknown
+scale and shift. Views are compared at the directions of an icosphere that two or more of them see,
+and one scale (and shift) per view is fitted to all pairs of views at once.
+
+* **Logarithm** (mode `scale`): ``log q_i + a_i`` of a view i, with ``q`` the distance, or the
+  disparity along the ray. It is linear in the unknown a.
+* **Affine**: ``q_i = (s_i x_i + t_i) f_i``, with the network's output x, and f the length of the
+  ray for depth or its inverse for disparity. Because f differs between views, a shift of all views
+  is observable. The differences of two views are divided by the noise that their scales cause,
+  ``√((s_i² h_i² + s_j² h_j²) / 2)`` with the spread h of x in a view. Without this, small scales
+  would always fit better: the trivial solution s = 0, and shrinkage of noisy views (total least
+  squares, Golub & Van Loan 1980). Scales are exponentials, so they are positive.
+
+Both are robust: iteratively reweighted least squares with the weights of Huber (1964), and the
+median absolute deviation as the unit of residuals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy import sparse
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import spsolve
+from torch import Tensor
+
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.distances import along_rays, is_disparity
+from tangent_train.errors import SettingError, counted
+from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
+from tangent_train.rendering.accumulate import NO_OWNERS
+from tangent_train.rendering.checks import check_choice
+from tangent_train.rendering.representations.views import Views
+
+Align = Literal["none", "scale", "affine", "grid"]
+"""Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+_POWERS: dict[DepthKind, int] = {
+    "log_distance": 0,
+    "metric_distance": 0,
+    "metric_z": 1,
+    "relative_depth": 1,
+    "relative_disparity": -1,
+}
+"""Powers of the ray length that convert output to distance or disparity along the ray."""
+
+_LEVEL = 5
+_PHOTO_POINTS = 2**13
+_LEAST_SAMPLES = 8
+"""Directions that two views must share to be compared."""
+_MOST_PAIRS = 2**16
+"""Pairs of samples above which directions are left out, to limit the time."""
+
+_HUBER = 1.345
+"""Residuals that keep weight 1, in standard deviations: 95 % efficiency for Gaussian noise."""
+_MAD_TO_STD = 1.4826
+_ITERATIONS, _TOLERANCE = 100, 1e-7
+_NO_NOISE, _DAMPING, _NEGLIGIBLE = 1e-10, 1e-8, 1e-30
+_LEVERAGE = 2.5
+"""Distance from the median, in spreads, beyond which samples lose weight in an affine fit."""
+
+_CONSTANT, _FIXED = 1e-4, 1e-6
+"""Spread of a constant view, as a share of its median; and standard deviation of its shift."""
+_RANGE_TO_STD = 2.563
+"""From the 10th to the 90th percentile of a Gaussian, in standard deviations."""
+
+_CORRELATED = 30.0
+"""Number of neighboring samples whose errors are alike; priors weigh as much as this many."""
+_SCALE_PRIOR = 2.0
+"""Standard deviation of the logarithms of scales, where the overlap does not determine them."""
+_NODES = 5
+"""Nodes of a grid of corrections per side."""
+_SLOPE_PRIOR, _NODE_PRIOR = 0.1, 0.3
+"""Standard deviations of differences of neighboring nodes, and of nodes, in logarithms."""
+
+
+class ViewSamples(NamedTuple):
+    """Output of a network at points of the canvas that its views show.
+
+    Attributes:
+        num_views: Number of views.
+        view: ``(n,)`` number of the view.
+        point: ``(n,)`` number of the point.
+        value: ``(n,)`` output, NaN where it is not finite.
+        ray_length: ``(n,)`` distance divided by z-depth.
+        position: ``(n, 2)`` x to the right and y down in the view, −1 to 1 between its outer pixel
+            edges; NaN in views that are neither pinhole images nor crops.
+    """
+
+    num_views: int
+    view: Indices
+    point: Indices
+    value: Floats
+    ray_length: Floats
+    position: Floats
+
+    @classmethod
+    def joined(cls, parts: Sequence[ViewSamples]) -> ViewSamples:
+        """Return the samples of several sets of views, numbered consecutively."""
+        first = np.cumsum([0, *(part.num_views for part in parts)])
+        views = np.concatenate([part.view + k for part, k in zip(parts, first, strict=False)])
+        rest = (np.concatenate(arrays) for arrays in list(zip(*parts, strict=True))[2:])
+        return cls(int(first[-1]), views, *rest)
+
+
+def sphere_points(shape: tuple[int, int]) -> Indices:
+    """Return ``(P, 2)`` rows and columns of the pixels of a panorama at an icosphere's vertices."""
+    positions = lonlat_to_equirect(xyz_to_lonlat(icosphere(_LEVEL).vertices), shape)
+    columns, rows = np.rint(positions).astype(np.int64).T
+    pixels = np.unique(rows.clip(0, shape[0] - 1) * shape[1] + columns % shape[1])
+    return np.stack(np.divmod(pixels, shape[1]), axis=-1)
+
+
+def photo_points(shape: tuple[int, int]) -> Indices:
+    """Return ``(P, 2)`` rows and columns of a lattice on a photo."""
+    step = max(1.0, (shape[0] * shape[1] / _PHOTO_POINTS) ** 0.5)
+    lines = (np.arange(step / 2, side, step).astype(np.int64) for side in shape)
+    return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def sample_views(
+    outputs: NDArray[np.floating], views: Views, shape: tuple[int, int], points: Indices
+) -> ViewSamples:
+    """Sample the output of a network at points of the canvas, bilinearly.
+
+    Args:
+        outputs: ``(n, h, w)`` output for all views of the set.
+        views: The views.
+        shape: ``(H, W)`` of the canvas: the panorama or photo.
+        points: ``(P, 2)`` rows and columns of the canvas.
+    """
+    placed, images = views.placed(torch.from_numpy(np.ascontiguousarray(outputs))[:, None], shape)
+    pixels = placed[:, 0].numpy()
+    geometry = images.geometry(shape, slice(0, shape[0]), NO_OWNERS)
+    rows, columns = geometry.rows[points[:, 0]].T, geometry.columns[:, points[:, 1]]
+    rays = np.stack([rows[0] * columns[0], rows[0] * columns[1], rows[1]])
+    u, v, w = np.moveaxis(geometry.matrices @ rays, 1, 0)
+    height, width = pixels.shape[1:]
+    x, y = ((side + w) / size for side, size in ((2 * u, width), (2 * v, height)))
+    view, point = np.nonzero((np.maximum(np.abs(x - w), np.abs(y - w)) <= w) & (w > 0))
+    w = w[view, point]
+    position = np.stack([x[view, point] / w - 1, y[view, point] / w - 1], axis=-1)
+    at = ((position + 1) * (width, height) - 1) / 2
+    value = _bilinear(pixels, view, at)
+    lengths = views.ray_lengths()
+    length = np.ones(len(view))
+    if images is views and lengths.size > 1:
+        length = _bilinear(lengths, view if len(lengths) > 1 else 0 * view, at)
+    elif images is not views:
+        position = np.full_like(position, np.nan)
+    return ViewSamples(len(pixels), view, point, value, length, position)
+
+
+def _bilinear(images: NDArray[np.floating], image: Indices, at: Floats) -> Floats:
+    """Return interpolated values ``(n,)`` at columns and rows ``(n, 2)``, clamped at the edges."""
+    last = np.array(images.shape[:0:-1]) - 1
+    at = at.clip(0, last)
+    low = np.minimum(np.floor(at), np.maximum(last - 1, 0)).astype(np.int64)
+    (right, below), (column, row) = (at - low).T, low.T
+    up, left = np.minimum(row + 1, last[1]), np.minimum(column + 1, last[0])
+    corners = [(row, column), (row, left), (up, column), (up, left)]
+    a, b, c, d = (images[image, i, j].astype(np.float64) for i, j in corners)
+    value = (1 - below) * ((1 - right) * a + right * b) + below * ((1 - right) * c + right * d)
+    return np.where(np.isfinite(value), value, np.nan)
+
+
+@dataclass(frozen=True)
+class AlignmentReport:
+    """Facts about an alignment.
+
+    Attributes:
+        mode: The correction.
+        views: Number of views.
+        groups: Number of groups of views that overlap, directly or through others. Each has a
+            scale of its own.
+        isolated: Views that overlap with no other view.
+        empty: Views without a valid value.
+        constant: Views with constant output, which got a scale but no shift.
+        invalid: Share of samples without a valid value, such as sky.
+        outliers: Share of pairs of samples with a Huber weight below ½.
+        step_before: Median difference of the logarithms of two views at a direction.
+        step_after: The same after the alignment.
+    """
+
+    mode: Align
+    views: int
+    groups: int = 0
+    isolated: tuple[int, ...] = ()
+    empty: tuple[int, ...] = ()
+    constant: tuple[int, ...] = ()
+    invalid: float = 0.0
+    outliers: float = 0.0
+    step_before: float | None = None
+    step_after: float | None = None
+
+    def lines(self) -> list[str]:
+        """Return the report as sentences."""
+        lines = [f"Aligned {counted(self.views, 'views')} ({self.mode})."]
+        if self.step_before is not None and self.step_after is not None:
+            steps = f"{self.step_before:.1%} before and {self.step_after:.1%} after"
+            lines.append(f"Median step between views: {steps}; {self.outliers:.0%} outliers.")
+        if self.groups > 1:
+            lines.append(f"{self.groups} groups of views do not overlap: their scales differ.")
+        named = {"without a valid value": self.empty, "with constant output": self.constant}
+        lines += [f"Views {what}: {', '.join(map(str, n))}." for what, n in named.items() if n]
+        if self.invalid:
+            lines.append(f"{self.invalid:.1%} of the samples have no valid value, such as sky.")
+        return lines
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Corrections of the depth of N views.
+
+    Attributes:
+        kind: Kind of the network's output.
+        scale: ``(N,)`` factors, larger than 0.
+        shift: ``(N,)`` shifts, added after multiplication with the scale.
+        grid: ``(N, k, k)`` corrections of the logarithm, added bilinearly; rows from top to bottom.
+            None without them.
+        report: Facts about the alignment.
+    """
+
+    kind: DepthKind
+    scale: Floats
+    shift: Floats
+    grid: Floats | None
+    report: AlignmentReport
+
+    def applied(self, outputs: Tensor, part: slice, ray_lengths: Tensor) -> Tensor:
+        """Return corrected depth in the quantity in which views are blended, see `along_rays`.
+
+        Sky (disparity 0) and negative disparities become 0.
+
+        Args:
+            outputs: ``(n, 1, h, w)`` output of the network.
+            part: The views.
+            ray_lengths: ``(1 or n, h, w)``, see `Views.ray_lengths`.
+        """
+        lengths = ray_lengths.to(outputs)[:, None]
+        scale, shift = (
+            torch.from_numpy(numbers[part]).to(outputs)[:, None, None, None]
+            for numbers in (self.scale, self.shift)
+        )
+        if self.kind == "log_distance":
+            depth = (outputs.exp() * scale + shift).log() if shift.any() else outputs + scale.log()
+        else:
+            depth = outputs * scale + shift
+        values = along_rays(depth, self.kind, lengths)
+        if is_disparity(self.kind):
+            values = torch.where(outputs == 0, 0 * values, values).clamp(min=0)
+        if self.grid is None:
+            return values
+        rows, columns = (
+            torch.from_numpy(_hat((2 * np.arange(side) + 1) / side - 1)).to(outputs)
+            for side in outputs.shape[-2:]
+        )
+        added = rows @ torch.from_numpy(self.grid[part]).to(outputs)[:, None] @ columns.T
+        return values * added.exp() if is_disparity(self.kind) else values + added
+
+
+def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = None) -> Alignment:
+    """Fit corrections of views to each other.
+
+    The median scale of each group of overlapping views is 1, so that metric depth remains metric.
+
+    Args:
+        parts: Samples of all sets of views.
+        kind: Kind of the values, after `uncanonical`.
+        mode: The correction; None for `scale` of metric and `affine` of relative kinds, and for
+            `none` of a single view. `grid` adds a grid of corrections to it.
+
+    Raises:
+        SettingError: The mode is unknown, or `grid` is given for views without positions.
+    """
+    check_choice("align", mode or "none", get_args(Align))
+    samples = ViewSamples.joined(parts)
+    view, count, value = samples.view, samples.num_views, samples.value
+    usual: Align = "affine" if kind.startswith("relative") else "scale"
+    mode = mode or (usual if count > 1 else "none")
+    if mode == "grid" and np.isnan(samples.position).any():
+        expected = "none, scale or affine, for views that are not pinhole images"
+        raise SettingError("align", found="grid", expected=expected)
+    base = usual if mode == "grid" else mode
+    if kind == "log_distance":
+        value = np.exp(value)
+    factor = samples.ray_length ** _POWERS[kind]
+    is_valid = np.isfinite(value) & (value != 0 if base == "affine" else value > 0)
+    pairs = _pairs(samples, np.flatnonzero(is_valid))
+    scale, shift, grid = np.ones(count), np.zeros(count), None
+    outliers, is_constant = np.zeros(len(pairs.first), bool), np.zeros(count, bool)
+    if base == "scale" and len(outliers):
+        logs, outliers = _fit_scales(pairs, _logarithm(value * factor), count)
+        scale = np.exp(logs)
+    elif base == "affine" and len(outliers):
+        scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
+    groups = pairs.groups(count)
+    for group in np.unique(groups):
+        unit = np.exp(np.median(np.log(scale[groups == group])))
+        scale[groups == group] /= unit
+        shift[groups == group] /= unit
+    before = _logarithm(value * factor)
+    after = _logarithm((scale[view] * value + shift[view]) * factor)
+    if mode == "grid" and len(outliers):
+        grid, added, outliers = _fit_grid(pairs, after, samples)
+        for group in np.unique(groups):
+            grid[groups == group] -= np.median(grid[groups == group].mean(axis=(1, 2)))
+        after = after + added
+    is_empty = np.bincount(view[is_valid], minlength=count) == 0
+    alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
+    report = AlignmentReport(
+        mode,
+        count,
+        groups=len(np.unique(groups[~is_empty])),
+        isolated=_numbers(alone),
+        empty=_numbers(is_empty),
+        constant=_numbers(is_constant),
+        invalid=1 - float(is_valid.mean()) if len(view) else 0.0,
+        outliers=float(outliers.mean()) if len(outliers) else 0.0,
+        step_before=pairs.step(before),
+        step_after=pairs.step(after),
+    )
+    return Alignment(kind, scale, shift, grid, report)
+
+
+def _numbers(mask: NDArray[np.bool_]) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(mask).tolist())
+
+
+def _logarithm(values: Floats) -> Floats:
+    """Return logarithms; NaN of values that are not positive."""
+    return np.log(np.where(values > 0, values, np.nan))
+
+
+class _Pairs(NamedTuple):
+    """Pairs of samples of the same point in two views.
+
+    Attributes:
+        first: ``(m,)`` indices of samples.
+        second: ``(m,)`` indices of the samples in the other view.
+        a: ``(m,)`` view of the first.
+        b: ``(m,)`` view of the second.
+    """
+
+    first: Indices
+    second: Indices
+    a: Indices
+    b: Indices
+
+    def groups(self, count: int) -> Indices:
+        """Return the group of each of the views, directly or indirectly connected by pairs."""
+        links = sparse.coo_array((np.ones(len(self.a)), (self.a, self.b)), (count, count))
+        groups: Indices = connected_components(links, directed=False)[1]
+        return groups
+
+    def step(self, logs: Floats) -> float | None:
+        """Return the median difference of logarithms."""
+        steps = np.abs(logs[self.first] - logs[self.second])
+        steps = steps[np.isfinite(steps)]
+        return float(np.median(steps)) if len(steps) else None
+
+
+def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
+    """Pair valid samples of the same point, of all views that share enough points."""
+    shared = np.bincount(samples.point[valid])
+    every = max(1, -(-int((shared * (shared - 1) // 2).sum()) // _MOST_PAIRS))
+    valid = valid[samples.point[valid] % every == 0]
+    order = valid[np.argsort(samples.point[valid], kind="stable")]
+    point, pairs = samples.point[order], [np.empty((2, 0), np.int64)]
+    for step in range(1, samples.num_views):
+        same = np.flatnonzero(point[step:] == point[:-step])
+        if not len(same):
+            break
+        pairs.append(np.stack([order[same], order[same + step]]))
+    first, second = np.concatenate(pairs, axis=1)
+    a, b = samples.view[first], samples.view[second]
+    views = a * samples.num_views + b
+    _, number, counts = np.unique(views, return_inverse=True, return_counts=True)
+    kept = counts[number] >= _LEAST_SAMPLES
+    return _Pairs(first[kept], second[kept], a[kept], b[kept])
+
+
+def _slopes(entries: Sequence[Floats], unknowns: Sequence[Indices], count: int) -> sparse.csr_array:
+    """Return the ``(m, count)`` matrix with k entries in each row, at the numbers of unknowns."""
+    values, columns = np.stack(entries, axis=-1), np.stack(unknowns, axis=-1)
+    starts = np.arange(0, values.size + 1, len(entries))
+    return sparse.csr_array((values.ravel(), columns.ravel(), starts), (len(values), count))
+
+
+def _robust_fit(
+    evaluate: Callable[[Floats], tuple[Floats, sparse.csr_array]],
+    start: Floats,
+    prior: sparse.csr_array,
+    expected: Floats,
+    design: Floats | float = 1.0,
+    logarithms: int = 0,
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Minimize the Huber loss of residuals, in units of their median absolute deviation.
+
+    Gauss-Newton steps on reweighted squares. Priors are measured in the noise of the residuals:
+    they decide what the samples do not determine, and vanish without noise.
+
+    Args:
+        evaluate: Returns residuals ``(m,)`` and their derivatives ``(m, n)``.
+        start: ``(n,)`` first values of the unknowns.
+        prior: ``(k, n)`` matrix; its product with the unknowns is expected to be `expected`, with
+            a standard deviation of 1.
+        expected: ``(k,)``.
+        design: ``(m,)`` weights that do not depend on residuals.
+        logarithms: Number of unknowns, the first ones, whose steps are limited to 1.
+
+    Returns:
+        The unknowns, and a mask of residuals with a weight below ½.
+    """
+    unknowns, weight = start, np.ones(0)
+    for _ in range(_ITERATIONS):
+        residual, slopes = evaluate(unknowns)
+        noise = max(_MAD_TO_STD * float(np.median(np.abs(residual))), _NO_NOISE)
+        weight = 1 / np.maximum(1, np.abs(residual) / (_HUBER * noise))
+        weighted, strength = slopes.T @ sparse.diags_array(design * weight), _CORRELATED * noise**2
+        normal = weighted @ slopes + strength * (prior.T @ prior)
+        slope = weighted @ residual + strength * (prior.T @ (prior @ unknowns - expected))
+        normal += sparse.diags_array(_DAMPING * normal.diagonal() + _NEGLIGIBLE)
+        step = spsolve(normal.tocsc(), -slope)
+        unknowns = unknowns + step / max(1.0, np.abs(step[:logarithms]).max(initial=0))
+        if np.abs(step).max() < _TOLERANCE:
+            break
+    return unknowns, weight < 1 / 2
+
+
+def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return ``(N,)`` logarithms of scales, and a mask of outliers."""
+    ones, offset = np.ones(len(pairs.a)), logs[pairs.first] - logs[pairs.second]
+    slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
+    none = sparse.csr_array((0, count)), np.zeros(0)
+    return _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count), *none)
+
+
+def _fit_affine(
+    pairs: _Pairs, value: Floats, factor: Floats, view: Indices, count: int
+) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return scales and shifts ``(N,)``, a mask of constant views, and a mask of outliers.
+
+    The unknowns are u and b in ``(s x + t) = exp(u) ((x − center) / spread + b)``.
+    """
+    first, second, a, b = pairs
+    center, spread = np.zeros(count), np.ones(count)
+    used = np.unique(np.concatenate([first, second]))
+    for number in np.unique(view[used]):
+        low, middle, high = np.quantile(value[used[view[used] == number]], (0.1, 0.5, 0.9))
+        center[number], spread[number] = middle, (high - low) / _RANGE_TO_STD
+    is_constant = spread <= _CONSTANT * np.abs(center)
+    spread = np.where(is_constant, np.abs(center), spread)
+    normal, no_shift = (value - center[view]) / spread[view], center / spread
+    farness = np.maximum(1, np.abs(normal) / _LEVERAGE)
+    design = (farness[first] * farness[second]) ** -2.0
+
+    def evaluate(unknowns: Floats) -> tuple[Floats, sparse.csr_array]:
+        scale, shift = np.exp(unknowns[:count]), unknowns[count:]
+        depth = scale[view] * (normal + shift[view]) * factor
+        noise = np.sqrt((scale[a] ** 2 + scale[b] ** 2) / 2)
+        residual, share = (depth[first] - depth[second]) / noise, (scale[a] / noise) ** 2 / 2
+        entries = [
+            depth[first] / noise - residual * share,
+            -depth[second] / noise - residual * (1 - share),
+            scale[a] * factor[first] / noise,
+            -scale[b] * factor[second] / noise,
+        ]
+        return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
+
+    deviation = np.concatenate([np.full(count, _SCALE_PRIOR), np.maximum(1, np.abs(no_shift))])
+    deviation[count:][is_constant] *= _FIXED
+    prior = sparse.diags_array(1 / deviation).tocsr()
+    expected = np.concatenate([np.log(spread), no_shift]) / deviation
+    start = np.concatenate([np.zeros(count), no_shift])
+    fit, outliers = _robust_fit(evaluate, start, prior, expected, design, count)
+    scale = np.exp(fit[:count]) / spread
+    return scale, scale * (fit[count:] * spread - center), is_constant, outliers
+
+
+def _fit_grid(
+    pairs: _Pairs, logs: Floats, samples: ViewSamples
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return corrections ``(N, k, k)``, their values at the samples, and a mask of outliers."""
+    count, nodes = samples.num_views, _NODES**2
+    x, y = (_hat(samples.position[:, axis]) for axis in (0, 1))
+    hats = sparse.csr_array((y[:, :, None] * x[:, None, :]).reshape(-1, nodes)).tocoo()
+    columns = samples.view[hats.row] * nodes + hats.col
+    at_samples = sparse.csr_array((hats.data, (hats.row, columns)), (len(x), count * nodes))
+    comparable = np.isfinite(logs[pairs.first] - logs[pairs.second])
+    first, second = pairs.first[comparable], pairs.second[comparable]
+    slopes, offset = at_samples[first] - at_samples[second], logs[first] - logs[second]
+    one = sparse.eye_array(_NODES)
+    next_node = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(_NODES - 1, _NODES))
+    smooth = sparse.vstack([sparse.kron(one, next_node), sparse.kron(next_node, one)])
+    small = sparse.vstack([smooth / _SLOPE_PRIOR, sparse.eye_array(nodes) / _NODE_PRIOR])
+    prior = sparse.kron(sparse.eye_array(count), small).tocsr()
+    start = np.zeros(count * nodes)
+    fit, outliers = _robust_fit(
+        lambda grid: (slopes @ grid + offset, slopes), start, prior, np.zeros(prior.shape[0])
+    )
+    return fit.reshape(count, _NODES, _NODES), at_samples @ fit, outliers
+
+
+def _hat(positions: Floats) -> Floats:
+    """Return weights ``(n, k)`` of linear interpolation between the nodes of a grid.
+
+    Args:
+        positions: ``(n,)`` from −1 (the first node) to 1 (the last).
+    """
+    nodes = np.linspace(-1, 1, _NODES)
+    distance = np.abs(positions[:, None] - nodes) * (_NODES - 1) / 2
+    return np.maximum(0, 1 - distance)
