@@ -220,7 +220,10 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
     torch.save(network.state_dict(), here / "state.pt")
     given = ("network=unet_small", "weights=state.pt", "normalization=unit", "output=net.ckpt")
     run("import", *given, "depth=relative_disparity", "image_size=32")
-    assert "it returns negative numbers, from -" in capsys.readouterr().out
+    assert (
+        "it returns negative numbers, which relative_disparity should not be, from -"
+        in capsys.readouterr().out
+    )
     trained = load_trained(here / "net.ckpt")
     assert trained.depth_kind == "relative_disparity"
     images = torch.randn(2, 3, 32, 32)
@@ -248,7 +251,7 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
                 "output=o.onnx",
                 "depth=metric_z",
             ),
-            "found 4 numbers per pixel; .*Leave out depth=",
+            "found 4 per pixel, .*Leave out depth=",
         ),
         (
             (*TORCHVISION, "model=lraspp_mobilenet_v3_large", "weights=s.pt", "depth=metric_z"),
