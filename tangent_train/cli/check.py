@@ -8,7 +8,7 @@ from contextlib import redirect_stdout
 from typing import Any
 
 from datamodules.core.class_weights import label_doubts
-from tangent_train.cli.run import needed_labels
+from tangent_train.cli.run import open_data
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.registry import build_from_config
@@ -24,9 +24,7 @@ def check(settings: Mapping[str, Any]) -> None:
     Args:
         settings: Composed ``check.yaml``.
     """
-    representation = build_from_config(settings["representation"], "representation")
-    given = needed_labels(settings)
-    data = build_from_config(settings["data"], "data", representation=representation, **given)
+    data = open_data(settings)
     terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # where progress is printed
         problems, count = data.check()
@@ -54,6 +52,7 @@ def check(settings: Mapping[str, Any]) -> None:
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     if getattr(data, "area", None) is not None:
+        representation = build_from_config(settings["representation"], "representation")
         views = [sum(map(len, r.view_sets())) for r in (data.representation, representation)]
         rows, columns = data.representation.image_size
         print_text(

@@ -10,6 +10,7 @@ const float PI = 3.14159265358979;
 const float UNKNOWN = -1e9;
 const float WORST = 0.22314355;  // ln 1.25
 const int REACH = 2;  // pixels between neighbors that tell which way a surface faces
+const float STEEP = 12.0;  // slope of a surface, seen from the center, of 85 degrees
 const int INSIDE = 0, PLANET = 1, FLAT = 2;
 const int INPUT = 0, TRUTH = 1, PREDICTION = 2, ERROR = 3, OVERLAY = 4;
 const vec3 OUTSIDE = vec3(0.086, 0.094, 0.11);
@@ -89,7 +90,6 @@ void main() {
   float share = uSphere ? max(cos((0.5 - vUv.y) * PI), 1.0 / float(size.x)) : 1.0;
   vec4 here = pointOf(at);
   if (here.w == 0.0 || floor(float(at.x + 1) * share) == floor(float(at.x) * share)) return;
-  float angle = uSphere ? PI / float(size.y) : 1.0 / (uCamera.x * float(size.x));
   vec3 seen = here.xyz - uEye;
   int columns = min(int(round(float(REACH) / share)), max(size.x / 4, 1));
   vec3 across = along(here.xyz, at, ivec2(columns, 0));
@@ -97,12 +97,17 @@ void main() {
   // Surfaces show their side towards the center; walls in front of the scene are left out.
   vec3 normal = cross(across, down);
   if (sign(dot(normal, here.xyz)) * dot(normal, seen) < -0.1 * length(normal) * length(seen)) return;
-  float apart = max(length(across), length(down)) / float(REACH);
-  float gap = angle * length(here.xyz) * clamp(apart / (angle * length(here.xyz)), 1.0, 3.0);
+  // Points are squares that cover the gap to the next ones, but not beyond edges.
+  float reach = ceil(1.0 / share) / float(columns);
+  float gap = max(reach * length(across), length(down) / float(REACH));
+  float pitch = (uSphere ? PI / float(size.y) : 1.0 / (uCamera.x * float(size.x))) * length(here.xyz);
+  // Between an object and what is behind it, networks predict slopes that no surface has.
+  if (gap > STEEP * pitch) return;
+  gap = 1.45 * clamp(gap, pitch, 3.0 * pitch);
   vec3 view = vec3(dot(seen, uRight), dot(seen, uUp), dot(seen, uAhead));
   float side = 0.5 * max(uCanvas.x, uCanvas.y);
   gl_Position = vec4(view.xy / uReach * 2.0 * side / uCanvas, view.z - 2.0 * uNear, view.z);
-  gl_PointSize = clamp(1.5 * gap / (uReach * view.z) * side, 1.0, 32.0);
+  gl_PointSize = clamp(gap / (uReach * view.z) * side, 1.0, 32.0);
 }
 #else
 out vec4 color;
