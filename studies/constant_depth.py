@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import sys
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,7 +24,7 @@ def main() -> None:
     """Print the median and the scores."""
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", sys.argv[1:])
-    settings = OmegaConf.to_container(config, resolve=True)
+    settings: Any = OmegaConf.to_container(config, resolve=True)
     data = build_data(settings)
     data.make_files()
     train, test = data.source("train"), data.source("test")

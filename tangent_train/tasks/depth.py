@@ -23,6 +23,7 @@ from tangent_train.checkpoints.distances import (
     from_distance,
     is_disparity,
     is_metric,
+    uncanonical,
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
@@ -239,7 +240,9 @@ class DepthTask(ViewsTask):
             depth = self._depth_of(images.__getitem__, len(images))
             if truth is not None:
                 self._add_loss(depth, truth, ray_lengths)
-            return distance_of(along_rays(depth[:, 0], kind, ray_lengths), kind)
+            lengths = ray_lengths[:, None]
+            values, kind = uncanonical(depth, kind, lengths)
+            return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
         outputs = []
         for views, of_set, rays in self.view_sets(images, rotation, area):
             depth = self._depth_of(of_set, len(views), rays)

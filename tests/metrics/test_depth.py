@@ -137,15 +137,14 @@ def test_alignments_equal_least_squares_of_numpy(alignment: Alignment, quantity:
         return x if quantity == "distance" else 1 / x
 
     p, g = as_quantity(prediction), as_quantity(truth)
-    scale, shift = {
-        "none": lambda: (1.0, 0.0),
-        "median": lambda: (
-            np.quantile(g[used], 0.5, method="lower") / np.quantile(p[used], 0.5, method="lower"),
-            0.0,
-        ),
-        "scale": lambda: (np.linalg.lstsq(p[used][:, None], g[used])[0][0], 0.0),
-        "affine": lambda: np.polyfit(p[used], g[used], 1),
-    }[alignment]()
+    medians = [np.quantile(x[used], 0.5, method="lower") for x in (g, p)]
+    fits: dict[str, Any] = {
+        "none": (1.0, 0.0),
+        "median": (medians[0] / medians[1], 0.0),
+        "scale": (np.linalg.lstsq(p[used][:, None], g[used])[0][0], 0.0),
+        "affine": np.polyfit(p[used], g[used], 1),
+    }
+    scale, shift = fits[alignment]
     expected = as_quantity(scale * p + shift)
     expected[~(expected > 0)] = np.nan
     aligned = DepthProtocol(alignment, quantity).aligned(

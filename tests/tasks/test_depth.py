@@ -93,7 +93,7 @@ class Right(nn.Module):
 
 
 def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> DepthTask:
-    kind = getattr(network, "kind", "log_distance")
+    kind: Any = getattr(network, "kind", "log_distance")
     settings = {"alignment": "none" if is_metric(kind) else "affine"} | settings
     optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))
     return DepthTask(network, representation, (), optimizer, **settings)
@@ -174,11 +174,9 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
 
 def _network() -> nn.Module:
     torch.manual_seed(0)
-    layers = nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), nn.Conv2d(8, 1, 3, padding=1)
-    network = nn.Sequential(*layers)
-    with torch.no_grad():
-        network[2].bias += 1  # positive
-    return network
+    last = nn.Conv2d(8, 1, 3, padding=1)
+    nn.init.constant_(last.bias, 1)  # type: ignore[arg-type]  # positive
+    return nn.Sequential(nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), last)
 
 
 def _gradients(images_per_chunk: int | None, batch_size: int = 3, **settings: Any) -> list[Tensor]:
