@@ -71,8 +71,8 @@ _LEVERAGE = 2.5
 
 _CONSTANT, _FIXED = 1e-4, 1e-6
 """Spread of a constant view, as a share of its median; and standard deviation of its shift."""
-_RANGE_TO_STD = 2.563
-"""From the 10th to the 90th percentile of a Gaussian, in standard deviations."""
+_RANGE_TO_STD = 1.349
+"""Between the quartiles of a Gaussian, in standard deviations."""
 
 _CORRELATED = 30.0
 """Number of neighboring samples whose errors are alike; priors weigh as much as this many."""
@@ -457,7 +457,7 @@ def _fit_affine(
     center, spread = np.zeros(count), np.ones(count)
     used = np.unique(np.concatenate([first, second]))
     for number in np.unique(view[used]):
-        low, middle, high = np.quantile(value[used[view[used] == number]], (0.1, 0.5, 0.9))
+        low, middle, high = np.quantile(value[used[view[used] == number]], (0.25, 0.5, 0.75))
         center[number], spread[number] = middle, (high - low) / _RANGE_TO_STD
     is_constant = spread <= _CONSTANT * np.abs(center)
     spread = np.where(is_constant, np.abs(center), spread)
