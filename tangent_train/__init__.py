@@ -12,9 +12,9 @@ from tangent_train.imports import import_own_packages
 
 if TYPE_CHECKING:
     from tangent_train.geometry import RingGrid, TangentGrid
+    from tangent_train.inference.applying import apply
     from tangent_train.inference.network import load
     from tangent_train.rendering import (
-        apply,
         equirect_to_tangent,
         tangent_to_equirect,
         tangent_to_labels,
@@ -32,7 +32,12 @@ __all__ = [
 
 import_own_packages()
 
-_HOMES = {"RingGrid": "geometry", "TangentGrid": "geometry", "load": "inference.network"}
+_HOMES = {
+    "RingGrid": "geometry",
+    "TangentGrid": "geometry",
+    "apply": "inference.applying",
+    "load": "inference.network",
+}
 
 
 def __getattr__(name: str) -> Any:

@@ -170,6 +170,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         reader, splits = self.find_images(problems)
         if self.has_distances:
             splits = {s: [f._replace(labels=None) for f in splits[s]] for s in splits}
+            fine = all(f.depth for files in splits.values() for f in problems.without(files))
+            self.require("labels", fine, f"{PIXEL_CLASSES}: `find_images` lists no depth files")
         read = self.reading(reader)
         store = Store.of(self.store, read.store_name, read.settings, read.layout)
         index = DatasetIndex(self.noun, splits, read, read.kind, store)

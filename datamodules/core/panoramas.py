@@ -511,8 +511,8 @@ class _DistanceLabels(_Reading):
             known = steps[steps > 0]
             label_counts[files.name] = np.array([steps.size - known.size, known.size])
             median_m = np.median(known) / STEPS_PER_M if known.size else 0
+            found = f"median distance {median_m:.3g} m" if median_m else "no distance below 128 m"
             if not _USUAL_M[0] <= median_m <= _USUAL_M[1]:
-                found = f"median distance {median_m:.3g} m" if known.size else "no distance at all"
                 warnings.append(f"{files.depth}: {found}; check the units and the missing value.")
 
         return {**super().parts(label_counts, warnings), "depth": count_distances}

@@ -8,7 +8,7 @@ from contextlib import redirect_stdout
 from typing import Any
 
 from datamodules.core.class_weights import label_doubts
-from tangent_train.cli.run import needed_labels
+from tangent_train.cli.run import open_data
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.registry import build_from_config
@@ -24,9 +24,7 @@ def check(settings: Mapping[str, Any]) -> None:
     Args:
         settings: Composed ``check.yaml``.
     """
-    representation = build_from_config(settings["representation"], "representation")
-    given = needed_labels(settings)
-    data = build_from_config(settings["data"], "data", representation=representation, **given)
+    data = open_data(settings)
     terminal = sys.stdout.isatty()
     with redirect_stdout(sys.stderr):  # where progress is printed
         problems, count = data.check()
@@ -48,10 +46,13 @@ def check(settings: Mapping[str, Any]) -> None:
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
             columns = zip(data.label_names, *shares, strict=True)
-            Table("Pixels of each class, %", ["class", *labeled], list(map(list, columns))).print()
+            kind = "class" if data.class_names else "label"
+            rows = list(map(list, columns))
+            Table(f"Pixels of each {kind}, %", [kind, *labeled], rows).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     if getattr(data, "area", None) is not None:
+        representation = build_from_config(settings["representation"], "representation")
         views = [sum(map(len, r.view_sets())) for r in (data.representation, representation)]
         rows, columns = data.representation.image_size
         print_text(

@@ -6,9 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from tangent_train.cli.jobs import Shard
-from tangent_train.cli.run import needed_labels
+from tangent_train.cli.run import open_data
 from tangent_train.console import print_text
-from tangent_train.registry import build_from_config
 
 
 def prepare(settings: Mapping[str, Any]) -> None:
@@ -18,9 +17,7 @@ def prepare(settings: Mapping[str, Any]) -> None:
         settings: Composed ``prepare.yaml``.
     """
     shard = Shard.parse(settings["shard"])
-    representation = build_from_config(settings["representation"], "representation")
-    given = needed_labels(settings)
-    data = build_from_config(settings["data"], "data", representation=representation, **given)
+    data = open_data(settings)
     if shard is not None:
         count = data.prepare_part(shard.part)
         print_text(f"Shard {shard}: {count} {data.noun} are in {data.store}.")

@@ -127,7 +127,8 @@ class Run:
             content = read_checkpoint(checkpoint)
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
-        if getattr(self.data, "upright", None) == "auto":
+        by_classes = self.task.predicts == PIXEL_CLASSES  # else upright=auto is by the image alone
+        if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
@@ -243,11 +244,13 @@ def build(
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
-    if getattr(data, "upright", None) == "auto" and task.predicts != PIXEL_CLASSES:
+    can_align = task.predicts in (PIXEL_CLASSES, DISTANCE)
+    if getattr(data, "upright", None) == "auto" and not can_align:
         raise SettingError(
             "data.upright",
             found=f"auto, with {type(task).__name__}",
-            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES}",
+            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES} or "
+            f"{DISTANCE}",
         )
     try_network(task, data.in_channels)
     if trains:
@@ -257,15 +260,11 @@ def build(
 
 def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -> Any:
     """Build the data module of a run and check that it has the labels of the task; see `build`."""
-    representation = build_from_config(settings["representation"], "representation", source)
     data_set = resolve_target(settings["data"], "data", source)
     if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
-    given = needed_labels(settings, source)
-    data = build_from_config(
-        settings["data"], "data", source, representation=representation, **given
-    )
+    data = open_data(settings, source)
     data.check_classes()
     task = resolve_target(settings["task"], "task", source)
     needed = getattr(task, "labels", data.labels)
@@ -278,15 +277,20 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
     return data
 
 
-def needed_labels(
-    settings: Mapping[str, Any], source: SettingsFile | None = None
-) -> dict[str, Any]:
-    """Return the argument ``labels`` of a data set of images: distances if its task needs them."""
-    data_set = resolve_target(settings["data"], "data", source)
-    task = resolve_target(settings["task"], "task", source)
-    is_needed = getattr(task, "labels", None) == DISTANCE
-    is_possible = isinstance(data_set, type) and issubclass(data_set, ImageDataModule)
-    return {"labels": DISTANCE} if is_needed and is_possible else {}
+def open_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -> Any:
+    """Build the data of a run, unchecked; images have distances as labels if the task needs them.
+
+    Args:
+        settings: Settings of the run.
+        source: File that settings come from, see `registry.build_from_config`.
+    """
+    representation = build_from_config(settings["representation"], "representation", source)
+    task, data_set = (resolve_target(settings[s], s, source) for s in ("task", "data"))
+    is_images = isinstance(data_set, type) and issubclass(data_set, ImageDataModule)
+    has_distances = is_images and getattr(task, "labels", None) == DISTANCE
+    given: dict[str, Any] = {"labels": DISTANCE} if has_distances else {}
+    given["representation"] = representation
+    return build_from_config(settings["data"], "data", source, **given)
 
 
 def build_trained(

@@ -10,7 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tangent_train.checkpoints.content import DepthKind
 from tangent_train.errors import SettingError, at_least
+from tangent_train.inference.alignment import Align
+from tangent_train.inference.depth import combine_depth
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_panorama
@@ -38,12 +41,18 @@ def apply(
     blend: Blend = "feather",
     *,
     images_per_call: int | None = None,
+    align: Align | None = None,
+    kind: DepthKind = "metric_z",
 ) -> Pixels:
     """Apply a function of images to a panorama: scores, depth, features, masks.
 
     The images are rendered a few at a time with `equirect_to_tangent`, and their results are
     rendered back as with `tangent_to_equirect`. Besides the result, only the images of one call are
     held in memory. Sums of more than 2 GiB are kept in a temporary file. There are no gradients.
+
+    With `align`, the results are depth. They are converted to distances along the rays and brought
+    to one scale: views are compared, and blended, in the logarithm of distance, or for disparity in
+    disparity along the ray. The depth of all images is held in memory.
 
     Args:
         function: Maps some images of the panorama's kind and dtype to a result of as many pixels:
@@ -54,10 +63,15 @@ def apply(
         blend: Blending of results that are floats, as in `tangent_to_equirect`. Whole numbers and
             booleans (labels, masks) need ``nearest``: each pixel is copied from its owner.
         images_per_call: Images per call of the function; None for as many as fit into 2^20 pixels.
+        align: Correction of the depth of each image: ``scale``, ``affine`` (a scale and a shift),
+            ``grid`` (also a coarse grid of scales) or ``none``. None for results that are not
+            depth.
+        kind: Kind of depth that the function returns, see `DepthKind`; used with `align`.
 
     Returns:
         An array ``(H, W[, K])``, or a tensor ``(H, W)`` or ``(K, H, W)`` on the panorama's device:
-        float32 if the function returns floats, else the function's dtype.
+        float32 if the function returns floats, else the function's dtype. With `align`, distances
+        ``(H, W)``, NaN where unknown: meters, or for relative kinds a median of 1, by solid angle.
 
     Raises:
         SettingError: The panorama or the blend cannot be used, or the function returns results of
@@ -82,6 +96,8 @@ def apply(
         step = at_least("images_per_call", images_per_call, 1)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     parts: Iterator[_Part] = _results(function, panorama, grid, step)
+    if align is not None:
+        return _like(panorama, _distance(parts, grid, (rows, columns), blend, kind, align))
     start = next(parts)
     first: NDArray[Any] = start[1]
     parts = chain([start], parts)
@@ -144,6 +160,29 @@ def _mean(
         row = row[..., :count] / (row[..., count:] if feather else 1)
         means[i * size : (i + 1) * size] = row.ravel()
     return means[: height * size].reshape(*shape, *channels)
+
+
+def _distance(
+    parts: Iterable[_Part],
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    blend: Blend,
+    kind: DepthKind,
+    align: Align,
+) -> NDArray[np.float32]:
+    """Return the distances ``(H, W)`` of aligned and blended depth."""
+    images = [results for _, results in parts]
+    depth = torch.from_numpy(np.concatenate(images).astype(np.float32))
+    channels = depth.shape[3:]
+    if math.prod(channels) != 1 or images[0].dtype.kind != "f":
+        raise SettingError(
+            "result of the function",
+            found=f"K = {math.prod(channels)} of {images[0].dtype}",
+            expected="one float per pixel, which is depth, with align=",
+        )
+    depth = depth.reshape(-1, 1, *grid.size)
+    found = combine_depth([(PinholeViews(grid), depth)], shape, kind, blend, align)
+    return found.distance.numpy()
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:

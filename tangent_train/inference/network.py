@@ -1,4 +1,4 @@
-"""Trained networks in Python: label files, images in memory and tensors."""
+"""Trained networks in Python: labels and depth of files, images in memory and tensors."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.image_module import Upright
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.panoramas import meters_to_steps
-from datamodules.images.gpano import Fill, PanoramaArea
+from datamodules.images.gpano import Fill
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
+from tangent_train.inference.alignment import Align
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
+from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import (
+    InputImage,
     Picture,
     described,
     read_panorama,
@@ -33,7 +36,6 @@ from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews, ViewChoice
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
-from tangent_train.rendering.mosaic import ScoreMosaic
 
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats in meters, 0 or NaN where missing."""
@@ -55,6 +57,7 @@ def load(
     fill: Fill | None = None,
     images_per_forward: int | None = None,
     min_confidence: float = 0.0,
+    align: Align | None = None,
     trust: str | Sequence[str] = (),
 ) -> Network:
     """Load a trained network from a file, for panoramas and photos.
@@ -81,6 +84,9 @@ def load(
         images_per_forward: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
         min_confidence: Pixels with a lower confidence get the label 0.
+        align: Correction of the views of a depth network: ``none``, ``scale``, ``affine`` (a scale
+            and a shift) or ``grid`` (also a coarse grid of scales). None for ``scale`` of networks
+            that return meters, and ``affine`` of others.
         trust: Full names of classes from other packages that the file may instantiate.
 
     Raises:
@@ -91,18 +97,30 @@ def load(
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
-    original.check_predicts(PIXEL_CLASSES)
     if class_map is not None:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
     chosen = trained, levels, base_level, blend, rotations
-    how = device, images_per_forward, min_confidence
-    panoramas = Predictor(trained, PanoramaViews(*chosen, views, fill), *how)
+    how = device, images_per_forward
+    predictor: Any
+    if trained.predicts == DISTANCE:
+        _check_unset("min_confidence", min_confidence or None, "depth networks")
+        predictor = partial(DepthPredictor, align=align)
+    else:
+        _check_unset("align", align, "networks of classes")
+        predictor = partial(Predictor, min_confidence=min_confidence)
+    panoramas = predictor(trained, PanoramaViews(*chosen, views, fill), *how)
     return Network(
         trained,
         panoramas,
-        lambda: Predictor(trained, PhotoViews(*chosen), *how),
+        lambda: predictor(trained, PhotoViews(*chosen), *how),
         NetworkJudge(original, panoramas.device),
     )
+
+
+def _check_unset(setting: str, value: object, what: str) -> None:
+    """Refuse a setting that would be ignored."""
+    if value is not None:
+        raise SettingError(setting, found=value, expected=f"None for {what}")
 
 
 class Network:
@@ -120,15 +138,15 @@ class Network:
 
     Attributes:
         trained: The network, with its inputs, level and representation.
-        class_names: K + 1 names of the labels, the unknown class first.
+        class_names: K + 1 names of the labels, the unknown class first; none for depth networks.
         palette: ``(K + 1, 3)`` uint8 RGB colors of the labels; ``palette[labels]`` is an image.
     """
 
     def __init__(
         self,
         trained: TrainedNetwork,
-        panoramas: Predictor,
-        photos: Callable[[], Predictor],
+        panoramas: Predictor | DepthPredictor,
+        photos: Callable[[], Predictor | DepthPredictor],
         judge: NetworkJudge,
     ) -> None:
         self.trained = trained
@@ -139,13 +157,14 @@ class Network:
         self._judge = judge
 
     def __repr__(self) -> str:
-        """Return classes, inputs, views and device in one line."""
+        """Return classes or kind of depth, inputs, views and device in one line."""
         trained, names = self.trained, self.class_names[1:]
         shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
+        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({trained.depth_kind})"
         rows, columns = trained.image_size
         kind = str(trained.representation["_target_"]).rpartition(".")[2]
         return (
-            f"<Network of {len(names)} classes ({shown}), inputs {', '.join(trained.inputs)}, "
+            f"<Network of {predicts}, inputs {', '.join(trained.inputs)}, "
             f"trained at level {trained.level} on {columns}×{rows} images of {kind}, "
             f"on {self._panoramas.device}>"
         )
@@ -185,18 +204,53 @@ class Network:
             DataError: A file cannot be used, or the image is not a whole panorama.
             SettingError: The image cannot be used, or the network needs another input.
         """
-        if mask is not None and fov is not None:
-            raise SettingError("mask", found="one, with fov=", expected="None for photos")
-        masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
+        self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         how: dict[str, Any] = {"depth": depth, "fov": fov, "area": area, "upright": upright}
-        mosaic, shown = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
-        labels: Any = self.trained.labels(mosaic.labels())
-        if shown is not None:
-            name = Path(image).stem if isinstance(image, str | Path) else ""
-            labels = shown.cut(np.where(masks.read(name, shown) > 0, labels, labels.dtype.type(0)))
+        mosaic, read = self._predict(image, max_tilt_deg=max_tilt_deg, mask=mask, **how)
+        labels = _cut(self.trained.labels(mosaic.labels()), image, read, mask, 0)
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
+
+    def depth(
+        self,
+        image: Picture,
+        *,
+        fov: float | None = None,
+        area: Sequence[float] | None = None,
+        upright: Upright = None,
+        mask: Mask | str | NDArray[Any] | Tensor = None,
+    ) -> Any:
+        """Return the depth of every pixel: distance from the center, or z-depth in photos.
+
+        Args:
+            image: A panorama, or a photo.
+            fov: See `labels`.
+            area: See `labels`.
+            upright: ``pose`` aligns a panorama with gravity by the GPano tags of its file.
+            mask: Pixels of a panorama that get NaN, see `labels`.
+
+        Returns:
+            ``(H, W)`` float32, NaN where unknown: an array, or a tensor. In meters for networks
+            that return meters. Others have an unknown unit: the median distance is 1, by solid
+            angle (`trained.depth_kind` starts with ``relative``).
+
+        Raises:
+            DataError: See `labels`.
+            SettingError: See `labels`; or the views cannot be aligned in this way.
+        """
+        self.trained.check_predicts(DISTANCE, "Use labels() or scores() of this network.")
+        if upright == "auto":
+            raise SettingError(
+                "upright",
+                found="auto",
+                expected="pose or None for depth networks: auto needs the confidence of classes",
+                remedy="Use pose for files with GPano tags, or a network of classes to align it.",
+            )
+        found, read = self._predict(image, fov=fov, area=area, upright=upright, mask=mask)
+        depth = found.depth(read.camera_matrix)
+        depth = _cut(depth.cpu().numpy(), image, read, mask, np.nan)
+        return torch.from_numpy(depth).to(image.device) if isinstance(image, Tensor) else depth
 
     def scores(self, image: Picture, **settings: Any) -> Any:
         """Return the probability of every class at every pixel.
@@ -214,10 +268,11 @@ class Network:
             DataError: See `labels`.
             SettingError: See `labels`.
         """
-        mosaic, shown = self._predict(image, probabilities=True, **settings)
+        self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
+        mosaic, read = self._predict(image, probabilities=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        if shown is not None:
-            scores = torch.from_numpy(np.ascontiguousarray(shown.cut(scores.cpu().numpy())))
+        if read.area is not None:
+            scores = torch.from_numpy(np.ascontiguousarray(read.area.cut(scores.cpu().numpy())))
         if isinstance(image, Tensor):
             return scores.movedim(-1, 0).contiguous().to(image.device)
         return scores.contiguous().cpu().numpy()
@@ -231,16 +286,19 @@ class Network:
         area: Sequence[float] | None = None,
         upright: Any = None,
         max_tilt_deg: float = 60.0,
-        probabilities: bool = False,
-    ) -> tuple[ScoreMosaic, PanoramaArea | None]:
-        """Predict a photo, or a panorama with the area of the sphere that it covers."""
+        mask: Any = None,
+        **settings: Any,
+    ) -> tuple[Any, InputImage]:
+        """Predict a photo or a panorama; return the result and the image."""
+        if mask is not None and fov is not None:
+            raise SettingError("mask", found="one, with fov=", expected="None for photos")
         of_size = partial(self._depth, depth)
         if fov is not None:
             if area is not None or upright is not None:
                 given = "area" if area is not None else "upright"
                 raise SettingError(given, found="one, with fov=", expected="None for photos")
             photo = read_photo(image, fov, of_size)
-            return self._photos().predict(photo, probabilities=probabilities), None
+            return self._photos().predict(photo, **settings), photo
         if upright is not None:
             check_choice("upright", upright, ("pose", "auto"))
             if upright == "pose" and not isinstance(image, str | Path):
@@ -250,10 +308,10 @@ class Network:
                     expected="auto or None: only files have GPano tags",
                     remedy="Give the path of the panorama.",
                 )
-        panorama, shown = read_panorama(image, area, upright, of_size)
+        panorama, _ = read_panorama(image, area, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._judge)
-        return self._panoramas.predict(panorama, probabilities=probabilities), shown
+        return self._panoramas.predict(panorama, **settings), panorama
 
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
         """Return depth in steps of 1/512 m; refuse depth of another size or kind."""
@@ -271,3 +329,15 @@ class Network:
                 else f"None: the network's inputs are {' and '.join(self.trained.inputs)}",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
+
+
+def _cut(
+    result: NDArray[Any], image: Any, read: InputImage, mask: Any, unknown: float
+) -> NDArray[Any]:
+    """Return the result ``(H, W)`` for the area of a panorama, with masked pixels unknown."""
+    if read.area is None:
+        return result
+    masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
+    name = Path(image).stem if isinstance(image, str | Path) else ""
+    is_shown = masks.read(name, read.area) > 0
+    return read.area.cut(np.where(is_shown, result, result.dtype.type(unknown)))

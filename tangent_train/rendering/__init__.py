@@ -4,7 +4,6 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
-from tangent_train.rendering.applying import apply
 from tangent_train.rendering.backward import tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.camera_files import (
     CameraFile,
@@ -40,7 +39,6 @@ __all__ = [
     "RigFile",
     "RingRepresentation",
     "TangentRepresentation",
-    "apply",
     "equirect_to_tangent",
     "read_cameras",
     "read_rig",

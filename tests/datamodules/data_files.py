@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 import zlib
 from collections.abc import Mapping
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.index import Split
+from datamodules.core.panoramas import resize_nearest
 from datamodules.core.split_module import SplitDataModule
 
 GPANO_TAGS = {
@@ -38,6 +40,23 @@ def read_png(path: Path) -> NDArray[Any]:
     image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     assert image is not None
     return image
+
+
+def nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
+    """Reduce depth slowly: look at every source pixel of every footprint."""
+    out = resize_nearest(depth, shape).copy()
+    (H, W), (h, w) = depth.shape, shape
+    for i, j in np.ndindex(h, w):
+        top, bottom, left, right = i * H / h, (i + 1) * H / h, j * W / w, (j + 1) * W / w
+        inside = [
+            (np.hypot(y + 0.5 - (top + bottom) / 2, x + 0.5 - (left + right) / 2), depth[y, x])
+            for y in range(int(top), min(math.ceil(bottom) + 1, H))
+            for x in range(int(left), min(math.ceil(right) + 1, W))
+            if top <= y + 0.5 <= bottom and left <= x + 0.5 <= right and depth[y, x]
+        ]
+        if out[i, j] == 0 and inside:
+            out[i, j] = min(inside, key=lambda pair: pair[0])[1]
+    return out
 
 
 def png_bytes(

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import CubeGrid, TangentGrid, equirect_directions, rotation_about
-from tangent_train.rendering import Blend, apply, equirect_to_tangent, tangent_to_equirect
+from tangent_train.inference.applying import apply
+from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 
 TURNED = TangentGrid(0, 5, rotation=rotation_about((1, 2, 3), 1.0))
 Function = Callable[[Any], Any]

@@ -8,11 +8,11 @@ import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation
 from tangent_train.geometry.icosphere_signals import IcosphereElements
+from tangent_train.inference.applying import apply
 from tangent_train.metrics import SegmentationMetric
 from tangent_train.rendering import (
     Blend,
     Interpolation,
-    apply,
     equirect_to_tangent,
     tangent_to_equirect,
     tangent_to_labels,

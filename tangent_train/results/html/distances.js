@@ -3,7 +3,7 @@
 class Distances {
   constructor(scale, sphere, colors) {
     Object.assign(this, scale, { sphere, colors });
-    this.noun = sphere || !scale.camera ? "distance" : "depth";
+    this.noun = sphere || !scale.camera ? "distance" : "z-depth";
     this.unit = scale.is_metric ? "m" : "relative";
     this.logs = [scale.near, scale.far, ...scale.limits].map(Math.log);
   }
@@ -65,10 +65,10 @@ class Scene {
     return Math.tan(25 * DEGREE);
   }
 
-  // Distance of the eye at which the scene fits; the ball around it has room to spare.
+  // Distance of the eye at which the scene fits.
   get fitting() {
     const reach = (this.reach * Math.min(...this.canvas)) / 2 / this.half;
-    return (0.8 * this.radius) / Math.sin(Math.atan(reach));
+    return (0.95 * this.radius) / Math.sin(Math.atan(reach));
   }
 
   get axes() {

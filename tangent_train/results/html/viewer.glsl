@@ -89,7 +89,6 @@ void main() {
   float share = uSphere ? max(cos((0.5 - vUv.y) * PI), 1.0 / float(size.x)) : 1.0;
   vec4 here = pointOf(at);
   if (here.w == 0.0 || floor(float(at.x + 1) * share) == floor(float(at.x) * share)) return;
-  float angle = uSphere ? PI / float(size.y) : 1.0 / (uCamera.x * float(size.x));
   vec3 seen = here.xyz - uEye;
   int columns = min(int(round(float(REACH) / share)), max(size.x / 4, 1));
   vec3 across = along(here.xyz, at, ivec2(columns, 0));
@@ -97,12 +96,15 @@ void main() {
   // Surfaces show their side towards the center; walls in front of the scene are left out.
   vec3 normal = cross(across, down);
   if (sign(dot(normal, here.xyz)) * dot(normal, seen) < -0.1 * length(normal) * length(seen)) return;
-  float apart = max(length(across), length(down)) / float(REACH);
-  float gap = angle * length(here.xyz) * clamp(apart / (angle * length(here.xyz)), 1.0, 3.0);
+  // Points are squares that cover the gap to the next ones, but not beyond edges.
+  float reach = ceil(1.0 / share) / float(columns);
+  float gap = max(reach * length(across), length(down) / float(REACH));
+  float pitch = (uSphere ? PI / float(size.y) : 1.0 / (uCamera.x * float(size.x))) * length(here.xyz);
+  gap = 1.45 * clamp(gap, pitch, 3.0 * pitch);
   vec3 view = vec3(dot(seen, uRight), dot(seen, uUp), dot(seen, uAhead));
   float side = 0.5 * max(uCanvas.x, uCanvas.y);
   gl_Position = vec4(view.xy / uReach * 2.0 * side / uCanvas, view.z - 2.0 * uNear, view.z);
-  gl_PointSize = clamp(1.5 * gap / (uReach * view.z) * side, 1.0, 32.0);
+  gl_PointSize = clamp(gap / (uReach * view.z) * side, 1.0, 32.0);
 }
 #else
 out vec4 color;

@@ -4,9 +4,9 @@ from typing import Literal
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from datamodules.core.panoramas import mask_black, resize_area, resize_depth, resize_nearest
+from tests.datamodules.data_files import nearest_valid
 
 # --- sizes -------------------------------------------------------------------------------------
 
@@ -26,29 +26,12 @@ def test_colors_are_means_of_areas() -> None:
     np.testing.assert_allclose(resize_area(rgb, (8, 16)), means, atol=0.501)
 
 
-def _nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
-    """Slow and independent: look at every source pixel of every footprint."""
-    out = resize_nearest(depth, shape).copy()
-    (H, W), (h, w) = depth.shape, shape
-    for i, j in np.ndindex(h, w):
-        top, bottom, left, right = i * H / h, (i + 1) * H / h, j * W / w, (j + 1) * W / w
-        inside = [
-            (np.hypot(y + 0.5 - (top + bottom) / 2, x + 0.5 - (left + right) / 2), depth[y, x])
-            for y in range(H)
-            for x in range(W)
-            if top <= y + 0.5 <= bottom and left <= x + 0.5 <= right and depth[y, x]
-        ]
-        if out[i, j] == 0 and inside:
-            out[i, j] = min(inside, key=lambda pair: pair[0])[1]
-    return out
-
-
 @pytest.mark.parametrize("shape", [(12, 24), (4, 8), (3, 6), (5, 10)])
 def test_depth_is_that_of_the_nearest_valid_pixel(shape: tuple[int, int]) -> None:
     rng = np.random.default_rng(3)
     depth = rng.integers(1, 2000, (12, 24), np.uint16)
     depth[rng.random(depth.shape) < 0.7] = 0
-    small, reference = resize_depth(depth, shape), _nearest_valid(depth, shape)
+    small, reference = resize_depth(depth, shape), nearest_valid(depth, shape)
     assert small.dtype == np.uint16
     np.testing.assert_array_equal(small, reference)
 

@@ -18,6 +18,8 @@ from playwright.sync_api import Browser, ConsoleMessage, FloatRect, Page, sync_p
 PROGRAMS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 # WebGL on the processor; no sandbox, as containers often run as root.
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox")
+TOLERANCE = 6  # of 255: JPEG and interpolation
+EDGE = 8  # pixels at the rounded corners of the canvas
 # Two frames: what an event asked for has been drawn. Playwright waits for promises without end.
 DRAWN = """() => new Promise((done, failed) => {
   setTimeout(() => failed(new Error("no frame was drawn in 20 s")), 20_000);
@@ -35,6 +37,15 @@ def chromium() -> Iterator[Browser]:
         browser = playwright.chromium.launch(executable_path=program, args=list(ARGUMENTS))
         yield browser
         browser.close()
+
+
+def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
+    """All colors equal within the tolerance, but for a share of the pixels."""
+    assert shown.shape == expected.shape
+    if shown.ndim == 3:
+        shown, expected = (image[EDGE:-EDGE, EDGE:-EDGE] for image in (shown, expected))
+    far = np.abs(shown - expected).max(axis=-1) > TOLERANCE
+    assert far.mean() <= but, f"{far.sum()} of {far.size} pixels, first at {np.argwhere(far)[:3]}"
 
 
 @dataclass
@@ -115,10 +126,20 @@ class OpenReport:
 
 
 @contextmanager
-def opened(browser: Browser, path: Path) -> Iterator[OpenReport]:
-    """Open a report in a window; afterwards there must be no errors and no requests."""
-    window = browser.new_context(viewport={"width": 600, "height": 800})
+def opened(
+    browser: Browser, path: Path, *, before: str = "", touch: bool = False
+) -> Iterator[OpenReport]:
+    """Open a report in a window; afterwards there must be no errors and no requests.
+
+    Args:
+        browser: Browser.
+        path: The report.
+        before: Script that runs before those of the page.
+        touch: True for a window with a touch screen.
+    """
+    window = browser.new_context(viewport={"width": 600, "height": 800}, has_touch=touch)
     window.set_default_timeout(20_000)
+    window.add_init_script(before)
     report = OpenReport(window.new_page())
 
     def record(message: ConsoleMessage) -> None:

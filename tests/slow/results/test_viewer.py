@@ -18,15 +18,13 @@ from tangent_train.geometry import equirect_directions
 from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.tables import Table
 from tests.rendering.reference import sample_panorama, to_lonlat
-from tests.slow.results.browser import OpenReport, chromium, opened
+from tests.slow.results.browser import EDGE, OpenReport, close, opened
 
 HEIGHT, WIDTH = 251, 503  # odd, no powers of two
 PHOTO = (120, 200)
 NAMES = ("unknown", *(f"octant {k}" for k in range(1, 8)), "<i>last</i>")
 COLORS = class_colors(len(NAMES)).astype(np.int64)
 START_DEG, PLANET_DEG = 95.0, 250.0
-TOLERANCE = 6  # of 255: JPEG and interpolation
-EDGE = 8  # pixels at the rounded corners of the canvas
 WRONG, UNLABELED = (214, 39, 40), (110, 110, 110)
 
 
@@ -59,15 +57,6 @@ def photo() -> EncodedImage:
     rgb = np.stack([40 + 180 * u, 40 + 180 * v, 0 * u + 90], axis=-1).round().astype(np.uint8)
     prediction = (1 + 2 * (v > 0.5) + (u > 0.5)).astype(np.uint8)
     return encode_image("a photo", rgb, len(NAMES), prediction=prediction, sphere=False)
-
-
-def close(shown: NDArray[Any], expected: NDArray[Any], but: float = 0.0) -> None:
-    """All colors equal within the tolerance, but for a share of the pixels."""
-    assert shown.shape == expected.shape
-    if shown.ndim == 3:
-        shown, expected = (image[EDGE:-EDGE, EDGE:-EDGE] for image in (shown, expected))
-    far = np.abs(shown - expected).max(axis=-1) > TOLERANCE
-    assert far.mean() <= but, f"{far.sum()} of {far.size} pixels, first at {np.argwhere(far)[:3]}"
 
 
 def view_of(
@@ -107,13 +96,6 @@ def view_of(
 def step_rad(report: OpenReport) -> float:
     """Angle that one pixel of a drag turns: what lies in the middle follows the pointer."""
     return math.tan(math.radians(START_DEG) / 2) / (max(report.box()[2:]) / 2)
-
-
-# Not for the whole session: while it runs, no other test could start an event loop.
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with chromium() as running:
-        yield running
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,219 @@
+"""Depth of whole panoramas and photos: views are aligned with each other, then blended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import torch
+
+from datamodules.core.labels import DISTANCE
+from tangent_train.checkpoints.distances import distance_of, is_metric, uncanonical
+from tangent_train.inference.alignment import Align, photo_points, sample_views, sphere_points
+from tangent_train.inference.alignment import align as align_views
+from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
+from tangent_train.rendering.checks import check_choice
+from tangent_train.rendering.mosaic import DepthMosaic
+from tangent_train.rendering.representations.views import lengths_of_rays
+from tangent_train.rendering.sampling import sphere_rays
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
+
+    from numpy.typing import NDArray
+    from torch import Tensor
+
+    from tangent_train.checkpoints.content import DepthKind
+    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.geometry import SphereArea
+    from tangent_train.inference.alignment import AlignmentReport
+    from tangent_train.inference.images import InputImage
+    from tangent_train.inference.representations import PanoramaViews, PhotoViews
+    from tangent_train.rendering import Blend
+    from tangent_train.rendering.representations.views import Views
+
+_MEDIAN_ROWS = 256
+"""Rows, and columns, from which the median distance is computed, at least."""
+
+
+@dataclass(frozen=True)
+class DistanceMap:
+    """Distances from the center along the rays of a panorama or photo.
+
+    Attributes:
+        distance: ``(H, W)`` float32, NaN where unknown: meters, or multiples of the median.
+        is_metric: True for meters. False for a median distance of 1, by solid angle.
+        report: Facts about the alignment of the views.
+    """
+
+    distance: Tensor
+    is_metric: bool
+    report: AlignmentReport
+
+    def depth(self, camera_matrix: NDArray[np.float64] | None) -> Tensor:
+        """Return what users get: z-depth of a photo, distance of a panorama.
+
+        Args:
+            camera_matrix: ``(3, 3)`` K of the photo; None for a panorama.
+        """
+        if camera_matrix is None:
+            return self.distance
+        lengths = _photo_ray_lengths(camera_matrix, self.distance.shape)
+        return self.distance / torch.from_numpy(lengths).to(self.distance)
+
+
+def combine_depth(
+    outputs: Sequence[tuple[Views, Tensor]],
+    shape: tuple[int, int],
+    kind: DepthKind,
+    blend: Blend,
+    align: Align | None = None,
+    *,
+    area: SphereArea | None = None,
+    camera_matrix: NDArray[np.float64] | None = None,
+) -> DistanceMap:
+    """Align the depth of all views of a panorama or photo, and blend it.
+
+    Views are blended in the logarithm of distance, or in disparity for networks that return it.
+
+    Args:
+        outputs: Sets of views that each cover the image, and the network's output for all views of
+            a set, ``(n, 1, h, w)``.
+        shape: ``(H, W)`` of the panorama or photo.
+        kind: Kind of the output.
+        blend: Blend of the views.
+        align: See `Align`; None for that of the kind, and `none` for a single view.
+        area: Area of a partial panorama: views are compared inside it. None for the whole sphere.
+        camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
+
+    Raises:
+        SettingError: The views cannot be aligned in this way.
+    """
+    points = sphere_points(shape) if camera_matrix is None else photo_points(shape)
+    if area is not None and not area.is_whole:
+        points = points[area.contains(_directions(shape, *points.T))]
+    sets, samples, count = [], [], 0
+    for views, raw in outputs:
+        lengths = torch.from_numpy(views.ray_lengths()).to(raw)
+        depth, found_kind = uncanonical(raw, kind, lengths[:, None])
+        samples.append(sample_views(depth[:, 0].cpu().numpy(), views, shape, points))
+        sets.append((views, depth, lengths, count))
+        count += len(views)
+    kind = found_kind
+    alignment = align_views(samples, kind, align if count > 1 else "none")
+    mosaic = DepthMosaic(shape, blend, device=outputs[0][1].device)
+    for views, depth, lengths, start in sets:
+        step = views_per_forward((depth.shape[-2], depth.shape[-1]))
+        for first in range(0, len(views), step):
+            part = slice(first, min(first + step, len(views)))
+            numbers = slice(start + part.start, start + part.stop)
+            of_part = lengths[part] if len(lengths) > 1 else lengths
+            mosaic.add(alignment.applied(depth[part], numbers, of_part), views[part])
+    distance = distance_of(mosaic.values(), kind)
+    if not is_metric(kind):
+        distance = distance / _median(distance, area, camera_matrix)
+    return DistanceMap(distance, is_metric(kind), alignment.report)
+
+
+class DepthPredictor(ViewPredictor):
+    """Predicts the depth of whole panoramas or photos.
+
+    Args:
+        trained: See `ViewPredictor`; a depth network.
+        view_sets: Selects the views of an image.
+        device: See `ViewPredictor`.
+        images_per_forward: See `ViewPredictor`.
+        align: See `combine_depth`.
+
+    Raises:
+        SettingError: See `ViewPredictor`; or the network predicts classes.
+    """
+
+    def __init__(
+        self,
+        trained: TrainedNetwork,
+        view_sets: PanoramaViews | PhotoViews,
+        device: str = "cpu",
+        images_per_forward: int | None = None,
+        align: Align | None = None,
+    ) -> None:
+        trained.check_predicts(DISTANCE)
+        check_choice("align", align or "none", get_args(Align))
+        super().__init__(trained, view_sets, device, images_per_forward)
+        self._kind: Any = trained.depth_kind
+        self._align = align
+
+    @torch.no_grad()
+    def predict(
+        self, image: InputImage, progress: Callable[[float], object] = lambda share: None
+    ) -> DistanceMap:
+        """Predict the distances of one image at its own resolution.
+
+        Args:
+            image: A panorama or photo.
+            progress: Called with the share of the image that was predicted since the last call.
+
+        Raises:
+            SettingError: The views cannot be aligned in this way.
+        """
+        sets, outputs = self._sets(image), []
+        count = sum(len(views) for views, _, _ in sets)
+        for views, images, rays in sets:
+            depth = []
+            for part, output in view_scores(
+                self._network, images, len(views), self._per_forward, rays
+            ):
+                depth.append(output)
+                progress((part.stop - part.start) / count)
+            outputs.append((views, torch.cat(depth)))
+        return combine_depth(
+            outputs,
+            image.shape,
+            self._kind,
+            self._view_sets.blend,
+            self._align,
+            area=None if image.area is None else image.area.sphere,
+            camera_matrix=image.camera_matrix,
+        )
+
+
+def _median(
+    distance: Tensor, area: SphereArea | None, camera_matrix: NDArray[np.float64] | None
+) -> float:
+    """Return the median of known distances, weighted by solid angle; 1 if all are unknown."""
+    rows, columns = (np.arange(0, side, max(1, side // _MEDIAN_ROWS)) for side in distance.shape)
+    values = distance[torch.from_numpy(rows)][:, torch.from_numpy(columns)].cpu().numpy()
+    if camera_matrix is None:
+        directions = _directions(distance.shape, rows[:, None], columns)
+        weight = np.hypot(directions[..., 0], directions[..., 1])
+        if area is not None:
+            weight *= area.contains(directions)
+    else:
+        weight = _photo_ray_lengths(camera_matrix, distance.shape)[rows][:, columns] ** -3.0
+    known = np.isfinite(values) & (weight > 0)
+    order = np.argsort(values[known])
+    total = weight[known][order].cumsum()
+    if not len(total):
+        return 1.0
+    return float(values[known][order][np.searchsorted(total, total[-1] / 2)])
+
+
+def _directions(
+    shape: Sequence[int], rows: NDArray[np.int64], columns: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """Return the directions ``(..., 3)`` of pixels of a panorama."""
+    of_columns, of_rows = sphere_rays((shape[0], shape[1]))
+    (x, y), (across, z) = of_columns[:, columns], np.moveaxis(of_rows[rows], -1, 0)
+    return np.stack(np.broadcast_arrays(across * x, across * y, z), axis=-1)
+
+
+def _photo_ray_lengths(
+    camera_matrix: NDArray[np.float64], shape: Sequence[int]
+) -> NDArray[np.float32]:
+    """Return distance divided by z-depth at every pixel of a photo, ``(H, W)``."""
+    y, x = (
+        (np.arange(shape[i]) - camera_matrix[1 - i, 2]) / camera_matrix[1 - i, 1 - i]
+        for i in (0, 1)
+    )
+    return lengths_of_rays(x[None], y[None])[0]

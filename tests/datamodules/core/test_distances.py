@@ -1,0 +1,350 @@
+"""Distances as labels: those of every data set with depth, as its files hold them."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from datamodules import (
+    Cityscapes,
+    DensePASS,
+    FolderPanoramas,
+    FolderPhotos,
+    Matterport360,
+    OmniSynthia,
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    Structured3D,
+    Structured3DPerspective,
+    SynPASS,
+    SynthiaPerspective,
+    SynthRooms,
+    SynthRoomsPerspective,
+    Zind,
+)
+from datamodules.core.image_module import ImageDataModule
+from datamodules.core.labels import DISTANCE
+from datamodules.synthia.omnisynthia import SEQUENCES
+from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import equirect_directions, perspective_directions
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tests.conftest import fabricate
+from tests.datamodules.conftest import TINY_ROOMS
+from tests.datamodules.data_files import nearest_valid, read_png, write_png
+from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.photo_format import write_cameras, write_photos
+from tests.datamodules.matterport360.matterport_format import write_matterport
+from tests.datamodules.structured3d.structured3d_format import HALF_ANGLES, write_structured3d
+from tests.datamodules.synthia.synthia_format import CENTER_X, CENTER_Y, FOCAL, write_views
+
+Depth = NDArray[np.float64]
+UNEVEN = EquirectRepresentation(3, crop_deg=90, erp_height=16)
+CROPS = PerspectiveRepresentation(5, fov_deg=25)
+_POSE = np.eye(3, 4).tolist()
+SHIFTED = [[41.0, 0, 13.5], [0, 52.0, 18.25], [0, 0, 1]]
+"""K that counts from the corners of pixels, with different focal lengths."""
+
+
+class Source(NamedTuple):
+    """A data set whose depth files are overwritten with random numbers and holes.
+
+    Attributes:
+        module: Class of the data set.
+        write: Function that writes its files.
+        pattern: Depth files.
+        units_per_m: Units of the files.
+        camera: Focal lengths and center (from centers of pixels) of a photo; None for panoramas.
+        settings: Further settings.
+    """
+
+    module: type[ImageDataModule]
+    write: Callable[[Path], object]
+    pattern: str
+    units_per_m: float
+    camera: tuple[float, float, float, float] | None = None
+    settings: Mapping[str, Any] = {}
+
+
+def _stanford_photos(root: Path) -> None:
+    fabricate(root, dict.fromkeys("123456", ("office_1",)) | _BOTH, photos=1)
+    for path in root.glob("*/data/pose/*.json"):
+        path.write_text(json.dumps({"camera_k_matrix": SHIFTED, "camera_rt_matrix": _POSE}))
+
+
+def _folder_photos(root: Path) -> None:
+    write_photos(root, scenes=5)
+    write_cameras(root, {".": {"fx": 60, "fy": 50, "cx": 20, "cy": 30.5}})
+    for path in (root / "images").rglob("*.*"):
+        values = read_png(root / "labels" / path.relative_to(root / "images").with_suffix(".png"))
+        write_png(root / "depth" / path.parent.name / f"{path.stem}.png", values.astype(np.uint16))
+    (root / "classes.json").unlink()
+
+
+def _folder(root: Path) -> None:
+    write_data_set(root, scenes=5, height=40, depth=True)
+    (root / "classes.json").unlink()
+    for path in root.glob("labels/*/*"):
+        path.unlink()
+
+
+_BOTH = dict.fromkeys(("5a", "5b"), ("office_1",))
+_HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
+SOURCES = {
+    "stanford2d3ds": Source(
+        Stanford2D3DS,
+        lambda root: fabricate(root, dict.fromkeys("12346", ("office_1",)) | _BOTH, height=40),
+        "area_*/pano/depth/*.png",
+        512,
+    ),
+    "structured3d": Source(
+        *(Structured3D, lambda root: write_structured3d(root, height=40)),
+        *("*/*/*/panorama/full/depth.png", 1000),
+    ),
+    "matterport360": Source(
+        Matterport360, lambda root: write_matterport(root, height=40), "*/depth/*.png", 4000
+    ),
+    "sfss": Source(
+        *(Matterport360, lambda root: write_matterport(root, height=40)),
+        *("*/panorama/undistorted_depth_images/*.png", 4000),
+        settings={"release": "sfss"},
+    ),
+    "folder": Source(
+        FolderPanoramas, _folder, "depth/*/*.png", 250, settings={"depth_units_per_m": 250}
+    ),
+    "stanford2d3ds_perspective": Source(
+        *(Stanford2D3DSPerspective, _stanford_photos, "area_*/data/depth/*.png", 512),
+        (41, 52, 13, 17.75),
+    ),
+    "structured3d_perspective": Source(
+        Structured3DPerspective,
+        lambda root: write_structured3d(root, photos=True),
+        "*/*/*/perspective/full/*/depth.png",
+        1000,
+        (*_HALF, 15.5, 15.5),
+    ),
+    "synthia_perspective": Source(
+        *(SynthiaPerspective, lambda root: write_views(root, dict.fromkeys(SEQUENCES, 2))),
+        *("*/Depth/Stereo_Left/*/*.png", 100),
+        (FOCAL, FOCAL, CENTER_X - 0.5, CENTER_Y - 0.5),
+    ),
+    "folder_photos": Source(
+        FolderPhotos, _folder_photos, "depth/*/*.png", 1000, (60, 50, 20, 30.5)
+    ),
+}
+
+
+def _overwrite(source: Source, root: Path) -> None:
+    """Write random depth, a third of it missing."""
+    for seed, path in enumerate(sorted(root.glob(source.pattern))):
+        rng = np.random.default_rng(seed)
+        stored = rng.integers(1, 65000, read_png(path).shape[:2], np.uint16)
+        missing = 65535 if source.units_per_m == 512 else 0
+        stored[rng.random(stored.shape) < 1 / 3] = missing
+        write_png(path, stored)
+
+
+@pytest.fixture(scope="module", params=SOURCES)
+def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """A source and its files; not to be changed."""
+    source, root = SOURCES[request.param], tmp_path_factory.mktemp("data") / "d"
+    root.mkdir()
+    source.write(root)
+    _overwrite(source, root)
+    return source, root
+
+
+def _data(source: Source, root: Path, representation: Any = None, **changes: Any) -> Any:
+    representation = representation or (UNEVEN if source.camera is None else CROPS)
+    given = {"labels": DISTANCE, "inputs": ["rgb"], **source.settings, **changes}
+    return source.module(root, representation, **given)
+
+
+def _distance_m(source: Source, path: Path, rows: int | None) -> Depth:
+    """Read a depth file in float64, 0 where unknown."""
+    stored = read_png(path)
+    stored[stored == 65535] = 0
+    if rows is not None:
+        stored = nearest_valid(stored, (rows, 2 * rows))
+    meters = stored / source.units_per_m
+    if source.camera is not None:
+        fx, fy, cx, cy = source.camera
+        v, u = np.indices(stored.shape)
+        meters = meters * np.sqrt(1 + ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2)
+    return np.where(meters < 65534.5 / 512, meters, 0)  # more than 16 bits hold
+
+
+def test_labels_are_the_distances_of_the_files(made: tuple[Source, Path]) -> None:
+    source, root = made
+    data = _data(source, root)
+    assert (data.class_names, data.num_classes, "classes" in data.facts) == ((), 0, False)
+    rows = None if source.camera else 16
+    images = data.images("test")
+    assert len(images)
+    for files, image in zip(data.index().splits["test"], images, strict=True):
+        expected = _distance_m(source, files.parts["depth"], rows)
+        assert image.labels.dtype == np.uint16
+        # z-depth is rounded before it is lengthened.
+        tolerance = 1.3 / 512 if source.camera else 0.501 / 512
+        np.testing.assert_allclose(image.labels / 512, expected, rtol=0, atol=tolerance)
+        assert 0.2 < (image.labels == 0).mean() < 0.95 or rows
+        np.testing.assert_array_equal(np.isnan(image.distance_m), image.labels == 0)
+        np.testing.assert_allclose(np.nan_to_num(image.distance_m) * 512, image.labels)
+
+
+def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: Path) -> None:
+    source, root = made
+    batches = []
+    for settings in ({}, {"store": tmp_path}, {"in_memory": True}):
+        data = _data(source, root, **settings)
+        data.prepare_data()
+        training, test = data.dataset("train")[1, 0], data.dataset("test")[0]
+        assert {training.labels.dtype, test.target.dtype} == {torch.int32}
+        batches.append((*training.images, training.labels, *test.images, test.target))
+        assert int(test.target.max()) > 2**11, "labels are not classes"
+    for others in batches[1:]:
+        for one, other in zip(batches[0], others, strict=True):
+            torch.testing.assert_close(one, other, rtol=0, atol=0)
+    classes = {"labels": "pixel_classes"}
+    if source.module not in (FolderPanoramas, FolderPhotos):  # they have no classes here
+        data = _data(source, root, store=tmp_path, **classes)
+        data.prepare_data()
+        assert data.dataset("test")[0].target.max() < 50
+    assert len(list(tmp_path.iterdir())) == 1 + (source.module.__name__[:6] != "Folder")
+
+
+def test_missing_and_broken_depth_is_named(tmp_path: Path, made: tuple[Source, Path]) -> None:
+    source, _ = made
+    source.write(tmp_path)
+    data = _data(source, tmp_path)
+    gone, cut, *_ = (files.parts["depth"] for files in data.index().of())
+    gone.unlink()
+    cut.write_bytes(cut.read_bytes()[:-20])
+    problems, _ = _data(source, tmp_path).check()
+    found = sorted(str(problem.file) for problem in problems.listed())
+    assert [name.removesuffix(".png") for name in found] == sorted(
+        str(path).removesuffix(".png") for path in (gone, cut)
+    )
+    with pytest.raises(DataError, match=r"depth"):
+        _data(source, tmp_path).prepare_data()
+    left = _data(source, tmp_path, skip_broken=True)
+    left.prepare_data()
+    assert len(left.index().of()) == len(data.index().of()) - 2
+
+
+def test_synthetic_photos_see_the_distances_of_the_panorama(tiny_rooms: Path) -> None:
+    given: Any = {"rooms": TINY_ROOMS, "labels": DISTANCE, "inputs": ["rgb"]}
+    data = SynthRoomsPerspective(tiny_rooms, PerspectiveRepresentation(2), **given)
+    panoramas = SynthRooms(tiny_rooms, EquirectRepresentation(3), **given).panoramas("test")
+    pairs: Any = zip(panoramas, data.photos("test"), strict=True)
+    shares = []
+    for panorama, photo in pairs:
+        assert photo.name.startswith(panorama.name)
+        rays = perspective_directions(photo.camera_matrix, photo.labels.shape) @ CAMERA_FROM_SPHERE
+        world = rays @ photo.pose.world_from_panorama.T
+        rows, columns = _pixels(world @ panorama.pose.world_from_panorama, 16)
+        ratio = photo.distance_m / panorama.distance_m[rows, columns]
+        shares.append((np.abs(np.log(ratio)) < 0.1)[np.isfinite(ratio)].mean())
+    assert min(shares) > 0.75, "but for edges: the panorama has 16 rows"
+
+
+def _pixels(directions: Depth, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows and columns of a panorama at directions ``(…, 3)``."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    columns = np.floor((np.arctan2(y, x) / np.pi + 1) * height).astype(int) % (2 * height)
+    rows = np.floor((0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * height).astype(int)
+    return np.clip(rows, 0, height - 1), columns
+
+
+# --- masks, rotation, areas, crops ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rotation", [None, "so3"])
+def test_masked_and_rotated_distances_keep_their_values(
+    tmp_path: Path, rotation: str | None
+) -> None:
+    source = SOURCES["stanford2d3ds"]
+    fabricate(tmp_path, dict.fromkeys("12346", ("office_1",)) | _BOTH)
+    _overwrite(source, tmp_path)
+    erp = EquirectRepresentation(4)
+    changes: dict[str, Any] = {"mask": -30, "unknown": "any_black", "test_rotation": rotation}
+    data = _data(source, tmp_path, erp, **changes)
+    files = data.index().splits["test"][0]
+    expected = (_distance_m(source, files.parts["depth"], None) * 512).round()
+    expected[np.deg2rad(90 - (np.arange(32) + 0.5) * 180 / 32) < np.deg2rad(-30)] = 0
+    expected[(read_png(files.rgb)[..., :3] == 0).any(-1)] = 0
+    if rotation:
+        R = data.source("test").transforms[-1].rotation(0)
+        expected = expected[_pixels(equirect_directions((32, 64)) @ R, 32)]
+    target = data.dataset("test")[0].target.numpy()
+    assert (target == expected).mean() > 0.99, "but for rounding at the borders of pixels"
+    assert 0.2 < (target > 0).mean() < 0.5
+
+
+def test_crops_of_a_photo_have_the_distances_of_its_pixels(tmp_path: Path) -> None:
+    """Every pixel of the photo is in one crop; its distance is along its ray in the photo."""
+    source = SOURCES["stanford2d3ds_perspective"]
+    source.write(tmp_path)
+    data = _data(source, tmp_path)
+    files = data.index().splits["test"][0]
+    matrix = np.array(SHIFTED) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+    # A plane across the optical axis at 3 m: distances grow with the angle to the axis.
+    write_png(files.parts["depth"], np.full((32, 32), 3 * 512, np.uint16))
+    photo, target = data.source("test").read(0), data.dataset("test")[0].target.numpy()
+    (crops,) = photo.sampler(CROPS).view_sets()
+    v, u = np.indices((32, 32)).astype(np.float32)
+    x, y = ((c - matrix[i, 2]) / matrix[i, i] for c, i in ((u, 0), (v, 1)))
+    place = [crops.render(a.astype(np.float32), "nearest") for a in (x, y)]
+    expected = 3 * np.sqrt(1 + place[0].astype(np.float64) ** 2 + place[1] ** 2)
+    owned = target > 0
+    np.testing.assert_allclose(target[owned] / 512, expected[owned], atol=0.51 / 512)
+    np.testing.assert_array_equal(owned, crops.owned())
+
+
+# --- what cannot be used -------------------------------------------------------------------------
+
+
+def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
+    write_data_set(tmp_path, scenes=3, each=1, depth=True)
+    for name, meters in (("scene_0", 0.01), ("scene_1", 0), ("scene_2", 120)):
+        stored = np.full((32, 64), meters * 250, np.uint16)
+        stored[:8] = 0
+        write_png(tmp_path / "depth" / name / "view.0.png", stored)
+    data = _data(SOURCES["folder"], tmp_path, validation_fraction=0, labels=DISTANCE)
+    problems, _ = data.check()
+    near, none, far = sorted(problems.warnings)
+    assert near.startswith(str(tmp_path / "depth/scene_0/view.0.png: median distance 0.00"))
+    assert "scene_1/view.0.png: no distance below 128 m" in none
+    assert "scene_2/view.0.png: median distance 120 m" in far
+    counts = sum(data.label_counts.values())
+    np.testing.assert_array_equal(counts, [4096 - 2 * 1536 + 2048, 2 * 1536])
+
+
+@pytest.mark.parametrize(
+    ("data", "settings", "message"),
+    [
+        *(
+            (module, {}, r"data\.labels: found distance; .*Choose|data=synthrooms")
+            for module in (Cityscapes, DensePASS, SynPASS, Zind, OmniSynthia)
+        ),
+        (Stanford2D3DS, {"inputs": ["rgb", "depth"]}, r"data\.inputs: .*no depth: .*\[rgb\]"),
+        (Stanford2D3DS, {"classes": 8}, r"data\.classes: found 8; expected null"),
+        (Stanford2D3DS, {"label_table": "a.json"}, r"data\.label_table: .*expected null"),
+        (Matterport360, {"classes": 20}, r"data\.classes: found 20; expected null"),
+    ],
+)
+def test_settings_without_a_meaning_for_distances_are_refused(
+    data: Any, settings: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    representation = CROPS if data is Cityscapes else UNEVEN
+    given = {"labels": DISTANCE, "inputs": ["rgb"], **settings}
+    with pytest.raises(SettingError, match=message):
+        data(tmp_path, representation, **given)
