@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tangent_train.results.predictions import Painter
+
 _POINTS = 500_000
 _SAMPLES = 2**16
 """Pixels whose median is that of an image."""
@@ -144,13 +146,12 @@ class DepthResults(ImageResults):
         depth = read_depth_m(file, self._units_per_m)
         return np.where(depth > 0, depth, np.float32(np.nan))
 
-    def paint(
-        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
-    ) -> NDArray[np.uint8]:
+    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
         """Color depth by the range of all frames of the video."""
         ranges = [c for entry in entries if (c := entry["depth"].get("colors"))]
         near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
-        return colorize_distance(pixels, (min(near), max(far)))
+        limits = min(near), max(far)
+        return lambda rgb, depth: colorize_distance(depth, limits)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return unit, shares of the solid angle, distances, range of the colors, alignment."""

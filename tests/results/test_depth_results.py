@@ -100,7 +100,8 @@ def test_a_video_has_one_range_of_colors() -> None:
     everywhere = np.array(True)
     entries = [{"depth": results.summarize(frame, everywhere)} for frame in frames]
     assert [entry["depth"].get("median") for entry in entries] == [1, 4, None, 9]
-    painted = [results.paint("color", f.image.rgb, f.pixels, entries)[0, 0] for f in frames]
+    paint = results.painter("color", entries)
+    painted = [paint(frame.image.rgb, frame.pixels)[0, 0] for frame in frames]
     assert (painted[0] == distance_colors()[0]).all()
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
