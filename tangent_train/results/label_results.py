@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.rendering.mosaic import ScoreMosaic
+    from tangent_train.results.predictions import Painter
 
 _ROWS_AT_ONCE = 64
 
@@ -79,7 +80,7 @@ class LabelResults(ImageResults):
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write labels and pictures."""
-        image, labels, area = predicted
+        image, labels, area, _ = predicted
         if "labels" in files:
             write_pixels(files["labels"], labels)
         if "color" in files:
@@ -111,12 +112,12 @@ class LabelResults(ImageResults):
         """Read labels."""
         return read_pixels(file, indices=True)
 
-    def paint(
-        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
-    ) -> NDArray[np.uint8]:
+    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
         """Color the labels, or overlay the frame with them."""
         count = len(self.class_names)
-        return colorize(pixels, count) if kind == "color" else mixed_picture(rgb, pixels, count)
+        if kind == "color":
+            return lambda rgb, labels: colorize(labels, count)
+        return lambda rgb, labels: mixed_picture(rgb, labels, count)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the shares of the classes."""
@@ -132,6 +133,6 @@ class LabelResults(ImageResults):
 
     def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
         """Compress an image with its labels."""
-        (image, labels, area), count = predicted, len(self.class_names)
+        (image, labels, area, _), count = predicted, len(self.class_names)
         placed = labels if area is None else area.place(labels)
         return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)
