@@ -90,13 +90,26 @@ def is_metric(kind: DepthKind) -> bool:
     return not kind.startswith("relative")
 
 
+def _widths_per_focal(ray_lengths: Tensor) -> Tensor | float:
+    """Return the width of images in focal lengths, from their ray lengths ``(…, h, w)``.
+
+    At columns of distance d, the second difference of 1 + x² is 2 (d p)², with the pitch p of
+    pixels on the image plane. Images that are not pinhole images count as equirectangular.
+    """
+    width = ray_lengths.shape[-1]
+    if width == 1:
+        return 2 * math.pi
+    half = (width - 1) // 2
+    left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+    squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+    return squared.sqrt() * width / half
+
+
 def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Tensor, DepthKind]:
     """Convert `canonical_inverse` to `metric_z`; other kinds are returned unchanged.
 
-    The inverse depth C is divided by the focal length in image widths (Bochkovskii et al. 2024,
-    section 3.2). That follows from the rays: at columns of distance d, the second difference of
-    1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as in
-    the authors' code.
+    The inverse depth is multiplied by the width in focal lengths (Bochkovskii et al. 2024, section
+    3.2). Depth is at most 10 km, as in the authors' code.
 
     Args:
         depth: Values of whole images, ``(n, 1, h, w)``.
@@ -108,20 +121,8 @@ def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Te
     """
     if kind != "canonical_inverse":
         return depth, kind
-    width = ray_lengths.shape[-1]
-    if width == 1:  # not a pinhole image: the radians of an equirectangular image
-        span: Any = 2 * math.pi
-    else:
-        half = (width - 1) // 2
-        left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
-        squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
-        span = squared.sqrt() * width / half
-    return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
-
-
-def _check_kind(kind: DepthKind) -> None:
-    if kind == "canonical_inverse":
-        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
+    inverse = depth * _widths_per_focal(ray_lengths)
+    return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
 
 
 def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
@@ -137,7 +138,8 @@ def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
         logarithm of the distance. NaN where the depth is not finite, or not positive where its
         logarithm is taken.
     """
-    _check_kind(kind)
+    if kind == "canonical_inverse":
+        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
     if kind == "log_distance":
         values = depth
     elif is_disparity(kind):
@@ -154,13 +156,15 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
     Args:
         distance: Distances.
         kind: Kind of the result.
-        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+        ray_lengths: Distance divided by z-depth at each pixel ``(…, h, w)``, see
+            `Views.ray_lengths`.
     """
-    _check_kind(kind)
     if kind == "log_distance":
         return distance.log()
     if kind == "metric_distance":
         return distance
+    if kind == "canonical_inverse":
+        return ray_lengths / (distance * _widths_per_focal(ray_lengths))
     return ray_lengths / distance if is_disparity(kind) else distance / ray_lengths
 
 
