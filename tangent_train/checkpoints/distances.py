@@ -90,26 +90,13 @@ def is_metric(kind: DepthKind) -> bool:
     return not kind.startswith("relative")
 
 
-def _widths_per_focal(ray_lengths: Tensor) -> Tensor | float:
-    """Return the width of images in focal lengths, from their ray lengths ``(…, h, w)``.
-
-    At columns of distance d, the second difference of 1 + x² is 2 (d p)², with the pitch p of
-    pixels on the image plane. Images that are not pinhole images count as equirectangular.
-    """
-    width = ray_lengths.shape[-1]
-    if width == 1:
-        return 2 * math.pi
-    half = (width - 1) // 2
-    left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
-    squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
-    return squared.sqrt() * width / half
-
-
 def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Tensor, DepthKind]:
     """Convert `canonical_inverse` to `metric_z`; other kinds are returned unchanged.
 
-    The inverse depth is multiplied by the width in focal lengths (Bochkovskii et al. 2024, section
-    3.2). Depth is at most 10 km, as in the authors' code.
+    The inverse depth C is divided by the focal length in image widths (Bochkovskii et al. 2024,
+    section 3.2). That follows from the rays: at columns of distance d, the second difference of
+    1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as in
+    the authors' code.
 
     Args:
         depth: Values of whole images, ``(n, 1, h, w)``.
@@ -121,8 +108,19 @@ def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Te
     """
     if kind != "canonical_inverse":
         return depth, kind
-    inverse = depth * _widths_per_focal(ray_lengths)
-    return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+    span = _span(ray_lengths)
+    return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+
+
+def _span(ray_lengths: Tensor) -> Any:
+    """Return the width of images ``(…, h, w)`` on the image plane at distance 1."""
+    width = ray_lengths.shape[-1]
+    if width == 1:  # not a pinhole image: the radians of an equirectangular image
+        return 2 * math.pi
+    half = (width - 1) // 2
+    left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+    squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+    return squared.sqrt() * width / half
 
 
 def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
@@ -154,17 +152,16 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
     """Convert distances along the rays to depth of a kind: the inverse of `distance_of`.
 
     Args:
-        distance: Distances.
+        distance: Distances ``(n, …, h, w)``.
         kind: Kind of the result.
-        ray_lengths: Distance divided by z-depth at each pixel ``(…, h, w)``, see
-            `Views.ray_lengths`.
+        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
     """
+    if kind == "canonical_inverse":
+        return ray_lengths / (distance * _span(ray_lengths))
     if kind == "log_distance":
         return distance.log()
     if kind == "metric_distance":
         return distance
-    if kind == "canonical_inverse":
-        return ray_lengths / (distance * _widths_per_focal(ray_lengths))
     return ray_lengths / distance if is_disparity(kind) else distance / ray_lengths
 
 
