@@ -216,9 +216,12 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
             torch.testing.assert_close(one, other, rtol=0, atol=0)
     classes = {"labels": "pixel_classes"}
     if source.module not in (FolderPanoramas, FolderPhotos):  # they have no classes here
-        data = _data(source, root, store=tmp_path, **classes)
+        data = _data(source, root, store=tmp_path, in_memory=True, **classes)
         data.prepare_data()
-        assert data.dataset("test")[0].target.max() < 50
+        target = data.dataset("test")[0].target
+        assert 0 < target.max() < 50
+        target.zero_()
+        assert data.dataset("test")[0].target.max() > 0, "a copy of what is in memory"
     assert len(list(tmp_path.iterdir())) == 1 + (source.module.__name__[:6] != "Folder")
 
 
