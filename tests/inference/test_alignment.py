@@ -273,7 +273,6 @@ def test_views_that_cannot_be_compared_are_reported(kind: Kind) -> None:
     assert report.isolated == tuple(range(20, 26))
     assert report.constant == ((7,) if kind.startswith("relative") else ())
     assert 0.05 < report.invalid < 0.3
-    assert len(report.lines()) == 5 + (kind.startswith("relative"))
     assert (found.scale[[2, 5, *range(20, 26)]] == 1).all()
     assert (found.shift[[2, 5, 7, *range(20, 26)]] == 0).all()
     assert np.isfinite(found.scale).all()
