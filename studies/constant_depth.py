@@ -27,9 +27,9 @@ def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
     known = np.sort(steps[steps > 0]).astype(np.float64)
     share = np.cumsum(1 / known)  # the absolute relative error weights an error by 1 / distance
     constant = known[np.searchsorted(share, share[-1] / 2)]
-    rows = np.ma.median(np.ma.masked_equal(steps.swapaxes(0, 1).reshape(steps.shape[1], -1), 0), 1)
-    filled = rows.filled(np.median(known))[:, None]
-    found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": filled}
+    rows = (steps[:, row][steps[:, row] > 0] for row in range(steps.shape[1]))
+    of_rows = np.array([[np.median(row if row.size else known)] for row in rows])
+    found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": of_rows}
     return {name: np.atleast_2d(value) / STEPS_PER_M for name, value in found.items()}
 
 
@@ -44,7 +44,7 @@ def main() -> None:
     data.make_files()
     train, test, view = data.source("train"), data.source("test"), data.representation
     targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
-    empty = {"network": nn.Identity(), "class_names": (), "optimizer": None}
+    empty: Any = {"network": nn.Identity(), "class_names": (), "optimizer": None}
     for name, meters in constants(np.stack(targets)).items():
         task = build_from_config(settings["task"], "task", representation=view, **empty)
         for index in range(len(test)):

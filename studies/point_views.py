@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from datamodules.images.pixel_files import read_depth_m
 from tangent_train.geometry import FLIP_Y, equirect_directions
 
-SIDE = 360
+SIDE = 320
 """Rows and columns of a view."""
 
 _HEAD_M = 0.6  # the floor plan leaves out the ceiling, and the sides what is behind the camera
@@ -56,7 +57,8 @@ def main() -> None:
     parser.add_argument("depth", type=Path, nargs="+", metavar="<depth>")
     parser.add_argument("--depth_scale", type=float, default=1000, help="units per meter")
     arguments = parser.parse_args()
-    rgb = cv2.imread(arguments.panorama)[..., ::-1]
+    bgr: Any = cv2.imread(arguments.panorama)
+    rgb = bgr[..., ::-1]
     rays = equirect_directions(rgb.shape[:2]) @ FLIP_Y
     depths = [read_depth_m(path, arguments.depth_scale) for path in arguments.depth]
     clouds = [rays * np.where(depth > 0, depth, np.nan)[..., None] for depth in depths]
