@@ -36,9 +36,9 @@ def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
 def main() -> None:
     """Print the scores of each constant."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("settings", nargs="+", metavar="<setting>=<value>")
+    parser.add_argument("overrides", nargs="+", metavar="setting=value")
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", parser.parse_args().settings)
+        config = compose("train", parser.parse_args().overrides)
     settings: Any = OmegaConf.to_container(config, resolve=True)
     data = build_data(settings)
     data.make_files()
