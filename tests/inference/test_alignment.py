@@ -244,7 +244,7 @@ def test_noise_does_not_shrink_scales(noise: float) -> None:
 
 
 def test_unobservable_shifts_remain_small() -> None:
-    """Without different ray lengths, only the prior knows that 0 is the center of projection."""
+    """Without different ray lengths, only the prior determines the shift of all views."""
     truth, rng = _truth("ring"), np.random.default_rng(3)
     samples = truth.samples._replace(ray_length=np.ones(len(truth.distance)))
     scale = np.exp(rng.normal(0, 0.5, samples.num_views))[samples.view]
