@@ -98,6 +98,7 @@ def _folder(root: Path) -> None:
 
 
 _BOTH = dict.fromkeys(("5a", "5b"), ("office_1",))
+_SCENES = (0, 1, 2, 3000, 3250)
 _HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
 SOURCES = {
     "stanford2d3ds": Source(
@@ -107,7 +108,7 @@ SOURCES = {
         512,
     ),
     "structured3d": Source(
-        *(Structured3D, lambda root: write_structured3d(root, height=40)),
+        *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
         *("*/*/*/panorama/full/depth.png", 1000),
     ),
     "matterport360": Source(
@@ -127,7 +128,7 @@ SOURCES = {
     ),
     "structured3d_perspective": Source(
         Structured3DPerspective,
-        lambda root: write_structured3d(root, photos=True),
+        lambda root: write_structured3d(root, _SCENES, photos=True),
         "*/*/*/perspective/full/*/depth.png",
         1000,
         (*_HALF, 15.5, 15.5),
@@ -360,8 +361,9 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
     ("data", "settings", "message"),
     [
         *(
-            (module, {}, r"data\.labels: found distance; .*Choose|data=synthrooms")
+            (module, settings, r"data\.labels: found distance; .* choose data=synthrooms")
             for module in (Cityscapes, DensePASS, SynPASS, Zind, OmniSynthia)
+            for settings in ({}, {"classes": 13, "inputs": ["rgb", "depth"]})
         ),
         (Stanford2D3DS, {"inputs": ["rgb", "depth"]}, r"data\.inputs: .*no depth: .*\[rgb\]"),
         (Stanford2D3DS, {"classes": 8}, r"data\.classes: found 8; expected null"),
