@@ -1,4 +1,4 @@
-"""Depth in OpenEXR images, read by the OpenEXR package (the extra ``exr``)."""
+"""Depth in OpenEXR images, by the OpenEXR package (the extra ``exr``)."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.images.png import check_pixels
 from tangent_train.errors import DataError, of_extra
+from tangent_train.files import atomic_path
 
 _PREFERRED = ("Z", "Y", "V", "R")
 _CONVERT = "Save the depth alone, or convert it to a float TIFF or .npy file."
@@ -54,6 +56,19 @@ def read_exr(path: Path) -> NDArray[Any]:
     if pixels.shape != size or pixels.dtype == object:
         raise _refused(path, "subsampled or deep pixels", "one depth per pixel")
     return pixels
+
+
+def write_exr(path: Path, pixels: NDArray[Any]) -> None:
+    """Write ``(H, W)`` float32 pixels as channel Z, atomically.
+
+    Raises:
+        SettingError: The OpenEXR package is missing.
+    """
+    with of_extra("exr", path):
+        import OpenEXR
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with atomic_path(path) as temporary:
+        OpenEXR.File(header, {"Z": np.ascontiguousarray(pixels)}).write(str(temporary))
 
 
 @contextmanager

@@ -19,7 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
 from PIL.ExifTags import Base as Tag
 
-from datamodules.images.exr import read_exr, read_exr_size
+from datamodules.images.exr import read_exr, read_exr_size, write_exr
 from datamodules.images.image_files import IMAGE_FORMATS
 from datamodules.images.png import (
     MOST_PIXELS,
@@ -345,6 +345,29 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
         missing |= stored == _MISSING_UNITS
     depth[missing] = 0
     return depth
+
+
+def most_depth_m(suffix: str, units_per_m: float) -> float:
+    """Return the largest depth that `write_depth_m` writes to files of a suffix."""
+    return (_MISSING_UNITS - 1) / units_per_m if suffix == ".png" else math.inf
+
+
+def write_depth_m(path: Path, depth_m: NDArray[np.floating], units_per_m: float) -> None:
+    """Write a depth map that `read_depth_m` reads.
+
+    Args:
+        path: 16-bit PNG, ``.npy`` or OpenEXR image; the last two hold float32 meters.
+        depth_m: ``(H, W)`` meters, NaN where unknown.
+        units_per_m: Units per meter in a PNG file, where 0 is unknown. Depth beyond `most_depth_m`
+            becomes unknown too.
+    """
+    if path.suffix != ".png":
+        write = write_exr if path.suffix == ".exr" else write_pixels
+        write(path, np.asarray(depth_m, np.float32))
+        return
+    units = np.maximum(np.rint(np.asarray(depth_m, np.float64) * units_per_m), 1)
+    is_written = (depth_m > 0) & (units < _MISSING_UNITS)
+    write_pixels(path, np.where(is_written, units, 0).astype(np.uint16))
 
 
 def read_array(path: Path) -> NDArray[Any]:

@@ -73,6 +73,9 @@ def _check_class_map(name: str, value: Any) -> None:
         _check_exists(name, Path(value))
 
 
+Align = Literal["none", "scale", "affine", "grid"]
+OutputKind = Literal["labels", "color", "overlay", "probabilities", "depth", "points"]
+
 _EXISTS = {"check": _check_exists}
 _IMAGES = {"check": _check_pattern}
 _CLASS_MAP = {"check": _check_class_map}
@@ -118,7 +121,10 @@ class PredictSettings(InputSettings):
     mask: float | Path | None = field(metadata=_EXISTS)
     min_confidence: float
     min_share: float
-    write: tuple[Literal["labels", "color", "overlay", "probabilities"], ...]
+    align: Align | None
+    write: tuple[OutputKind, ...] | None
+    depth_format: Literal["png", "npy", "exr"] | None
+    points: int | None
     report: int
     overwrite: bool
     resume: bool

@@ -1,4 +1,4 @@
-"""``tangent-predict``: predict labels of panoramas and photos."""
+"""``tangent-predict``: predict labels or depth of panoramas and photos."""
 
 from __future__ import annotations
 
@@ -20,9 +20,14 @@ from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
-from tangent_train.cli.predict_labels import LabelPrediction, ReadsImage
+from tangent_train.cli.predict_kinds import (
+    PREDICTIONS,
+    DepthPrediction,
+    LabelPrediction,
+    ReadsImage,
+)
 from tangent_train.cli.predict_shards import PredictionShard
-from tangent_train.cli.settings import parse_settings
+from tangent_train.cli.settings import check_unread, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
@@ -39,7 +44,7 @@ from tangent_train.results.predictions import (
 _DECISIVE = (
     "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
     "levels", "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
-    "min_confidence", "min_share", "every",
+    "min_confidence", "min_share", "align", "depth_format", "points", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
 
@@ -63,7 +68,7 @@ def predict(config: Mapping[str, Any]) -> None:
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_trained(settings.checkpoint, settings.trust)
     views = _views(settings, trained)
-    prediction = LabelPrediction(settings, trained, views)
+    prediction = PREDICTIONS[trained.predicts](settings, trained, views)
     if isinstance(views, PanoramaViews):
         print_text(f"{prediction.announcement} in {views.description(settings.area)}.")
     results = prediction.results
@@ -175,7 +180,7 @@ class _Images:
     def __init__(
         self,
         settings: PredictSettings,
-        prediction: LabelPrediction,
+        prediction: LabelPrediction | DepthPrediction,
         folder: PredictionFolder,
         depth: DepthFolder | None,
         shown: Sequence[str],
@@ -295,12 +300,10 @@ def _views(settings: PredictSettings, trained: TrainedNetwork) -> PanoramaViews 
 
 def _check_projection(settings: PredictSettings) -> None:
     """Refuse settings of photos for panoramas, and of panoramas for photos."""
-    is_photo = settings.projection == "perspective"
-    others = ("area", "upright", "mask", "views") if is_photo else ("fov",)
-    for name in others:
-        if (found := getattr(settings, name)) is not None:
-            expected = "null for photos" if is_photo else "null without projection=perspective"
-            raise SettingError(name, found=found, expected=expected)
+    if settings.projection == "perspective":
+        check_unread(settings, "for photos", area=None, upright=None, mask=None, views=None)
+    else:
+        check_unread(settings, "without projection=perspective", fov=None)
 
 
 def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

@@ -79,7 +79,7 @@ class LabelResults(ImageResults):
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write labels and pictures."""
-        image, labels, area = predicted
+        image, labels, area, _ = predicted
         if "labels" in files:
             write_pixels(files["labels"], labels)
         if "color" in files:
@@ -132,6 +132,6 @@ class LabelResults(ImageResults):
 
     def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
         """Compress an image with its labels."""
-        (image, labels, area), count = predicted, len(self.class_names)
+        (image, labels, area, _), count = predicted, len(self.class_names)
         placed = labels if area is None else area.place(labels)
         return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)

@@ -166,6 +166,29 @@ def overlay_picture(rgb: _Image, labels: NDArray[np.integer], class_names: Seque
     return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
 
 
+def distance_picture(distance: NDArray[np.floating], unit: str) -> _Image:
+    """Color distances above a bar of the colors with the first and the last distance.
+
+    Args:
+        distance: Distances ``(H, W)``, see `colorize_distance`.
+        unit: Unit that is printed after the distances.
+
+    Returns:
+        RGB image of the same width, higher by the bar, whose text grows with the width.
+    """
+    limits = distance_limits(distance)
+    width = distance.shape[1]
+    scale = max(1, round(width / _LEGEND_WIDTH))
+    bar = np.full((22 * scale, width, 3), 255, np.uint8)
+    near, far = (f"{limit:.3g} {unit}" for limit in limits)
+    left, right = ((16 + 9 * len(text)) * scale for text in (near, far))
+    ramp = np.linspace(0, 255, max(0, width - left - right)).astype(np.uint8)
+    bar[4 * scale : 18 * scale, left : left + len(ramp)] = distance_colors()[ramp]
+    _text(bar, near, (4 * scale, 16 * scale), scale)
+    _text(bar, far, (width - right + 8 * scale, 16 * scale), scale)
+    return np.concatenate([colorize_distance(distance, limits), bar])
+
+
 def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
     """Overlay the lightness of a picture with its labels.
 

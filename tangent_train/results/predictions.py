@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -53,11 +54,13 @@ class PredictedImage(NamedTuple):
         image: Photo, or image of the whole sphere.
         pixels: Prediction ``(h, w)`` for the image, or for its area; see `ImageResults`.
         area: Part of the sphere that the prediction covers; None for photos.
+        facts: Further facts about the prediction, for its summary.
     """
 
     image: InputImage
     pixels: NDArray[Any]
     area: PanoramaArea | None = None
+    facts: Mapping[str, Any] = MappingProxyType({})
 
 
 def solid_angles(predicted: PredictedImage) -> Iterator[NDArray[np.float64]]:

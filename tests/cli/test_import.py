@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from onnx import helper
 from torchvision import models as torchvision_models
 
 import tangent_train as tt
@@ -184,6 +185,92 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
         expected = network(weights.transforms()(photo)[None])["out"]
         found = trained.network(((photo / 255 - mean) / std)[None])
     torch.testing.assert_close(found, expected, atol=1e-4, rtol=1e-4)
+
+
+# Depth.
+
+OF_DEPTH = ("network=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx")
+
+
+@pytest.mark.parametrize("squeezed", [True, False])
+def test_an_onnx_file_predicts_depth(squeezed: bool, here: Path, run: Run, capsys: Capture) -> None:
+    """Of shape (B, h, w) or (B, 1, h, w), for images of any size."""
+    after = [helper.make_node("Squeeze", ["linear", "axes"], ["scores"])] if squeezed else []
+    axes = {"axes": np.array([1])} if squeezed else {}
+    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), *after, **axes)
+    run("import", *OF_DEPTH, "depth=metric_z", "image_size=32")
+    printed = capsys.readouterr().out
+    assert "depth: metric_z\nthe network returns z-depth in meters\n" in printed
+    assert "panoramas: 16 views of 32 × 32 (130° wide" in printed
+    assert printed.splitlines()[-1].startswith("panoramas"), "no remarks"
+    trained = load_trained(here / "ours.onnx")
+    assert (trained.depth_kind, trained.predicts, trained.class_names) == (
+        "metric_z",
+        "distance",
+        (),
+    )
+    images = torch.rand(2, 3, 32, 32)
+    torch.testing.assert_close(trained.network(images), 1 + images.sum(1, keepdim=True))
+
+
+def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capture) -> None:
+    """A remark is printed, because its depth may be negative."""
+    torch.manual_seed(0)
+    network = UNet(3, 1, (16, 32, 64, 128, 256)).eval()
+    torch.save(network.state_dict(), here / "state.pt")
+    given = ("network=unet_small", "weights=state.pt", "normalization=unit", "output=net.ckpt")
+    run("import", *given, "depth=relative_disparity", "image_size=32")
+    assert (
+        "it returns negative numbers, which relative_disparity should not be, from -"
+        in capsys.readouterr().out
+    )
+    trained = load_trained(here / "net.ckpt")
+    assert trained.depth_kind == "relative_disparity"
+    images = torch.randn(2, 3, 32, 32)
+    with torch.no_grad():
+        torch.testing.assert_close(trained.network(images), network(images))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (
+            (*OF_DEPTH, "depth=metric_z", "classes=classes.json"),
+            "classes: found classes.json; .*de",
+        ),
+        ((*OF_DEPTH, "depth=metric_z", "unknown_classes=[sky]"), "unknown_classes: found .*depth"),
+        ((*OF_DEPTH, "depth=metric_z", "unknown_wins=false"), "unknown_wins: found False; .*depth"),
+        ((*OF_DEPTH, "depth=metric_z", "scores=logits"), "scores: found logits; .*predicts depth"),
+        ((*OF_DEPTH, "depth=meters"), "depth: found meters; expected .*metric_z"),
+        ((*OF_ONNX, "output=ours.onnx", "depth=metric_z"), "classes: found classes.json"),
+        (
+            (
+                "network=onnx",
+                "file=net.onnx",
+                "normalization=unit",
+                "output=o.onnx",
+                "depth=metric_z",
+            ),
+            "found 4 per pixel, .*Leave out depth=",
+        ),
+        (
+            (*TORCHVISION, "model=lraspp_mobilenet_v3_large", "weights=s.pt", "depth=metric_z"),
+            "depth",
+        ),
+    ],
+)
+def test_settings_of_depth_and_of_classes_exclude_each_other(
+    given: tuple[str, ...], message: str, here: Path, run: Run
+) -> None:
+    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32))
+    if "network=torchvision" in given:
+        network = torchvision_models.get_model("lraspp_mobilenet_v3_large", weights_backbone=None)
+        torch.save(network.state_dict(), here / "s.pt")
+        message = (
+            "depth: found metric_z; expected its default, because the network predicts classes"
+        )
+    with pytest.raises(SystemExit, match=message):
+        run("import", *given)
 
 
 # Default views.

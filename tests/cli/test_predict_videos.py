@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from datamodules.images.palette import class_colors
 from datamodules.images.videos import read_frames
+from tangent_train.results.pictures import colorize_distance
+from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import hide_start, read_png
 from tests.inference.trained import CLASS_NAMES, sphere
@@ -231,3 +233,45 @@ def test_a_shard_has_whole_videos(tmp_path: Path, predict: Predict) -> None:
     assert not _labels(out / "labels" / "a")["000003"][24:].any()
     of_shard = json.loads((out / "shards" / "1-of-2.json").read_text())["images"]
     assert {entry["name"].partition("/")[0] for entry in of_shard} == {"a", "c"}
+
+
+def test_depth_of_an_interrupted_video(
+    tmp_path: Path, predict: Predict, monkeypatch: Patch, capsys: Capture
+) -> None:
+    """It is the same as without interruption; the video has one range of colors."""
+    video = _write_video(tmp_path / "in" / "walk.mp4")
+    checkpoint = write_depth_checkpoint(tmp_path / "net.ckpt")
+    settings: dict[str, Any] = {"checkpoint": checkpoint, "input": video}
+    settings |= {"write": "[depth,color,points]", "points": 100, "align": "none"}
+    predict(**settings, output="whole")
+
+    def interrupted(path: Path, *arguments: int) -> Any:
+        for number, frame in enumerate(read_frames(path, *arguments)):
+            if number == 4:
+                raise KeyboardInterrupt
+            yield frame
+
+    with monkeypatch.context() as patch:
+        patch.setattr("tangent_train.cli.input_files.read_frames", interrupted)
+        with pytest.raises(SystemExit):
+            predict(**settings)
+    assert "4 of 7 images are done. Continue with resume=true" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="resume: found align=scale, which differs"):
+        predict(**(settings | {"align": "scale"}), resume="true")
+    kept = tmp_path / "out" / "depth" / "walk" / "000003.png"
+    before = kept.stat().st_mtime_ns
+    entries = predict(**settings, resume="true")
+    assert kept.stat().st_mtime_ns == before
+    assert [entry["frame"] for entry in entries.values()] == list(range(7))
+    for name in ("summary.csv", *(f"depth/walk/{n:06d}.png" for n in range(7))):
+        found, expected = (tmp_path / folder / name for folder in ("out", "whole"))
+        assert found.read_bytes() == expected.read_bytes(), name
+    assert len(list((tmp_path / "out" / "points" / "walk").glob("*.ply"))) == 7
+    near = min(entry["depth"]["colors"][0] for entry in entries.values())
+    far = max(entry["depth"]["colors"][1] for entry in entries.values())
+    depth = np.stack([read_png(path) for path in sorted(kept.parent.glob("*.png"))]) / 1000
+    colors = np.stack([colorize_distance(frame, (near, far)) for frame in depth])
+    made, _ = _decoded(tmp_path / "out" / "color" / "walk.mp4")
+    assert np.abs(made - colors.astype(float)).mean() < 8
+    with pytest.raises(SystemExit, match="write: found color of a video without depth"):
+        predict(**(settings | {"write": "[color]"}), output="other")

@@ -18,13 +18,13 @@ _METRIC: Sequence[DepthKind] = "metric_z", "metric_distance"
 _RELATIVE: Sequence[DepthKind] = "relative_disparity", "relative_depth"
 _FAMILIES: dict[str, Sequence[DepthKind]] = {
     "depth_pro": ("canonical_inverse",),
+    "metric": _METRIC,  # Depth Anything: its depth_estimation_type
+    "relative": _RELATIVE,
     "glpn": _METRIC,
     "tipsv2_dpt": _METRIC,
     "zoedepth": _METRIC,
 }
-"""Possible kinds of networks in transformers, the usual one first: all of these learn meters."""
-
-_TYPES = {"depth_estimation_type: metric": _METRIC, "depth_estimation_type: relative": _RELATIVE}
+"""Possible kinds of networks in transformers, the usual one first."""
 
 _REFUSED = {
     "chmv2": "heights of trees in aerial images, which are not distances from the camera",
@@ -53,19 +53,16 @@ def declared_kind(config: Mapping[str, Any], path: Path, given: DepthKind | None
         SettingError: The config does not determine the kind, or contradicts `given`.
     """
     name = str(config.get("model_type"))
+    if name == "depth_anything":
+        name = str(config.get("depth_estimation_type", "relative"))
     if name in _REFUSED:
         raise DataError(path, found=f"{name}: {_REFUSED[name]}", expected="depth of photos")
-    kinds, reason = _FAMILIES.get(name, ()), f"model_type: {name}"
-    if "depth_estimation_type" in config or name == "depth_anything":
-        reason = f"depth_estimation_type: {config.get('depth_estimation_type', 'relative')}"
-        if reason not in _TYPES:
-            raise DataError(path, found=reason, expected="relative or metric")
-        kinds = _TYPES[reason]
+    kinds = _FAMILIES.get(name, ())
     if given is None and not kinds:
         expected = f"one of {', '.join(get_args(DepthKind))}, which {path} does not contain"
         raise SettingError("depth", found="none", expected=expected, remedy=_NAMES)
     if given is not None and kinds and given not in kinds:
-        expected = f"{' or '.join(kinds)}, as {path} has {reason}"
+        expected = f"{' or '.join(kinds)}, because {path} has {name}"
         raise SettingError("depth", found=given, expected=expected)
     return given or kinds[0]
 
@@ -86,26 +83,21 @@ def try_depth(network: PhotoNetwork) -> list[str]:
     """
     network.network.eval()
     kind = network.depth_kind
-    outputs = [trial_output(network, image) for image in islice(trial_images(network), 3)]
-    depth = torch.cat(outputs)
+    depth = torch.cat([trial_output(network, image) for image in islice(trial_images(network), 3)])
     known = depth[depth.isfinite()]
     if depth.shape[1] != 1 or not len(known):
         raise SettingError(
             "output of the network",
-            found=f"{depth.shape[1]} numbers per pixel" if len(known) else "no finite number",
-            expected=f"one number per pixel, {kind}",
-            remedy="Leave out depth= for a network that predicts classes."
-            if len(known)
-            else "Check the weights: they may contain NaN.",
+            found=f"{depth.shape[1]} per pixel, {len(known)} of {depth.numel()} numbers are finite",
+            expected=f"one finite number per pixel, {kind}",
+            remedy="Leave out depth= for classes. Weights that contain NaN return no numbers.",
         )
     least, most = known.amin().item(), known.amax().item()
+    noise = _SPREAD * max(abs(least), abs(most))
+    odd = {
+        "nearly the same depth everywhere": most - least <= noise,
+        f"negative numbers, which {kind} should not be": least < -noise and kind != "log_distance",
+        "depth of more than 1 km": most > _FARTHEST_M and kind in _METRIC,
+    }
     numbers = f"from {least:.4g} to {most:.4g} on images of noise"
-    largest = max(abs(least), abs(most))
-    remarks = []
-    if most - least <= _SPREAD * largest:
-        remarks.append(f"it returns nearly the same depth everywhere, {numbers}")
-    if least < -_SPREAD * largest and kind != "log_distance":
-        remarks.append(f"it returns negative numbers, {numbers}: is it {kind}?")
-    if kind in _METRIC and most > _FARTHEST_M:
-        remarks.append(f"it returns {numbers}: are these meters?")
-    return remarks
+    return [f"it returns {what}, {numbers}" for what, is_so in odd.items() if is_so]

@@ -152,7 +152,7 @@ def tipsv2() -> Made:
 def photo(side: int) -> Any:
     """Blocks of noise, ``(side, side, 3)``."""
     blocks = np.random.default_rng(1).integers(0, 256, (8, 8, 3), dtype=np.uint8)
-    return np.asarray(Image.fromarray(blocks).resize((side, side), Image.Resampling.BICUBIC))
+    return np.array(Image.fromarray(blocks).resize((side, side), Image.Resampling.BICUBIC))
 
 
 FAMILIES: tuple[tuple[Any, int, DepthKind | None, DepthKind], ...] = (

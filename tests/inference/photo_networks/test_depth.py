@@ -17,12 +17,14 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import uncanonical
-from tangent_train.checkpoints.trained import describe_network
+from tangent_train.checkpoints.trained import describe_network, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import PhotoNetwork, huggingface, import_network
 from tangent_train.inference.photo_networks.depth_kinds import declared_kind, try_depth
 from tests.inference.photo_networks import depth_networks as depth
 from tests.inference.photo_networks.huggingface_networks import change_json, imported, saved
+from tests.security.attacks import undeclared_settings
+from tests.security.watch import watched
 
 CONFIG = Path("config.json")
 
@@ -75,10 +77,14 @@ def test_depth_is_that_of_the_library(family: Any, tmp_path: Path) -> None:
         (
             {"model_type": "depth_anything", "depth_estimation_type": "metric"},
             "relative_disparity",
-            "depth: found relative_disparity; expected metric_z or metric_distance, as config.json "
-            "has depth_estimation_type: metric",
+            "depth: found relative_disparity; expected metric_z or metric_distance, because "
+            "config.json has metric",
         ),
-        ({"model_type": "depth_pro"}, "metric_z", "expected canonical_inverse, as config.json has"),
+        (
+            {"model_type": "depth_pro"},
+            "metric_z",
+            "expected canonical_inverse, because config.json has",
+        ),
         ({"model_type": "dpt"}, None, "depth: found none; expected one of .* Set depth=, e.g. rel"),
         ({"model_type": "chmv2"}, None, "config.json: found chmv2: heights of trees"),
         ({"model_type": "prompt_depth_anything"}, None, "depth image of a sensor, a second input"),
@@ -113,10 +119,8 @@ def test_broken_folders_are_refused(tmp_path: Path) -> None:
     path, weights = tmp_path / "config.json", tmp_path / "model.safetensors"
     honest, tensors = path.read_text(), load_file(weights)
     change_json(path, depth_estimation_type="squared")
-    with pytest.raises(
-        DataError, match=r"config\.json: found depth_estimation_type: squared; expected rel"
-    ):
-        imported(tmp_path)
+    with pytest.raises(DataError, match=r"config\.json: .*DepthNetwork cannot be made"):
+        imported(tmp_path, depth="metric_z")
     path.write_text(honest)
     change_json(path, head_hidden_size=9)
     with pytest.raises(
@@ -131,6 +135,29 @@ def test_broken_folders_are_refused(tmp_path: Path) -> None:
     (tmp_path / "preprocessor_config.json").unlink()
     with pytest.raises(DataError, match=r"no preprocessor_config\.json"):
         imported(tmp_path)
+
+
+def test_undeclared_settings_are_left_out_or_refused(tmp_path: Path) -> None:
+    """All at once when a folder is imported; each of them in a checkpoint."""
+    saved(depth.depth_anything, tmp_path)
+    imported(tmp_path)
+    content = torch.load(tmp_path / "imported.ckpt", weights_only=True)
+    attacks = list(undeclared_settings(tmp_path / "forbidden"))
+    every = {name: value for attack in attacks for name, value in attack.items()}
+    inside = json.loads((tmp_path / "config.json").read_text())["backbone_config"]
+    change_json(tmp_path / "config.json", **every, backbone_config=inside | every)
+    with watched(tmp_path / "forbidden") as happened:
+        assert imported(tmp_path).depth_kind == "relative_disparity"
+        inner = content["config"]["network"]["config"]
+        for section in (inner, inner["backbone_config"]):
+            for attack in attacks:
+                section.update(attack)
+                torch.save(content, tmp_path / "hostile.ckpt")
+                with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
+                    load_trained(tmp_path / "hostile.ckpt")
+                for name in attack:
+                    del section[name]
+    assert happened == []
 
 
 def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:
@@ -164,8 +191,16 @@ class _Output(nn.Module):
         (_Output(-3), "log_distance", None),
         (_Output(1, 2), "relative_disparity", None),
         (_Output(0, 2), "relative_disparity", "nearly the same depth everywhere, from 2 to 2"),
-        (_Output(-3), "relative_depth", "negative numbers, from -3 to .* is it relative_depth"),
-        (_Output(5000), "metric_distance", "from 0 to 5000 on images of noise: are these meters"),
+        (
+            _Output(-3),
+            "relative_depth",
+            "negative numbers, which relative_depth should not be, from -3 to 0",
+        ),
+        (
+            _Output(5000),
+            "metric_distance",
+            "depth of more than 1 km, from 0 to 5000 on images of noise",
+        ),
     ],
 )
 def test_depth_that_looks_wrong_is_remarked(
@@ -182,8 +217,8 @@ def test_depth_that_looks_wrong_is_remarked(
 @pytest.mark.parametrize(
     ("output", "expected"),
     [
-        (_Output(1, channels=3), "3 numbers per pixel; .* Leave out depth="),
-        (_Output(math.nan), "no finite number"),
+        (_Output(1, channels=3), "3 per pixel, .* Leave out depth="),
+        (_Output(math.nan), "1 per pixel, 0 of 786432 numbers are finite"),
         (nn.AvgPool2d(2), r"\(1, 3, 256, 256\)"),
     ],
 )

@@ -118,6 +118,7 @@ def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
 _PROCESSORS = (
     *("Segformer", "Beit", "DPT", "MaskFormer", "Mask2Former", "MobileViT", "MobileNetV2", "Eomt"),
     *("OneFormer", "ViT", "ConvNext", "EfficientNet"),
+    *("ZoeDepth", "GLPN", "DepthPro", "Tipsv2Dpt"),
 )
 
 
@@ -152,7 +153,12 @@ def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
         sizes = {
             n: False for n in ("do_resize", "do_center_crop", "do_pad") if hasattr(processor, n)
         }
-        pixels = np.asarray(processor(photo, return_tensors="np", **sizes)["pixel_values"])
+        try:
+            pixels = np.asarray(processor(photo, return_tensors="np", **sizes)["pixel_values"])
+        except (TypeError, ValueError):  # e.g. a normalization without numbers
+            with pytest.raises(DataError, match="no normalization in"):
+                huggingface._processor(tmp_path)
+            continue
         expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
         found = huggingface._processor(tmp_path)
         normalized = (color / 255 - found["mean"]) / found["std"]

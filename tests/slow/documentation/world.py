@@ -26,6 +26,7 @@ from PIL import ExifTags, Image
 from datamodules.cityscapes.classes import CLASSES
 from tangent_train.geometry import TangentGrid
 from tangent_train.rendering import write_rig
+from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.conftest import fabricate
 from tests.datamodules.cityscapes.street_format import (
     write_cityscapes,
@@ -94,6 +95,7 @@ def build_world(folder: Path) -> Path:
     shutil.copytree(folder / demo, folder / "runs" / "demo" / "first")  # of `make demo`
     trained = next((folder / "runs" / "rgb").glob("*/checkpoints/best.ckpt"))
     shutil.copyfile(trained, folder / "net.ckpt")
+    write_depth_checkpoint(folder / "depth.ckpt")
     for kind in ("room", "room_depth", "room_features"):  # what another program made of them
         images = shutil.copytree(folder / "tangent" / "room", folder / "kept" / kind)
         shutil.copytree(images, folder / "tangent" / kind, dirs_exist_ok=True)

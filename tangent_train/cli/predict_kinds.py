@@ -1,27 +1,33 @@
-"""Predict labels of images: the part of ``tangent-predict`` for networks of classes."""
+"""Predict labels or depth: the parts of ``tangent-predict`` that depend on the kind of network."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.images.gpano import PanoramaArea
+from tangent_train.checkpoints.distances import is_metric
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.command_settings import PredictSettings
+from tangent_train.cli.settings import check_unread
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.confidences import class_thresholds, count_confidences
+from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage, with_up
 from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.results.depth_results import DepthResults
 from tangent_train.results.label_results import LabelResults
 from tangent_train.results.predictions import PredictedImage
 
@@ -30,6 +36,9 @@ ReadsImage = Callable[[], tuple[InputImage, PanoramaArea | None]]
 
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
+
+_OF_CLASSES = {"class_map": None, "unmapped": "unknown", "min_confidence": 0, "min_share": 0}
+_OF_DEPTH = {"align": None, "depth_format": None, "points": None}
 
 
 class LabelPrediction:
@@ -53,6 +62,7 @@ class LabelPrediction:
     def __init__(
         self, settings: PredictSettings, original: TrainedNetwork, views: PanoramaViews | PhotoViews
     ) -> None:
+        check_unread(settings, "for networks of classes", **_OF_DEPTH)
         _check_confidence(settings)
         self._settings, self._trained = settings, original
         if settings.class_map is not None:
@@ -130,6 +140,53 @@ class LabelPrediction:
             image = with_up(image, settings.max_tilt_deg, self._judge)
         keeps_sums = settings.min_share > 0 or "probabilities" in (settings.write or ())
         return image, self._predictor.predict(image, progress, probabilities=keeps_sums)
+
+
+class DepthPrediction:
+    """Predicts the depth of images; see `LabelPrediction`."""
+
+    announcement = "The depth of a panorama is predicted"
+
+    def __init__(
+        self, settings: PredictSettings, trained: TrainedNetwork, views: PanoramaViews | PhotoViews
+    ) -> None:
+        check_unread(settings, "for depth networks", **_OF_CLASSES)
+        if settings.upright == "auto":
+            expected = "pose or null: depth networks do not estimate the up direction"
+            raise SettingError("upright", found="auto", expected=expected)
+        how = settings.device, settings.images_per_forward, settings.align
+        self._predictor = DepthPredictor(trained, views, *how)
+        kind: Any = trained.depth_kind
+        self.results = DepthResults(
+            is_metric=is_metric(kind),
+            depth_format=settings.depth_format,
+            depth_scale=settings.depth_scale,
+            points=settings.points,
+        )
+
+    def prepare(self, examples: Callable[[int], Any]) -> None:
+        """Do nothing."""
+
+    def __call__(
+        self,
+        image: InputImage,
+        area: PanoramaArea | None,
+        files: Mapping[str, Path],
+        progress: Callable[[float], object],
+    ) -> PredictedImage:
+        """Predict the depth of one image, see `DepthResults`."""
+        found = self._predictor.predict(image, progress)
+        depth = found.depth(image.camera_matrix).cpu().numpy()
+        report = asdict(found.report)
+        facts = {name: len(v) if isinstance(v, tuple) else v for name, v in report.items()}
+        return PredictedImage(image, depth if area is None else area.cut(depth), area, facts)
+
+
+PREDICTIONS: Mapping[str, type[LabelPrediction | DepthPrediction]] = {
+    PIXEL_CLASSES: LabelPrediction,
+    DISTANCE: DepthPrediction,
+}
+"""Classes by the kind of labels that a network predicts."""
 
 
 def _check_confidence(settings: PredictSettings) -> None:

@@ -1,0 +1,192 @@
+"""Write predicted depth: depth maps, colored pictures, point clouds and statistics."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from datamodules.core.panoramas import ray_lengths
+from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
+from tangent_train.errors import SettingError, at_least, of_extra
+from tangent_train.files import write_bytes
+from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.results.html import EncodedImage, encode_image
+from tangent_train.results.pictures import colorize_distance, distance_limits, distance_picture
+from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
+from tangent_train.results.tables import Table
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+    from pathlib import Path
+
+    from numpy.typing import NDArray
+
+_POINTS = 500_000
+_SAMPLES = 2**16
+"""Pixels whose median is that of an image."""
+
+_ROWS = {
+    "known": "known pixels, % of the solid angle",
+    "too_far": "too far for 16 bits, unknown in depth files, %",
+    "nearest": "nearest{unit}",
+    "median": "median{unit}",
+    "farthest": "farthest{unit}",
+    "step_before": "median step between views before alignment, %",
+    "step_after": "median step between views after alignment, %",
+    "isolated": "views without overlap",
+}
+"""Rows of the table, by name in the summary; shares are in percent."""
+
+
+def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
+    """Return known pixels, evenly spread over the solid angle that they cover.
+
+    Pixels are passed row by row. One is taken each time their solid angle has grown by a
+    `count`-th of the sum (systematic sampling).
+
+    Args:
+        predicted: Image with its depth.
+        count: Number of pixels, at most.
+
+    Returns:
+        ``(2, n)`` rows and columns of the depth map.
+    """
+    known, chosen, seen = np.isfinite(predicted.pixels), [], 0.0
+    total = sum(w @ k for w, k in zip(solid_angles(predicted), known, strict=True)) or 1.0
+    for row, weights in enumerate(solid_angles(predicted)):
+        columns = np.flatnonzero(known[row])
+        grown = np.cumsum([seen, *weights[columns]])
+        taken = columns[np.diff(np.floor(grown * (count / total))) > 0]
+        chosen.append(np.stack([np.full_like(taken, row), taken]))
+        seen = grown[-1]
+    return np.concatenate(chosen, axis=1)
+
+
+def points_of(
+    predicted: PredictedImage, pixels: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return ``(n, 3)`` points and their RGB colors.
+
+    Args:
+        predicted: Image with its depth.
+        pixels: Rows and columns, see `spread_pixels`.
+
+    Returns:
+        Points of panoramas in their axes: x ahead (the middle of the panorama), y to the right, z
+        up. Points of photos in camera axes: x to the right, y down, z ahead.
+    """
+    image, depth, area = predicted.image, predicted.pixels[tuple(pixels)], predicted.area
+    rows, columns = pixels
+    if area is not None:
+        rows, columns = (places[index] for places, index in zip(area.places(), pixels, strict=True))
+        rays = lonlat_to_xyz(equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape))
+    else:
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+        rays = rays @ np.linalg.inv(np.asarray(image.camera_matrix)).T
+    return rays * depth[:, None].astype(np.float64), image.rgb[rows, columns]
+
+
+class DepthResults(ImageResults):
+    """Results of a network that predicts depth; see `ImageResults`.
+
+    Pixels are distances from the center in panoramas and z-depth in photos, float32, NaN where
+    unknown.
+
+    Args:
+        is_metric: True for meters; False for distances that are known up to a factor.
+        depth_format: Suffix of the depth files without dot: png, npy or exr; None for png.
+        depth_scale: Units per meter in PNG files.
+        points: Number of points of an image, at most; None for 500 000.
+
+    Raises:
+        SettingError: A setting is invalid, or a package for the format is missing.
+    """
+
+    summary = "depth"
+    usual = ("depth", "color")
+    pictures = ("color",)
+    unknown = math.nan
+    columns = ("unit", *_ROWS)
+
+    def __init__(
+        self, *, is_metric: bool, depth_format: str | None, depth_scale: float, points: int | None
+    ) -> None:
+        suffix = f".{depth_format or 'png'}"
+        if suffix == ".exr":
+            with of_extra("exr", "depth_format"):
+                import OpenEXR  # noqa: F401
+        if not 0 < depth_scale < math.inf:
+            raise SettingError("depth_scale", found=depth_scale, expected="more than 0")
+        self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
+        self._points = _POINTS if points is None else at_least("points", points, 1)
+        self._is_metric = is_metric
+        self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
+
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write depth, a colored picture and points."""
+        if "depth" in files:
+            write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
+        if "color" in files:
+            write_pixels(
+                files["color"], distance_picture(predicted.pixels, "m" if self._is_metric else "")
+            )
+        if "points" in files:
+            from trimesh import PointCloud  # half a second
+
+            points, colors = points_of(predicted, spread_pixels(predicted, self._points))
+            content: Any = PointCloud(points.astype(np.float32), colors).export(file_type="ply")
+            write_bytes(files["points"], content)
+
+    def read(self, file: Path) -> NDArray[Any]:
+        """Read depth."""
+        depth = read_depth_m(file, self._units_per_m)
+        return np.where(depth > 0, depth, np.float32(np.nan))
+
+    def paint(
+        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
+    ) -> NDArray[np.uint8]:
+        """Color depth by the range of all frames of the video."""
+        ranges = [c for entry in entries if (c := entry["depth"].get("colors"))]
+        near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
+        return colorize_distance(pixels, (min(near), max(far)))
+
+    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
+        """Return unit, shares of the solid angle, distances, range of the colors, alignment."""
+        depth, shares = predicted.pixels, np.zeros(3)
+        counts = np.broadcast_to(is_counted, depth.shape)
+        for line, weights, counted in zip(depth, solid_angles(predicted), counts, strict=True):
+            shares += np.stack([counted, np.isfinite(line), line > self._most]) @ weights
+        known, too_far = shares[1:] / (shares[0] or 1)
+        facts = {"known": known, "too_far": too_far, **predicted.facts}
+        summary: dict[str, Any] = {"unit": "m" if self._is_metric else "relative"}
+        if known:
+            median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
+            facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
+            summary["colors"] = [float(f"{limit:.4g}") for limit in distance_limits(depth)]
+        return summary | {
+            name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
+            for name, value in facts.items()
+        }
+
+    def table(self, entries: Sequence[Entry]) -> Table:
+        """Return the means of the summaries over the images."""
+        rows, unit = [], ", m" if self._is_metric else ""
+        for name, title in _ROWS.items():
+            values = [v for e in entries if (v := e["depth"].get(name)) is not None]
+            if any(values):
+                mean = np.mean(values) * (100 if "%" in title else 1)
+                rows.append([title.format(unit=unit), f"{mean:.3g}"])
+        kind = "depth in meters" if self._is_metric else "relative depth: the median is 1"
+        return Table(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
+
+    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
+        """Compress an image with its distances."""
+        image, distance, area, _ = predicted
+        if area is not None:
+            distance = area.place(distance)  # 0 outside: unknown
+        elif image.camera_matrix is not None:
+            distance = distance * ray_lengths(image.camera_matrix, distance.shape)
+        how: dict[str, Any] = {"is_metric": self._is_metric, "camera_matrix": image.camera_matrix}
+        return encode_image(name, image.rgb, distance=distance, sphere=area is not None, **how)

@@ -1,0 +1,223 @@
+"""`tangent-predict` with a depth network: files, statistics, videos, shards."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from numpy.typing import NDArray
+
+from datamodules.core.inputs import RGB_NORMALIZATION
+from datamodules.images.pixel_files import read_depth_m, write_pixels
+from tangent_train.geometry import equirect_directions
+from tests.checkpoints.test_distances import write_depth_checkpoint
+from tests.cli.tiny_runs import Predict
+from tests.datamodules.data_files import read_png
+from tests.inference.trained import sphere
+from tests.running import Capture
+
+LEAST_M = 1.5
+
+
+def _distances(rgb: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Distances that `network` estimates: 1.5 m where an image is not red, to 1.5 e m."""
+    return LEAST_M * np.exp(rgb[..., 0] / 255)
+
+
+@pytest.fixture
+def network(tmp_path: Path) -> Path:
+    """A network whose output, the logarithm of the distance, depends on the color of a pixel."""
+    return _network(tmp_path / "depth.ckpt")
+
+
+def _network(path: Path, **changes: Any) -> Path:
+    weight = torch.zeros(1, 3, 3, 3)
+    weight[0, 0, 1, 1] = RGB_NORMALIZATION.std[0]
+    bias = torch.tensor([RGB_NORMALIZATION.mean[0] + math.log(LEAST_M)])
+    tensors = {"network.weight": weight, "network.bias": bias}
+    return write_depth_checkpoint(path, state_dict=tensors, **changes)
+
+
+def _depth(path: Path) -> NDArray[np.float64]:
+    return read_depth_m(path, 1000).astype(np.float64)
+
+
+def test_files_of_a_panorama(
+    tmp_path: Path, network: Path, predict: Predict, capsys: Capture
+) -> None:
+    """Below latitude −60°, rows from (90 + 60) / 180 · 64 = 53.3 on, pixels are masked."""
+    rgb, output = sphere(64), tmp_path / "out"
+    write_pixels(tmp_path / "in" / "hall.png", rgb)
+    common = {"checkpoint": network, "mask": -60, "write": "[depth,color,points]"}
+    entry = predict(**common, points=3000)["hall"]["depth"]
+    expected = _distances(rgb)
+    expected[53:] = 0
+    depth = _depth(output / "depth" / "hall.png")
+    np.testing.assert_allclose(depth, expected, rtol=0.01)
+    known = depth[depth > 0]
+    assert entry["unit"] == "m"
+    assert entry["nearest"] == pytest.approx(known.min(), abs=1e-3)
+    assert entry["farthest"] == pytest.approx(known.max(), abs=1e-3)
+    assert (entry["known"], entry["too_far"]) == (1, 0), "masked pixels do not count"
+    # Red is 128 + 120 x, and x has the median 0 in the part of the sphere above a latitude.
+    assert entry["median"] == pytest.approx(LEAST_M * math.exp(128 / 255), rel=0.01)
+    assert entry["step_after"] < 0.01
+
+    picture = read_png(output / "color" / "hall.png")
+    assert picture.shape == (64 + 22, 128, 3)
+    light = picture[:64].sum(axis=-1, dtype=int)
+    assert light[depth == 0].max() == 0
+    near, far = (light[depth > 0][known < 1.6], light[depth > 0][known > 3.8])
+    assert near.min() > 2 * far.max()
+
+    cloud = trimesh.load(output / "points" / "hall.ply")
+    content = (output / "points" / "hall.ply").read_bytes()
+    assert content.startswith(b"ply\nformat binary_little_endian 1.0\n")
+    assert b"property float x\nproperty float y\nproperty float z\nproperty uchar red" in content
+    directions = equirect_directions((64, 128)).reshape(-1, 3)
+    distance_m = np.linalg.norm(cloud.vertices, axis=-1)
+    pixels = (cloud.vertices @ directions.T).argmax(axis=1)
+    np.testing.assert_allclose(directions[pixels] * distance_m[:, None], cloud.vertices, atol=1e-6)
+    np.testing.assert_allclose(distance_m, depth.reshape(-1)[pixels], atol=5.1e-4)
+    np.testing.assert_array_equal(cloud.colors[:, :3], rgb.reshape(-1, 3)[pixels])
+    assert len(set(pixels)) == len(pixels)
+    assert 2900 < len(pixels) <= 3000
+
+    printed = capsys.readouterr().out
+    assert "The depth of a panorama is predicted in 20 views" in printed
+    assert "Mean over the images (depth in meters)" in printed
+    assert re.search(rf"median, m +│ +{entry['median']:.3g} │", printed)
+    with (output / "summary.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["unit"], row["median"]) == ("m", str(entry["median"]))
+    assert not (output / "classes.json").exists()
+    assert "hall" in (output / "report.html").read_text()
+
+
+def test_formats_hold_the_same_depth(tmp_path: Path, network: Path, predict: Predict) -> None:
+    """16-bit files leave out what does not fit: with 30 000 units per meter, 2.18 m and more."""
+    write_pixels(tmp_path / "in" / "a.png", sphere(32))
+    common = {"checkpoint": network, "write": "[depth]", "report": 0}
+    for name in ("png", "npy", "exr"):
+        predict(**common, output=name, depth_format=name)
+    exact = np.load(tmp_path / "npy" / "depth" / "a.npy")
+    assert exact.dtype == np.float32
+    np.testing.assert_array_equal(_depth(tmp_path / "exr" / "depth" / "a.exr"), exact)
+    np.testing.assert_allclose(_depth(tmp_path / "png" / "depth" / "a.png"), exact, atol=5.1e-4)
+    entry = predict(**common, output="fine", depth_scale=30000)["a"]["depth"]
+    fits = exact < 65534.5 / 30000
+    fine = read_depth_m(tmp_path / "fine" / "depth" / "a.png", 30000)
+    np.testing.assert_allclose(fine, np.where(fits, exact, 0), atol=1.7e-5)
+    weights = np.cos(np.radians(90 - 180 * (np.arange(32) + 0.5) / 32))
+    too_far = weights @ (~fits).mean(axis=1) / weights.sum()
+    assert entry["too_far"] == pytest.approx(too_far, rel=1e-3)
+    assert entry["farthest"] == pytest.approx(exact.max(), rel=1e-3)
+
+
+def test_a_part_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) -> None:
+    """Across the seam: files have the size of the part, points their place on the sphere."""
+    rows, columns = np.arange(16, 48), np.r_[112:128, 0:16]
+    write_pixels(tmp_path / "in" / "a.png", sphere(64)[rows][:, columns])
+    area = {"area": "[135,-135,-45,45]", "fill": "edge", "write": "[depth,color,points]"}
+    entry = predict(checkpoint=network, **area)["a"]["depth"]
+    depth = _depth(tmp_path / "out" / "depth" / "a.png")
+    expected = _distances(sphere(64))[rows][:, columns]
+    np.testing.assert_allclose(depth, expected, rtol=0.02)
+    points = trimesh.load(tmp_path / "out" / "points" / "a.ply").vertices
+    assert entry["known"] == 1
+    assert len(points) == depth.size, "fewer than 500 000 pixels"
+    azimuth = np.degrees(np.arctan2(points[:, 1], points[:, 0]))
+    assert np.abs(azimuth).min() > 135
+    latitude = np.degrees(np.arcsin(points[:, 2] / np.linalg.norm(points, axis=-1)))
+    assert np.abs(latitude).max() < 45
+
+
+def test_photos_have_z_depth(tmp_path: Path, predict: Predict) -> None:
+    """A wall at 2 m, for a network that returns the same z-depth everywhere."""
+    weight, bias = torch.zeros(1, 3, 3, 3), torch.tensor([2.0])
+    tensors = {"network.weight": weight, "network.bias": bias}
+    network = write_depth_checkpoint(
+        tmp_path / "net.ckpt", state_dict=tensors, depth_kind="metric_z"
+    )
+    rgb = sphere(64)[10:40, 20:70]
+    write_pixels(tmp_path / "in" / "a.png", rgb)
+    how = {"projection": "perspective", "fov": 70, "write": "[depth,color,points]"}
+    entry = predict(checkpoint=network, **how)["a"]["depth"]
+    depth = _depth(tmp_path / "out" / "depth" / "a.png")
+    np.testing.assert_allclose(depth, np.full((30, 50), 2.0), atol=0.02)  # few pixels
+    assert (entry["nearest"], entry["farthest"]) == pytest.approx((2, 2), abs=0.02)
+    cloud = trimesh.load(tmp_path / "out" / "points" / "a.ply")
+    half = math.tan(math.radians(35)) * 49 / 50
+    np.testing.assert_allclose(cloud.vertices[:, 2], depth.reshape(-1), atol=5.1e-4)
+    np.testing.assert_allclose(cloud.vertices[:, 0].max(), 2 * half, rtol=0.01)
+    first = cloud.vertices[:, :2].sum(axis=1).argmin()  # left and up
+    np.testing.assert_array_equal(cloud.colors[first, :3], rgb[0, 0])
+
+
+def test_relative_depth_is_marked(
+    tmp_path: Path, network: Path, predict: Predict, capsys: Capture
+) -> None:
+    relative = torch.load(network, weights_only=True) | {"depth_kind": "relative_depth"}
+    relative["state_dict"]["network.bias"] += 1  # positive
+    torch.save(relative, tmp_path / "relative.ckpt")
+    write_pixels(tmp_path / "in" / "a.png", sphere(32))
+    entry = predict(checkpoint=tmp_path / "relative.ckpt", align="none")["a"]["depth"]
+    assert entry["unit"] == "relative"
+    assert entry["median"] == pytest.approx(1, rel=0.05)
+    title = "relative depth: the median is 1"
+    assert title in capsys.readouterr().out
+    assert title in (tmp_path / "out" / "report.html").read_text()
+    with (tmp_path / "out" / "summary.csv").open(newline="") as file:
+        assert next(csv.DictReader(file))["unit"] == "relative"
+
+
+@pytest.mark.parametrize(
+    ("settings", "refused"),
+    [
+        ({"class_map": "ade20k_to_stanford2d3ds"}, "class_map: found .*expected null for depth"),
+        ({"unmapped": "never"}, "unmapped: found never; expected unknown for depth networks"),
+        ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0 for depth networks"),
+        ({"min_share": 0.5}, "min_share: found 0.5"),
+        ({"upright": "auto"}, "upright: found auto; expected pose or null"),
+        ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),
+        ({"depth_scale": 0}, "depth_scale: found 0"),
+        ({"points": 0}, "points: found 0"),
+        ({"align": "twice"}, "align: found twice; expected none or scale"),
+        ({"depth": "."}, "depth: found .*expected null"),
+    ],
+)
+def test_settings_of_networks_of_classes_are_refused(
+    tmp_path: Path, network: Path, predict: Predict, settings: dict[str, Any], refused: str
+) -> None:
+    write_pixels(tmp_path / "in" / "a.png", sphere(16))
+    with pytest.raises(SystemExit, match=refused):
+        predict(checkpoint=network, **settings)
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_of_depth_networks_are_refused(tmp_path: Path, predict: Predict) -> None:
+    write_pixels(tmp_path / "in" / "a.png", sphere(16))
+    for name, value in (("align", "none"), ("points", 5), ("depth_format", "npy")):
+        with pytest.raises(SystemExit, match=f"{name}: found {value}; expected null for networks"):
+            predict(**{name: value})
+    with pytest.raises(SystemExit, match="write: found depth, points; expected labels, color"):
+        predict(write="[depth,points]")
+
+
+def test_shards_give_the_same_files(tmp_path: Path, network: Path, predict: Predict) -> None:
+    for number in range(3):
+        write_pixels(tmp_path / "in" / f"{number}.png", np.roll(sphere(16), number, axis=1))
+    for output, shard in (("whole", "null"), ("out", "2/2"), ("out", "1/2")):
+        predict(checkpoint=network, output=output, shard=shard, report=2)
+    files = ["summary.json", "summary.csv", "report.html"]
+    files += [f"{kind}/{number}.png" for kind in ("depth", "color") for number in range(3)]
+    for name in files:
+        found, expected = (tmp_path / folder / name for folder in ("out", "whole"))
+        assert found.read_bytes() == expected.read_bytes(), name

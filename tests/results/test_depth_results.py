@@ -1,0 +1,107 @@
+"""Depth files, points and pictures of predicted depth, without a network."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from datamodules.images.gpano import area_of_angles, whole_area
+from datamodules.images.palette import distance_colors
+from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m
+from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
+from tangent_train.inference.images import InputImage
+from tangent_train.results.depth_results import DepthResults, points_of, spread_pixels
+from tangent_train.results.pictures import colorize_distance, distance_picture
+from tangent_train.results.predictions import PredictedImage
+
+RNG = np.random.default_rng(0)
+
+
+def _panorama(depth: NDArray[np.float32]) -> PredictedImage:
+    rgb = RNG.integers(0, 256, (*depth.shape, 3), np.uint8)
+    return PredictedImage(InputImage(rgb), depth, whole_area(Path("a"), depth.shape))
+
+
+def test_points_are_evenly_spread_over_the_sphere() -> None:
+    """A cap of angle a has the share (1 − cos a) / 2 of the sphere, around any direction."""
+    depth = np.ones((512, 1024), np.float32)
+    points, _ = points_of(_panorama(depth), spread_pixels(_panorama(depth), 20000))
+    assert 19990 < len(points) <= 20000
+    for axis in ((0, 0, 1), (0, 0, -1), (1, 0, 0), (-1, 0, 0), (0.6, 0, 0.8)):
+        for angle in (10, 45):
+            share = (points @ axis > math.cos(math.radians(angle))).mean()
+            expected = (1 - math.cos(math.radians(angle))) / 2
+            assert share == pytest.approx(expected, rel=0.05 if angle == 10 else 0.01)
+
+
+def test_points_are_directions_times_distance_without_unknown_pixels() -> None:
+    depth = RNG.uniform(0.5, 9, (20, 40)).astype(np.float32)
+    depth[RNG.random(depth.shape) < 0.3] = np.nan
+    image = _panorama(depth)
+    rows, columns = pixels = spread_pixels(image, 10**6)
+    assert not np.isnan(depth[rows, columns]).any()
+    assert len(set(zip(rows, columns, strict=True))) == len(rows)
+    points, colors = points_of(image, pixels)
+    expected = equirect_directions((20, 40)) * depth[..., None].astype(np.float64)
+    np.testing.assert_allclose(points, expected[rows, columns], atol=1e-12)
+    np.testing.assert_array_equal(colors, image.image.rgb[rows, columns])
+    empty = image._replace(pixels=np.full_like(depth, np.nan))
+    assert spread_pixels(empty, 100).shape == (2, 0)
+
+
+def test_points_of_a_part_and_of_a_photo() -> None:
+    """A part across the seam has its place on the sphere; a photo is in camera axes, z ahead."""
+    rgb = RNG.integers(0, 256, (64, 128, 3), np.uint8)
+    area = area_of_angles((16, 32), [135, -135, 0, 45])
+    part = PredictedImage(InputImage(rgb), np.full((16, 32), 2, np.float32), area)
+    points, colors = points_of(part, np.array([[0, 15], [0, 31]]))
+    rows, columns = [16, 31], [112, 15]
+    np.testing.assert_allclose(points, 2 * equirect_directions((64, 128))[rows, columns])
+    np.testing.assert_array_equal(colors, rgb[rows, columns])
+    camera = camera_matrix_from_fov(90.0, (64, 128))
+    photo = PredictedImage(InputImage(rgb, camera_matrix=camera), np.full((64, 128), 3.0))
+    points, _ = points_of(photo, np.array([[0], [127]]))
+    np.testing.assert_allclose(points, [[3 * 127 / 128, -3 * 63 / 128, 3]])
+
+
+def test_depth_files_are_read_back(tmp_path: Path) -> None:
+    """At the limits of 16 bits: 65535 means missing, and 0 would."""
+    meters = np.array([[np.nan, 1e-5, 0.0014, 1.0, 65.534, 65.5344, 65.5346, 1e4]], np.float32)
+    write_depth_m(tmp_path / "a.png", meters, 1000)
+    found = read_depth_m(tmp_path / "a.png", 1000)
+    np.testing.assert_allclose(found, [[0, 0.001, 0.001, 1, 65.534, 65.534, 0, 0]], atol=1e-6)
+    assert most_depth_m(".png", 1000) == 65.534
+    for suffix in (".npy", ".exr"):
+        write_depth_m(tmp_path / f"a{suffix}", meters, 1000)
+        found = read_depth_m(tmp_path / f"a{suffix}", 1000)
+        np.testing.assert_array_equal(found, np.nan_to_num(meters))
+
+
+def test_pictures_have_a_bar_of_their_colors() -> None:
+    distance = np.tile(np.geomspace(1, 10, 500, dtype=np.float32), (40, 1))
+    picture = distance_picture(distance, "m")
+    assert picture.shape == (62, 500, 3)
+    np.testing.assert_array_equal(picture[:40], colorize_distance(distance))
+    bar = picture[40 + 10]
+    ramp = np.flatnonzero((bar == distance_colors()[0]).all(axis=-1))[0]
+    assert (bar[ramp:][:100].astype(int).sum(axis=-1)[::10] > bar[-80].min()).all()
+    assert picture[40:, : ramp - 2].min() < 100, "text"
+    assert distance_picture(np.full((8, 20), np.nan), "m").shape == (30, 20, 3)
+
+
+def test_a_video_has_one_range_of_colors() -> None:
+    """That of all frames, so that a distance has the same color in all of them."""
+    results = DepthResults(is_metric=True, depth_format=None, depth_scale=1000, points=None)
+    frames = [_panorama(np.full((8, 16), m, np.float32)) for m in (1, 4, np.nan, 9)]
+    everywhere = np.array(True)
+    entries = [{"depth": results.summarize(frame, everywhere)} for frame in frames]
+    assert [entry["depth"].get("median") for entry in entries] == [1, 4, None, 9]
+    painted = [results.paint("color", f.image.rgb, f.pixels, entries)[0, 0] for f in frames]
+    assert (painted[0] == distance_colors()[0]).all()
+    place = 255 * math.log(4) / math.log(9 * 1.01)
+    assert (painted[1] == distance_colors()[round(place)]).all()
+    assert not painted[2].any()

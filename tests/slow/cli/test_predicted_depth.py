@@ -1,0 +1,93 @@
+"""Predicted depth is read where true depth is: by data sets, keypoints, renderings, networks."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datamodules.core.problems import Problems
+from datamodules.folder.classes import read_classes
+from datamodules.folder.reader import FolderReader, list_images
+from datamodules.images.pixel_files import read_depth_m, write_pixels
+from datamodules.stanford2d3ds.pairs import StanfordPairs
+from tests.checkpoints.test_distances import write_depth_checkpoint
+from tests.cli.tiny_runs import Run, predicted, results, run_command
+from tests.datamodules.data_files import read_png
+from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_panorama
+from tests.inference.trained import sphere, write_checkpoint
+
+ROWS = 64
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a command in this process, in a folder with panoramas ``in`` and a depth network."""
+    monkeypatch.chdir(tmp_path)
+    write_depth_checkpoint(tmp_path / "depth.ckpt")
+    for number, name in enumerate(("hall", "flat/kitchen")):
+        write_pixels(tmp_path / "in" / f"{name}.png", np.roll(sphere(ROWS), 9 * number, axis=1))
+
+    def run(command: str, *arguments: str) -> None:
+        run_command(monkeypatch, command, *arguments)
+
+    return run
+
+
+@pytest.mark.parametrize("kind", ["png", "npy", "exr"])
+def test_folders_of_images_with_depth(run: Run, tmp_path: Path, kind: str) -> None:
+    run("predict", "checkpoint=depth.ckpt", "input=in", "output=out", f"depth_format={kind}")
+    root = tmp_path / "rooms"
+    shutil.copytree("in", root / "images")
+    shutil.copytree("out/depth", root / "depth")
+    (root / "classes.json").write_text('["wall"]')
+    reader = FolderReader(read_classes(root / "classes.json"), 1000)
+    files = list_images(root, Problems(), with_labels=False, with_depth=True)
+    assert [one.name for one in files] == ["flat/kitchen", "hall"]
+    for one in files:
+        expected = read_depth_m(tmp_path / "out" / "depth" / f"{one.name}.{kind}", 1000)
+        np.testing.assert_allclose(reader.depth(one) / 512, expected, atol=1 / 1024 + 1e-6)
+    write_checkpoint(tmp_path / "rgbd.ckpt", channels=4)
+    run("predict", "checkpoint=rgbd.ckpt", "input=in", "output=labels", "depth=out/depth")
+    assert predicted(Path("labels")).keys() == {"hall", "flat/kitchen"}
+
+
+def test_tangent_images_and_projects_of_depth(run: Run, tmp_path: Path) -> None:
+    """Rendered back, most pixels are what they were; none is a mixture of two."""
+    run("predict", "checkpoint=depth.ckpt", "input=in", "output=out", "write=[depth]")
+    images = ("input=out/depth", "interpolation=nearest", "base_level=0", "level=7")
+    run("render", *images, "output=tangent")
+    run("render", "back=tangent", "output=again")
+    depth, again = (read_png(tmp_path / name / "hall.png") for name in ("out/depth", "again"))
+    assert (depth == again).mean() > 0.8
+    assert set(np.unique(again)) <= set(np.unique(depth))
+    run("render", *images, "output=project", "colmap=true")
+    face = read_png(next((tmp_path / "project" / "images").rglob("hall.png")))
+    assert face.dtype == np.uint16
+    assert set(np.unique(face)) <= {0, *np.unique(depth).tolist()}
+
+
+def test_keypoints_are_compared_with_predicted_depth(run: Run, tmp_path: Path) -> None:
+    pytest.importorskip("pycolmap")
+    root, rng = tmp_path / "data", np.random.default_rng(0)
+    texture = rng.integers(0, 256, (ROWS, 2 * ROWS, 3), np.uint8)
+    for camera, shift in (("a", 0), ("b", 3)):
+        image = write_panorama(root, 32 * camera, "office_1", 20, ROWS)
+        write_pixels(image, np.roll(texture, shift, axis=1))
+    pano = root / "area_1" / "pano"
+    predict = ("checkpoint=depth.ckpt", f"input={pano}/rgb", "depth_scale=512", "align=none")
+    run("predict", *predict, "output=out", "write=[depth]")
+    true = read_png(next((pano / "depth").iterdir()))
+    for path in (tmp_path / "out" / "depth").iterdir():
+        shutil.copy(path, pano / "depth" / path.name.replace("_rgb", "_depth"))
+    assert (read_png(next((pano / "depth").iterdir())) != true).any()
+    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.pairs=rooms")
+    run("keypoints", *data, "base_level=0", "controls=false", "pictures=0", "output=keypoints")
+    assert {row["visible_by"] for row in results(tmp_path / "keypoints")["rows"]} == {"depth"}
+    pair = StanfordPairs(root, pairs="rooms").read(0)
+    for side, camera in ((pair.left, "a"), (pair.right, "b")):
+        (path,) = (tmp_path / "out" / "depth").glob(f"camera_{camera}*")
+        assert side.distance_m is not None
+        np.testing.assert_allclose(side.distance_m, read_depth_m(path, 512), atol=1e-6)
