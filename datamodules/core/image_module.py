@@ -126,8 +126,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
             self.class_names = ()
             reason = self.no_depth or self.no_distances
             self.require("labels", not reason, f"{PIXEL_CLASSES}: {reason}", _DISTANCES)
-            fine = not with_depth
-            self.require("inputs", fine, "no depth: it is what the network learns", "[rgb]")
+            expected = "no depth: it is the target"
+            self.require("inputs", not with_depth, expected, "Give data.inputs=[rgb].")
         given = self.normalization or self.normalizations[with_depth]
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")
@@ -191,7 +191,7 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def images(self, split: Split) -> LabeledImages:
         """Return the whole images of a split as arrays, see `LabeledImage`."""
         reading: Any = self.index().read
-        return LabeledImages(self.source(split), reading.reader, self.has_distances)
+        return LabeledImages(self.source(split), reading.reader)
 
     @property
     def in_channels(self) -> int:

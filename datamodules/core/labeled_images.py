@@ -51,12 +51,10 @@ class LabeledImages(Dataset[LabeledImage]):
     Attributes:
         source: Reader of the split.
         reader: Reader of the data set.
-        has_distances: True if the labels are distances.
     """
 
     source: SplitReader[ImageFiles, Any]
     reader: ImageReader
-    has_distances: bool = False
 
     def __len__(self) -> int:
         return len(self.source)
@@ -72,7 +70,7 @@ class LabeledImages(Dataset[LabeledImage]):
             if pose is not None and isinstance(transform, RotatedPanoramas):
                 rotation = transform.rotation(index)
                 pose = PanoramaPose(pose.world_from_panorama @ rotation.T, pose.location_m)
-        depth = image.labels if self.has_distances else image.depth
+        depth = image.labels if image.labels.dtype == np.uint16 else image.depth
         distance_m = None if depth is None else steps_to_meters(depth)
         matrix = getattr(image, "camera_matrix", None)
         return LabeledImage(

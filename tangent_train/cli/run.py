@@ -244,14 +244,6 @@ def build(
     )
     network = build_from_config(section, "network", source)
     task = _build_task(settings, data, network, source, trains=trains)
-    can_align = task.predicts in (PIXEL_CLASSES, DISTANCE)
-    if getattr(data, "upright", None) == "auto" and not can_align:
-        raise SettingError(
-            "data.upright",
-            found=f"auto, with {type(task).__name__}",
-            expected=f"null or pose: auto needs a network that predicts {PIXEL_CLASSES} or "
-            f"{DISTANCE}",
-        )
     try_network(task, data.in_channels)
     if trains:
         try_training(task, data, settings)

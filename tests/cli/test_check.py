@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from tangent_train.cli.check import check
+from tangent_train.cli.prepare import prepare
+from tests.datamodules.data_files import write_png
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.running import Capture, composed_settings
 
@@ -68,6 +70,29 @@ def test_nothing_is_wrong(root: Path, capsys: Capture) -> None:
     out, err = _checked(root, capsys)
     assert out == f"Nothing is wrong; 3 panoramas of {root} checked.\n"
     assert "Warning" not in err
+
+
+def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> None:
+    """Depth in 1/1000 m without labels or classes; a third is missing, and one file in meters."""
+    for name, unit in (("a", 1000), ("b", 1000), ("test", 1)):
+        save(tmp_path / "images" / f"{name}.png", np.full((32, 64, 3), 9, np.uint8))
+        depth = np.full((32, 64), 3 * unit, np.uint16)
+        depth[:, ::4] = 0
+        write_png(tmp_path / "depth" / f"{name}.png", depth)
+    (tmp_path / "test.txt").write_text("test")
+    _, err = _checked(tmp_path, capsys, "task=depth")
+    assert "Pixels of each label, %" in err
+    rows = [line.split() for line in err.splitlines()]
+    shares = {words[1]: words[3::2] for words in rows if words[:1] == ["│"]}
+    assert shares == {"unknown": ["25.0", "25.0"], "distance": ["75.0", "75.0"]}
+    (warning,) = (line for line in err.splitlines() if line.startswith("Warning: "))
+    assert f"{tmp_path}/depth/test.png: median distance 0.00391 m" in warning
+    stores = tmp_path / "stores"
+    settings = ["data=folder", "level=4", f"data.root='{tmp_path}'", "data.validation_fraction=0"]
+    prepare(composed_settings("prepare", *settings, f"data.store='{stores}'", "task=depth"))
+    stored = np.load(next(stores.glob("32x64_*/a.npy")))
+    assert stored.dtype.names == ("rgb", "labels")
+    assert np.unique(stored["labels"]).tolist() == [0, 3 * 512]
 
 
 def test_the_views_of_an_area_are_counted(tmp_path: Path, capsys: Capture) -> None:

@@ -10,6 +10,7 @@ const float PI = 3.14159265358979;
 const float UNKNOWN = -1e9;
 const float WORST = 0.22314355;  // ln 1.25
 const int REACH = 2;  // pixels between neighbors that tell which way a surface faces
+const float STEEP = 12.0;  // slope of a surface, seen from the center, of 85 degrees
 const int INSIDE = 0, PLANET = 1, FLAT = 2;
 const int INPUT = 0, TRUTH = 1, PREDICTION = 2, ERROR = 3, OVERLAY = 4;
 const vec3 OUTSIDE = vec3(0.086, 0.094, 0.11);
@@ -100,6 +101,8 @@ void main() {
   float reach = ceil(1.0 / share) / float(columns);
   float gap = max(reach * length(across), length(down) / float(REACH));
   float pitch = (uSphere ? PI / float(size.y) : 1.0 / (uCamera.x * float(size.x))) * length(here.xyz);
+  // Between an object and what is behind it, networks predict slopes that no surface has.
+  if (gap > STEEP * pitch) return;
   gap = 1.45 * clamp(gap, pitch, 3.0 * pitch);
   vec3 view = vec3(dot(seen, uRight), dot(seen, uUp), dot(seen, uAhead));
   float side = 0.5 * max(uCanvas.x, uCanvas.y);

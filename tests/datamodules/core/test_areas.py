@@ -49,6 +49,8 @@ def test_native_pixels_are_placed_unchanged(tmp_path: Path, level: int) -> None:
         assert panorama.depth is not None
         assert not panorama.depth[outside].any()
         assert panorama.rgb[outside].any()
+    labels = FolderPanoramas(root, erp, labels="distance", inputs=["rgb"], area=AREA).source("test")
+    np.testing.assert_array_equal(labels.read(0).labels, panorama.depth)
 
 
 def _canvas(angles: tuple[float, ...], fill: Fill) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import OpenEXR
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresent
 from tests.conftest import fabricate
 from tests.datamodules.conftest import TINY_ROOMS
 from tests.datamodules.data_files import nearest_valid, read_png, write_png
-from tests.datamodules.folder.folder_format import write_data_set
+from tests.datamodules.folder.folder_format import save, write_data_set
 from tests.datamodules.folder.photo_format import write_cameras, write_photos
 from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.structured3d.structured3d_format import HALF_ANGLES, write_structured3d
@@ -262,6 +263,30 @@ def _pixels(directions: Depth, height: int) -> tuple[NDArray[np.intp], NDArray[n
     columns = np.floor((np.arctan2(y, x) / np.pi + 1) * height).astype(int) % (2 * height)
     rows = np.floor((0.5 - np.arcsin(np.clip(z, -1, 1)) / np.pi) * height).astype(int)
     return np.clip(rows, 0, height - 1), columns
+
+
+@pytest.mark.parametrize("suffix", [".npy", ".exr"])
+def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> None:
+    """Other programs write RGB-D pairs like these."""
+    meters = np.random.default_rng(0).uniform(0.01, 9, (32, 64)).astype(np.float32)
+    special = [np.nan, np.inf, -1, 0, 1e-4, 127.99, 128, 5000, 1e10]
+    meters[0, : len(special)] = special
+    for name in ("a", "b", "c"):
+        save(tmp_path / "images" / f"{name}.png", np.zeros((32, 64, 3), np.uint8))
+        path = tmp_path / "depth" / f"{name}{suffix}"
+        path.parent.mkdir(exist_ok=True)
+        if suffix == ".npy":
+            np.save(path, meters)
+        else:
+            header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+            OpenEXR.File(header, {"Y": meters}).write(str(path))
+    data = FolderPanoramas(
+        tmp_path, EquirectRepresentation(4), labels=DISTANCE, inputs=["rgb"], validation_fraction=0
+    )
+    sample: Any = data.dataset("test")[0]
+    labels = sample.target.numpy()
+    assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
+    np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
 
 
 # --- masks, rotation, areas, crops ---------------------------------------------------------------
