@@ -56,17 +56,17 @@ def depth(quick: bool) -> Iterator[Table]:
     near = 1 / np.minimum.reduce([3 / np.abs(x), 2 / np.abs(y), 1.4 / np.abs(z)])
     rgb = np.stack([300 * near, 128 + 100 * y, 0 * z], axis=-1).astype(np.uint8)
     chosen = PanoramaViews(trained)
-    views = chosen.representation.view_sets()[0]
-    random = torch.rand(len(views), 3, *views.grid.size)
-    per_forward = views_per_forward(views.grid.size)
+    count = sum(map(len, chosen.representation.view_sets()))
+    random = torch.rand(count, 3, side, side)
+    per_forward = views_per_forward((side, side))
 
     def network() -> None:
-        for _ in view_scores(trained.network, random.__getitem__, len(views), per_forward):
+        for _ in view_scores(trained.network, random.__getitem__, count, per_forward):
             pass
 
     run = partial(DepthPredictor(trained, chosen).predict, InputImage(rgb))
     alternatives = [
-        Alternative(f"the network, {len(views)} views", network),
+        Alternative(f"the network, {count} views", network),
         Alternative("DepthPredictor", run, is_ours=True),
     ]
     table = Table(f"depth: {2 * rows}×{rows}", measure(alternatives, 2))

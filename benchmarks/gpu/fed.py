@@ -138,4 +138,5 @@ def _rendered(data: Any, count: int) -> Iterator[Any]:
         rgb, depth, labels = (torch.stack(part) for part in zip(*sets, strict=True))
         inputs = normalize((rgb, depth), data.normalization, ("rgb", "depth"))
         rays = torch.empty(4, 0, 3, 3, device=DEVICE)
-        yield TrainingSample(inputs, labels, rays, torch.arange(4))  # type: ignore[arg-type]
+        lengths = torch.ones(4, 1, 1, 1)
+        yield TrainingSample(inputs, labels, rays, lengths, torch.arange(4))  # type: ignore[arg-type]

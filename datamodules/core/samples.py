@@ -39,12 +39,15 @@ class TrainingSample(NamedTuple, Generic[_Images]):
             ``(P, C, h, w)`` float32 on the device.
         labels: ``(P, h, w)`` uint8, or int32 for distances, 0 where unknown.
         rays: ``(P, 3, 3)`` float32 viewing rays, see `world_rays`; or ``(0, 3, 3)``.
+        ray_lengths: ``(1 or P, h, w)`` float32, see `Views.ray_lengths`, for distances as labels;
+            else a 1, ``(1, 1, 1)``.
         index: Index in its split.
     """
 
     images: _Images
     labels: Tensor
     rays: Tensor
+    ray_lengths: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
 
 
@@ -56,6 +59,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
         target: Labels as in `TrainingSample`: ``(H, W)`` of a panorama; ``(N, h, w)`` of the crops
             of a photo.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
+        ray_lengths: As in `TrainingSample`, of each view set of a panorama or each crop of a photo.
         area: ``(13,)`` float64, the area of a partial panorama, see `SphereArea.numbers`; that of
             the whole sphere for other images.
         index: Index in its split.
@@ -64,6 +68,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     images: _Images
     target: Tensor
     rotation: Tensor
+    ray_lengths: Tensor
     area: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
 
@@ -99,7 +104,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
             rgb = jitter_colors(rgb, self.color_jitter, rng)
         labels = _label_tensor(views.render(image.labels, "nearest"))
         rays = torch.from_numpy(world_rays(views, image.up))
-        return TrainingSample((rgb, *others), labels, rays, index)
+        return TrainingSample((rgb, *others), labels, rays, _ray_lengths([views], image), index)
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,8 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
         target = _label_tensor(image.target(self.representation))
         area = torch.from_numpy((image.area or _WHOLE).numbers)
-        return EvaluationSample(images, target, torch.from_numpy(rotation), area, index)
+        lengths = _ray_lengths(view_sets, image)
+        return EvaluationSample(images, target, torch.from_numpy(rotation), lengths, area, index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
@@ -177,6 +183,13 @@ def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
 def _tensor(array: NDArray[Any]) -> Tensor:
     # The rendered array may be the panorama itself, shared or a read-only file: copy it.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)
+
+
+def _ray_lengths(view_sets: Sequence[Views], image: Any) -> Tensor:
+    """Return the ray lengths of sets of views if the labels are distances; else a 1."""
+    if image.labels.dtype != np.uint16:
+        return torch.ones(1, 1, 1)
+    return torch.from_numpy(np.concatenate([views.ray_lengths() for views in view_sets]))
 
 
 def _label_tensor(labels: NDArray[Any]) -> Tensor:

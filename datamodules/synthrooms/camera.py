@@ -32,7 +32,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 
-ViewKind = Literal["stanford", "uniform"]
+ViewKind = Literal["stanford", "wide", "uniform"]
 """Viewing directions of photos, see `RoomSettings.views`."""
 
 _X, _Y, _Z = np.eye(3)
@@ -164,7 +164,7 @@ def draw_rays(
 
     Args:
         rng: Source of randomness.
-        kind: See `RoomSettings.views`. Both kinds have fields of view of 45° to 75°.
+        kind: See `RoomSettings.views`.
         location: ``(3,)`` center in meters.
         size: Side in pixels.
     """
@@ -172,7 +172,8 @@ def draw_rays(
     if kind == "uniform":
         pitch, roll = math.asin(rng.uniform(-1, 1)), rng.uniform(-math.pi, math.pi)
     else:
-        pitch = float(np.clip(rng.normal(0, math.radians(20)), -1.4, 1.4))
+        spread = math.radians(35 if kind == "wide" else 20)
+        pitch = float(np.clip(rng.normal(0, spread), -1.4, 1.4))
         roll = rng.normal(0, math.radians(3))
-    fov = math.radians(rng.uniform(45, 75))
+    fov = math.radians(rng.uniform(96, 106) if kind == "wide" else rng.uniform(45, 75))
     return PerspectiveRays(Pose.looking(location, heading, pitch, roll), size, fov)

@@ -41,7 +41,8 @@ class RoomSettings:
         rooms: Number of rooms per area (a subset of `AREAS`, also written ``area_5a``).
         height: Rows of the panoramas; they have twice as many columns.
         views: Viewing directions of photos: ``"stanford"`` upright as in the real set (pitch
-            about N(0, 20°)), ``"uniform"`` in directions uniform on the sphere.
+            about N(0, 20°)), ``"uniform"`` in directions uniform on the sphere; both have fields of
+            view of 45° to 75°. ``"wide"``: upright, 96° to 106° (pitch about N(0, 35°)).
         views_per_camera: Perspective views per panorama.
         view_size: Side of the square perspective views in pixels.
         supersample: Rays per pixel side for the colors (labels and depth: one ray at the center).

@@ -60,8 +60,11 @@ protocols differ. Different data sets are not compared.
 | `test_rotation` | rotation of the test images, see `data.test_rotation` |
 | `classes` | set of classes: their number, or a name, see `data.classes` |
 | `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
+| `alignment` | of depth: alignment with the true distances, in distance or disparity |
+| `range` | of depth: true distances that count, and whether predictions are clipped to them |
 | `images` | number of test images, if some are missing or were left out as broken: `2 of 100` |
 | `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
+| | `pixels, then images`: the mean over the pixels of each image, then over the images |
 
 Further facts are settings of single data sets. Folds are compared separately. "Not stated" is a
 fact that the source does not state: such scores stand beside no result. Reasons are on the page

@@ -109,20 +109,19 @@ def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Te
     """
     if kind != "canonical_inverse":
         return depth, kind
-    width = ray_lengths.shape[-1]
-    if width == 1:  # not a pinhole image: the radians of an equirectangular image
-        span: Any = 2 * math.pi
-    else:
-        half = (width - 1) // 2
-        left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
-        squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
-        span = squared.sqrt() * width / half
+    span = _span(ray_lengths)
     return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
 
 
-def _check_kind(kind: DepthKind) -> None:
-    if kind == "canonical_inverse":
-        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
+def _span(ray_lengths: Tensor) -> Any:
+    """Return the width of images ``(…, h, w)`` on the image plane at distance 1."""
+    width = ray_lengths.shape[-1]
+    if width == 1:  # not a pinhole image: the radians of an equirectangular image
+        return 2 * math.pi
+    half = (width - 1) // 2
+    left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+    squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+    return squared.sqrt() * width / half
 
 
 def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
@@ -138,7 +137,8 @@ def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
         logarithm of the distance. NaN where the depth is not finite, or not positive where its
         logarithm is taken.
     """
-    _check_kind(kind)
+    if kind == "canonical_inverse":
+        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
     if kind == "log_distance":
         values = depth
     elif is_disparity(kind):
@@ -153,11 +153,12 @@ def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Ten
     """Convert distances along the rays to depth of a kind: the inverse of `distance_of`.
 
     Args:
-        distance: Distances.
+        distance: Distances ``(n, …, h, w)``.
         kind: Kind of the result.
         ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
     """
-    _check_kind(kind)
+    if kind == "canonical_inverse":
+        return ray_lengths / (distance * _span(ray_lengths))
     if kind == "log_distance":
         return distance.log()
     if kind == "metric_distance":

@@ -110,6 +110,7 @@ class Run:
         config = {name: value for name, value in self.settings.items() if name != "logger"}
         contents = {
             "predicts": self.task.predicts,
+            "depth_kind": self.task.depth_kind,
             "config": config,
             **inputs_and_classes(self.data),
         }

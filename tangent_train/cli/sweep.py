@@ -14,11 +14,13 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import CompactHydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json
+from tangent_train.imports import elsewhere
+from tangent_train.registry import resolve_target
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
@@ -58,6 +60,8 @@ def run_job(
             found="no validation split, in a sweep that searches the best validation score",
             expected="more than 0: runs are not compared on the test fold",
         )
+    if searches:
+        _check_direction(config, hydra.sweeper.get("direction"))
     folder = Path(hydra.runtime.output_dir)
     (folder / OBJECTIVE_FILE).unlink(missing_ok=True)
     sources = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]
@@ -74,12 +78,18 @@ def run_job(
         raise CompactHydraException(f"job {hydra.job.num} in {folder} ended with status {status}")
     if not (folder / OBJECTIVE_FILE).is_file():
         return None
-    objective = parse_json((folder / OBJECTIVE_FILE).read_bytes())
-    direction = hydra.sweeper.get("direction") if searches else None
-    if isinstance(direction, str) and not direction.startswith(objective["mode"]):
-        raise SettingError(
-            "hydra.sweeper.direction",
-            found=direction,
-            expected=f"{objective['mode']}imize, for {objective['figure']}",
-        )
-    return float(objective["best"])
+    return float(parse_json((folder / OBJECTIVE_FILE).read_bytes())["best"])
+
+
+def _check_direction(config: DictConfig, direction: object) -> None:
+    """Refuse to search for the worst score: errors are minimized."""
+    with elsewhere():  # imports torch
+        task = resolve_target(OmegaConf.to_container(config.task), "task")
+    if isinstance(direction, str) and hasattr(task, "mode_of"):
+        expected = f"{task.mode_of(task.monitor)}imize"
+        if direction != expected:
+            raise SettingError(
+                "hydra.sweeper.direction",
+                found=direction,
+                expected=f"{expected}, for {task.monitor}",
+            )

@@ -62,7 +62,7 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
     checkpoints = run.folder / "checkpoints"
     needed = _settings_to_type_again(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
-    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.monitor_mode)
+    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.mode_of(run.task.monitor))
     trainer = run.trainer([last, best])
     if settings["ema"] is not None:  # the first callback: the saved average has the last step
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])
@@ -98,7 +98,7 @@ def _best_validation_score(
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:
-        content = {"figure": best.monitor, "mode": best.mode, "best": score}
+        content = {"figure": best.monitor, "best": score}
         write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
     return score
 

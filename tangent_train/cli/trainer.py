@@ -65,7 +65,7 @@ def build_trainer(
     if epochs not in (None, -1):
         at_least("trainer.max_epochs", epochs, 1)
     loggers = _build_entries(settings, "logger", {"save_dir": str(folder), **_logger_names(folder)})
-    monitor = {"monitor": task.monitor, "mode": task.monitor_mode}
+    monitor = {"monitor": task.monitor, "mode": task.mode_of}
     plugins = section.pop("plugins", None) or []
     numbered = dict(enumerate(plugins if isinstance(plugins, list) else [plugins]))
     own_plugins = _build_entries({"trainer.plugins": numbered}, "trainer.plugins", {})
@@ -125,9 +125,9 @@ def _build_entries(settings: Mapping[str, Any], group: str, known: Mapping[str, 
 
 
 def _fill_null_settings(entry: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace null settings by known values; the mode for a monitored loss is min."""
-    if str(entry.get("monitor")).endswith("loss"):
-        known = {**known, "mode": "min"}
+    """Replace null settings by known values; the mode is that of the monitored value."""
+    if callable(mode_of := known.get("mode")):
+        known = {**known, "mode": mode_of(str(entry.get("monitor") or known["monitor"]))}
     return {
         name: _fill_null_settings(value, known)
         if isinstance(value, Mapping)

@@ -106,7 +106,7 @@ def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None
     built: dict[Any, tuple[Stage, Any]] = {}
     tried: list[Any] = []
     for stage in stages:
-        names = ["data", "representation", "level"]
+        names = ["data", "representation", "level", "task"]
         names += ["optimizer", "scheduler"] if stage.command == "train" else []
         parts = [stage.config.get(name) for name in names]
         if parts in tried:

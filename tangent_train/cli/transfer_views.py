@@ -29,8 +29,8 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
-    sets the level of the stage. Distortion-aware views of a network that does not allow them are
-    left out.
+    sets the level of the stage; names such as ``task.align`` change the task. Distortion-aware
+    views of a network that does not allow them are left out.
 
     Args:
         config: Composed ``transfer.yaml``.
@@ -111,8 +111,9 @@ def _view(
         config: Composed ``transfer.yaml``.
         trained: Network from a file without settings of a run; else None.
         option: Option of the group ``representation``; None for the representation of the transfer.
-        **changes: Changed settings of the representation.
+        **changes: Changed settings of the representation, or of the task.
     """
+    of_task = {name: changes.pop(name) for name in [*changes] if name.startswith("task.")}
     level = changes.get("level")
     composed: Any = OmegaConf.to_container(config.representation)
     section: Any
@@ -133,7 +134,7 @@ def _view(
     if rows is None and level is not None:
         rows = 2 ** (config.level + 1)
     section |= ({} if rows is None else {"erp_height": rows}) | changes
-    return {"representation": section} | ({} if level is None else {"level": level})
+    return {"representation": section, **of_task} | ({} if level is None else {"level": level})
 
 
 def _named_entries(config: DictConfig, setting: str) -> dict[str, dict[str, Any]]:

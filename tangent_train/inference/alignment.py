@@ -69,10 +69,10 @@ _NO_NOISE, _DAMPING, _NEGLIGIBLE = 1e-10, 1e-8, 1e-30
 _LEVERAGE = 2.5
 """Distance from the median, in spreads, beyond which samples lose weight in an affine fit."""
 
-_CONSTANT, _FIXED = 1e-4, 1e-6
-"""Spread of a constant view, as a share of its median; and standard deviation of its shift."""
-_RANGE_TO_STD = 2.563
-"""From the 10th to the 90th percentile of a Gaussian, in standard deviations."""
+_CONSTANT = 1e-4
+"""Spread of a constant view, as a share of its median."""
+_RANGE_TO_STD = 1.349
+"""Between the quartiles of a Gaussian, in standard deviations."""
 
 _CORRELATED = 30.0
 """Number of neighboring samples whose errors are alike; priors weigh as much as this many."""
@@ -384,7 +384,7 @@ def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
         pairs.append(np.stack([order[same], order[same + step]]))
     first, second = np.concatenate(pairs, axis=1)
     a, b = samples.view[first], samples.view[second]
-    views = a * samples.num_views + b
+    views = np.minimum(a, b) * samples.num_views + np.maximum(a, b)
     _, number, counts = np.unique(views, return_inverse=True, return_counts=True)
     kept = counts[number] >= _LEAST_SAMPLES
     return _Pairs(first[kept], second[kept], a[kept], b[kept])
@@ -457,10 +457,10 @@ def _fit_affine(
     center, spread = np.zeros(count), np.ones(count)
     used = np.unique(np.concatenate([first, second]))
     for number in np.unique(view[used]):
-        low, middle, high = np.quantile(value[used[view[used] == number]], (0.1, 0.5, 0.9))
+        low, middle, high = np.quantile(value[used[view[used] == number]], (0.25, 0.5, 0.75))
         center[number], spread[number] = middle, (high - low) / _RANGE_TO_STD
     is_constant = spread <= _CONSTANT * np.abs(center)
-    spread = np.where(is_constant, np.abs(center), spread)
+    spread, has_shift = np.where(is_constant, np.abs(center), spread), ~is_constant
     normal, no_shift = (value - center[view]) / spread[view], center / spread
     farness = np.maximum(1, np.abs(normal) / _LEVERAGE)
     design = (farness[first] * farness[second]) ** -2.0
@@ -473,13 +473,12 @@ def _fit_affine(
         entries = [
             depth[first] / noise - residual * share,
             -depth[second] / noise - residual * (1 - share),
-            scale[a] * factor[first] / noise,
-            -scale[b] * factor[second] / noise,
+            scale[a] * factor[first] / noise * has_shift[a],
+            -scale[b] * factor[second] / noise * has_shift[b],
         ]
         return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
 
     deviation = np.concatenate([np.full(count, _SCALE_PRIOR), np.maximum(1, np.abs(no_shift))])
-    deviation[count:][is_constant] *= _FIXED
     prior = sparse.diags_array(1 / deviation).tocsr()
     expected = np.concatenate([np.log(spread), no_shift]) / deviation
     start = np.concatenate([np.zeros(count), no_shift])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -78,7 +80,7 @@ def segmentation_scores(
     iou, accuracy = _class_scores(sums, absent_class)
     truth = sums[0]
     share = truth / truth.sum() if truth.any() else np.zeros_like(truth)
-    miou, macc = float(_mean_of_classes(iou)), float(_mean_of_classes(accuracy))
+    miou, macc = float(defined_mean(iou)), float(defined_mean(accuracy))
     return SegmentationScores(miou, macc, iou, accuracy, share)
 
 
@@ -99,7 +101,7 @@ def _class_scores(
     return np.where(truth > 0, iou, missing), np.where(truth > 0, accuracy, missing)
 
 
-def _mean_of_classes(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+def defined_mean(scores: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the mean over the last axis without NaN; NaN if all values are NaN."""
     count = np.sum(~np.isnan(scores), axis=-1)
     total = np.nansum(scores, axis=-1)
@@ -111,7 +113,7 @@ def mean_scores(
 ) -> dict[str, Any]:
     """Return mIoU and mAcc, given labeled area, predicted area and hits of each class."""
     scores = zip(("miou", "macc"), _class_scores(sums, absent_class), strict=True)
-    return {name: _mean_of_classes(of_classes) for name, of_classes in scores}
+    return {name: defined_mean(of_classes) for name, of_classes in scores}
 
 
 def bootstrap_intervals(
@@ -135,6 +137,26 @@ def bootstrap_intervals(
     Returns:
         Intervals of ``miou`` and ``macc``; empty for a single image, or without labeled pixels.
     """
+    return bootstrap(of_images, partial(mean_scores, absent_class=absent_class), draws, seed)
+
+
+def bootstrap(
+    of_images: Float[np.ndarray, "images ..."],
+    score: Callable[[NDArray[np.float64]], Mapping[str, NDArray[np.float64]]],
+    draws: int = 1000,
+    seed: int = 0,
+) -> dict[str, Interval]:
+    """Compute 95 % percentile bootstrap intervals of scores, see `bootstrap_intervals`.
+
+    Args:
+        of_images: Numbers of each image from whose sums the scores follow.
+        score: Function that returns scores ``(draws,)`` by name, given sums ``(draws, …)``.
+        draws: Number of draws.
+        seed: Seed of the draws.
+
+    Returns:
+        Intervals by name; empty for a single image. Undefined scores have none.
+    """
     count = len(of_images)
     if count <= 1:
         return {}
@@ -148,7 +170,7 @@ def bootstrap_intervals(
         drawn.append(times.astype(np.float64) @ flat)
     sums = np.concatenate(drawn).reshape(draws, *of_images.shape[1:])
     intervals = {}
-    for name, means in mean_scores(sums, absent_class).items():
+    for name, means in score(sums).items():
         if not np.isnan(means).all():
             low, high = np.nanquantile(means, (0.025, 0.975))
             intervals[name] = (float(low), float(high))
@@ -199,10 +221,7 @@ def count_image(
         # Integer counts first, so that results do not depend on the order or the device.
         by_row = torch.bincount(rows * k * k + pairs, minlength=height * k * k)
         by_row = by_row.reshape(height, k, k)
-        # In degrees, with the division last, so that a row on an edge has no rounding error.
-        southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
-        band_of_row = np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
-        bands.index_add_(0, torch.as_tensor(band_of_row, device=truth.device), by_row)
+        bands.index_add_(0, torch.as_tensor(band_of_rows(height), device=truth.device), by_row)
         angles = torch.as_tensor(equirect_solid_angles((height, width)), device=truth.device)
         pixels, steradians = by_row.sum(dim=0), torch.tensordot(angles, by_row.double(), dims=1)
     else:
@@ -210,6 +229,13 @@ def count_image(
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
     return SegmentationCounts(pixels, steradians, bands, torch.stack(sums)[None])
+
+
+def band_of_rows(height: int) -> NDArray[np.intp]:
+    """Return the index of the latitude band of each row of a panorama, see `BAND_EDGES_DEG`."""
+    # In degrees, with the division last, so that a row on an edge has no rounding error.
+    southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
+    return np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
 
 
 class SegmentationMetric(Metric):

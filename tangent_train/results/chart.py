@@ -35,8 +35,9 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     """
     record = rows[0].records[0]
     panels: list[_Panel] = []
-    for unit in dict.fromkeys(heading.unit for heading in record.headings.values()):
-        shown = {n: h.text for n, h in record.headings.items() if h.unit == unit}
+    headings = record.main_headings
+    for unit in dict.fromkeys(heading.unit for heading in headings.values()):
+        shown = {n: h.text for n, h in headings.items() if h.unit == unit}
         means = [[row.score(name) for name in shown] for row in rows]
         panels.append(_Panel("" if panels else title, list(shown.values()), means, unit))
     if score := record.main_of_class:

@@ -11,7 +11,7 @@ from datamodules.core.panoramas import ray_lengths
 from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
-from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
 from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import colorize_distance, distance_limits, distance_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from numpy.typing import NDArray
+
+    from tangent_train.results.predictions import Painter
 
 _POINTS = 500_000
 _SAMPLES = 2**16
@@ -74,14 +76,15 @@ def points_of(
         pixels: Rows and columns, see `spread_pixels`.
 
     Returns:
-        Points of panoramas in their axes: x ahead (the middle of the panorama), y to the right, z
-        up. Points of photos in camera axes: x to the right, y down, z ahead.
+        Points in right-handed axes, as other programs expect: of panoramas x ahead (the middle of
+        the panorama), y to the left, z up; of photos x to the right, y down, z ahead.
     """
     image, depth, area = predicted.image, predicted.pixels[tuple(pixels)], predicted.area
     rows, columns = pixels
     if area is not None:
         rows, columns = (places[index] for places, index in zip(area.places(), pixels, strict=True))
-        rays = lonlat_to_xyz(equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape))
+        lonlat_rad = equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape)
+        rays = lonlat_to_xyz(lonlat_rad) @ FLIP_Y
     else:
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
         rays = rays @ np.linalg.inv(np.asarray(image.camera_matrix)).T
@@ -144,13 +147,12 @@ class DepthResults(ImageResults):
         depth = read_depth_m(file, self._units_per_m)
         return np.where(depth > 0, depth, np.float32(np.nan))
 
-    def paint(
-        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
-    ) -> NDArray[np.uint8]:
+    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
         """Color depth by the range of all frames of the video."""
         ranges = [c for entry in entries if (c := entry["depth"].get("colors"))]
         near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
-        return colorize_distance(pixels, (min(near), max(far)))
+        limits = min(near), max(far)
+        return lambda rgb, depth: colorize_distance(depth, limits)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return unit, shares of the solid angle, distances, range of the colors, alignment."""

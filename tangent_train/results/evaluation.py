@@ -63,7 +63,7 @@ def headline(record: Record) -> str:
     """Return the scores over all images in one line."""
     means = [
         f"{h.text} {score_text(value, h.unit, record.intervals.get(name))}\u00a0{h.unit}".strip()
-        for name, h in record.headings.items()
+        for name, h in record.main_headings.items()
         if (value := record.means.get(name)) is not None
     ]
     absent = record.absent

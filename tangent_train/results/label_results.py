@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.rendering.mosaic import ScoreMosaic
+    from tangent_train.results.predictions import Painter
 
 _ROWS_AT_ONCE = 64
 
@@ -111,12 +112,12 @@ class LabelResults(ImageResults):
         """Read labels."""
         return read_pixels(file, indices=True)
 
-    def paint(
-        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
-    ) -> NDArray[np.uint8]:
+    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
         """Color the labels, or overlay the frame with them."""
         count = len(self.class_names)
-        return colorize(pixels, count) if kind == "color" else mixed_picture(rgb, pixels, count)
+        if kind == "color":
+            return lambda rgb, labels: colorize(labels, count)
+        return lambda rgb, labels: mixed_picture(rgb, labels, count)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the shares of the classes."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -18,6 +18,7 @@ _Image = NDArray[np.uint8]
 _MARGIN = 8
 _LEAST_ROWS = 256
 _PANORAMA_DIMENSIONS = 2
+_LARGEST_ERROR = 0.5
 _LEGEND_WIDTH = 1200
 """Width of a picture, in pixels, per step of its legend's size."""
 
@@ -94,15 +95,51 @@ def prediction_panel(
         "prediction": colorize(prediction, count),
         "error": error,
     }
-    scale = max(1, _LEAST_ROWS // truth.shape[0])
+    grid = _grid(tiles)
+    seen = np.union1d(np.unique(truth), np.unique(prediction))
+    return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+
+
+def distance_panel(
+    rgb: _Image, truth: NDArray[np.floating], prediction: NDArray[np.floating]
+) -> _Image:
+    """Draw input, true and predicted distances with one color scale, and error in a 2 × 2 grid.
+
+    Args:
+        rgb: Panorama ``(H, W, 3)``, or the crops of a photo side by side.
+        truth: True distances ``(H, W)`` in meters; NaN where unknown.
+        prediction: Predicted distances ``(H, W)``.
+
+    Returns:
+        RGB image as of `prediction_panel`. Relative errors are white to red, from 0 to 50 %; pixels
+        without a true distance are gray, those without a prediction are black.
+    """
+    near, far = distance_limits(truth)
+    share = np.abs(prediction - truth) / (_LARGEST_ERROR * truth)
+    red = np.array((214, 39, 40))
+    error = 255 + np.nan_to_num(share, posinf=1)[..., None].clip(0, 1) * (red - 255)
+    error[np.isnan(prediction)] = 0
+    error[np.isnan(truth)] = 160
+    scale = f"{near:.2g} to {far:.2g} m"
+    return _grid(
+        {
+            "input": rgb,
+            f"truth, {scale}": colorize_distance(truth, (near, far)),
+            f"prediction, {scale}": colorize_distance(prediction, (near, far)),
+            "error, 0 to 50 %": error.round().astype(np.uint8),
+        }
+    )
+
+
+def _grid(tiles: Mapping[str, _Image]) -> _Image:
+    """Draw four images in a 2 × 2 grid, below their titles; small ones are enlarged."""
+    scale = max(1, _LEAST_ROWS // len(next(iter(tiles.values()))))
     titled = [
         _titled(image.repeat(scale, axis=0).repeat(scale, axis=1), title)
         for title, image in tiles.items()
     ]
     gap = np.full((titled[0].shape[0], _MARGIN, 3), 255, np.uint8)
-    grid = np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
-    seen = np.union1d(np.unique(truth), np.unique(prediction))
-    return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+    return np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
 
 
 def shown_arrays(
@@ -113,12 +150,12 @@ def shown_arrays(
     most_rows: int | None = None,
     *,
     cut: bool = True,
-) -> tuple[_Image, NDArray[np.integer], NDArray[np.integer]]:
+) -> tuple[_Image, NDArray[Any], NDArray[Any]]:
     """Return a panorama with its labels, or the crops of a photo side by side.
 
     Args:
         image: `Panorama` or `Photo`.
-        target: True labels: ``(H, W)``, or ``(n, h, w)`` for crops.
+        target: True labels or distances: ``(H, W)``, or ``(n, h, w)`` for crops.
         prediction: Predicted labels of the same shape.
         representation: Representation that defines the crops.
         most_rows: Largest number of rows, to which larger images are downsampled; None for all.

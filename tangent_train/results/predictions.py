@@ -28,6 +28,9 @@ if TYPE_CHECKING:
     from datamodules.images.gpano import PanoramaArea
     from tangent_train.inference.images import InputImage
 
+    Painter = Callable[[NDArray[np.uint8], NDArray[Any]], NDArray[np.uint8]]
+    """Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
+
 _SUMMARY, _CLASSES = "summary.json", "classes.json"
 _FILES = (_SUMMARY, _CLASSES, "summary.csv", "report.html", "shards")
 _FOLDERS = ("labels", "color", "overlay", "probabilities", "depth", "points")
@@ -133,15 +136,11 @@ class ImageResults(ABC):
         """Read the predicted pixels from a file that `write` wrote."""
 
     @abstractmethod
-    def paint(
-        self, kind: str, rgb: NDArray[np.uint8], pixels: NDArray[Any], entries: Sequence[Entry]
-    ) -> NDArray[np.uint8]:
-        """Return a picture ``(h, w, 3)`` for a video.
+    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
+        """Return a function that paints the frames of a video.
 
         Args:
             kind: One of `pictures`.
-            rgb: Frame of the video.
-            pixels: Its prediction.
             entries: Entries of all frames of the video.
         """
 
@@ -269,14 +268,15 @@ class PredictionFolder:
             DataError: The video, or the prediction of a frame, cannot be read.
         """
 
-        def painted(kind: str, number: int, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        def painted(paint: Painter, number: int, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
             file = self.of_frames.files(frame_name(name, number))[self.results.source]
-            return self.results.paint(kind, rgb, self.results.read(file), entries)
+            return paint(rgb, self.results.read(file))
 
         for kind in self.results.pictures:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and (again or not file.exists()):
-                write_video(file, path, size, partial(painted, kind), every)
+                paint = self.results.painter(kind, entries)
+                write_video(file, path, size, partial(painted, paint), every)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and the description of the predictions.

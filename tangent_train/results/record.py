@@ -38,17 +38,22 @@ class Heading(NamedTuple):
         unit: ``%`` for a share of 1, which is printed in percent; else a unit, or "".
         of_class: Key of the score of one class that this score is the mean of, or "".
         class_text: Name of that score in reports.
+        better: ``higher``, or ``lower`` for errors.
+        is_main: True if reports of several runs and headlines contain the score; all scores are in
+            the files and in the tables of a run.
     """
 
     text: str
     unit: str = "%"
     of_class: str = ""
     class_text: str = ""
+    better: str = "higher"
+    is_main: bool = True
 
     @property
     def column(self) -> str:
         """Heading of a column with the score."""
-        return f"{self.text} {self.unit}".strip()
+        return f"{self.text} {self.unit}".strip() + " ↓" * (self.better == "lower")
 
     @property
     def class_column(self) -> str:
@@ -73,6 +78,8 @@ def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
             heading.unit,
             heading.of_class and heading.of_class + SOLID_ANGLE,
             heading.class_text and f"{heading.class_text} by solid angle",
+            heading.better,
+            heading.is_main,
         )
         for name, heading in headings.items()
     }
@@ -90,7 +97,7 @@ _SHOWN = {
 _FIELDS = {
     "noun": Text,
     "images": int,
-    "headings": dict[str, dict[str, Text]],
+    "headings": dict[str, dict],
     "classes": list,
     "latitude_bands": list,
     "groups": list,
@@ -100,7 +107,7 @@ _FIELDS = {
     "checkpoint": Text,
     "class_map": Text | None,
 }
-_HEADING: dict[str, Any] = dict.fromkeys(Heading._fields, Text)
+_HEADING: dict[str, Any] = dict.fromkeys(Heading._fields, Text) | {"is_main": bool}
 _EXPECTED = "results written by tangent-train or tangent-evaluate"
 
 
@@ -161,6 +168,11 @@ class Record:
     def main_of_class(self) -> str:
         """Name of the main score of a class; "" without classes."""
         return next(filter(None, (self.headings[name].of_class for name in self.means)), "")
+
+    @property
+    def main_headings(self) -> dict[str, Heading]:
+        """Headings of the main scores, see `Heading.is_main`."""
+        return {name: heading for name, heading in self.headings.items() if heading.is_main}
 
     @property
     def class_means(self) -> dict[str, str]:

@@ -102,7 +102,7 @@ class Report:
         return "Percent. " * all(h.unit == "%" for h in self.first.headings.values()) + _LEGEND
 
     def _overall(self) -> Table:
-        scores = self.first.headings
+        scores = self.first.main_headings
         names = dict.fromkeys(name for row in self.rows for name in row.facts)
         facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
         alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]

@@ -17,6 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
+from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.scores import network_for_views
 from tangent_train.errors import SettingError, at_least
 from tangent_train.results.evaluation import plain_scores
@@ -62,7 +63,7 @@ class Task(lightning.LightningModule, ABC):
         labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
         predicts: Kind of predictions, e.g. `PIXEL_CLASSES`, for commands that read a checkpoint.
         monitor: Score on the validation split that selects the best epoch.
-        monitor_mode: ``max`` if a larger score is better, ``min`` if a smaller one is.
+        depth_kind: Kind of the network's output, if it predicts distances; else None.
         takes: Input and output of a network for this task, for messages.
         headings: Headings of the scores over a split, in the order of the tables.
         metric: Metric of a split, see `build_metric`.
@@ -78,9 +79,9 @@ class Task(lightning.LightningModule, ABC):
     labels: ClassVar[str] = PIXEL_CLASSES
     predicts: ClassVar[str] = ""
     monitor: ClassVar[str]
-    monitor_mode: ClassVar[Literal["max", "min"]] = "max"
     takes: ClassVar[str]
     headings: ClassVar[Mapping[str, Heading]]
+    depth_kind: DepthKind | None = None
     result: Any
     evaluated: int
 
@@ -145,6 +146,17 @@ class Task(lightning.LightningModule, ABC):
             num_classes: Number of classes of the data.
         """
         return num_classes
+
+    @classmethod
+    def mode_of(cls, monitor: str) -> Literal["max", "min"]:
+        """Return ``min`` for a loss and for errors, see `Heading.better`; else ``max``.
+
+        Args:
+            monitor: Name of a logged value, e.g. ``val/miou``.
+        """
+        heading = cls.headings.get(monitor.partition("/")[2])
+        is_error = heading is not None and heading.better == "lower"
+        return "min" if is_error or monitor.endswith("loss") else "max"
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
@@ -514,8 +526,7 @@ class Task(lightning.LightningModule, ABC):
             group["lr"] *= group_factor
         if self.schedule is None:
             return optimizer
-        monitor = self.monitor, self.monitor_mode
-        configured = self.schedule.configure(optimizer, length, factors, monitor)
+        configured = self.schedule.configure(optimizer, length, factors, self.monitor, self.mode_of)
         return {"optimizer": optimizer, "lr_scheduler": configured}
 
     def _length(self) -> dict[str, int]:

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from torch.nn import functional
+
+DepthLoss = Literal["log_l1", "scale_invariant"]
+"""Loss of predicted distances, see `log_error_sum`."""
 
 
 def cross_entropy_sum(
@@ -77,6 +82,54 @@ def auxiliary_sum(
     histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
     # Counts instead of probabilities: pixels weigh the same in cells with few and many of them.
     return functional.cross_entropy(exact, histograms, class_weights.to(exact), reduction="sum")
+
+
+def log_error_sum(
+    errors: Float[Tensor, "images height width"], kind: DepthLoss, scale_invariance: float
+) -> Tensor:
+    """Sum the loss of logarithmic errors e = ln d − ln g; divide it by the number of known pixels.
+
+    * `log_l1`: ``Σ |e|``.
+    * `scale_invariant`: ``Σᵢ (Σ e² − λ (Σ e)² / nᵢ)`` over the images i of the network with nᵢ
+      known pixels each (Eigen, Puhrsch and Fergus, NeurIPS 2014, equation 4). A chunk contains
+      whole images, so that the sum is exact for all divisions of a step.
+
+    Args:
+        errors: Errors; NaN where the true distance is unknown.
+        kind: Kind of the loss.
+        scale_invariance: λ from 0 to 1: 1 ignores a common scale of each image.
+    """
+    known = ~errors.isnan()
+    exact = _exact(errors).where(known, 0)
+    if kind == "log_l1":
+        return exact.abs().sum()
+    counts = known.flatten(1).sum(dim=1).clamp(min=1)
+    common = exact.flatten(1).sum(dim=1).square() / counts
+    return exact.square().sum() - scale_invariance * common.sum()
+
+
+def scaled_and_shifted(
+    values: Float[Tensor, "images height width"], truth: Float[Tensor, "images height width"]
+) -> Tensor:
+    """Scale and shift values of each image by least squares, as far as the truth is known.
+
+    This is the alignment of Ranftl et al. (TPAMI 2022, equation 4).
+
+    Args:
+        values: Values of any scale and shift.
+        truth: True values; NaN where unknown.
+    """
+    known = ~truth.isnan()
+    counts = known.sum(dim=(1, 2), keepdim=True).clamp(min=1)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.where(known, 0).sum(dim=(1, 2), keepdim=True) / counts
+
+    # Without NaN, whose gradients would be NaN too.
+    exact, true = _exact(values), _exact(truth).where(known, 0)
+    centered, true_mean = exact - mean(exact), mean(true)
+    variance = mean(centered.square()).clamp(min=torch.finfo(exact.dtype).eps)
+    return centered * (mean(centered * (true - true_mean)) / variance) + true_mean
 
 
 def _exact(values: Tensor) -> Tensor:

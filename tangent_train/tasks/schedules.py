@@ -59,7 +59,8 @@ class Schedule:
         optimizer: Optimizer,
         length: Callable[[], Mapping[str, int]],
         factors: Sequence[float],
-        monitor: tuple[str, str],
+        monitor: str,
+        mode_of: Callable[[str], str],
     ) -> dict[str, Any]:
         """Build the scheduler and Lightning's settings for it.
 
@@ -67,7 +68,8 @@ class Schedule:
             optimizer: Optimizer whose learning rates are scheduled.
             length: Function that returns the number of epochs and steps of the training.
             factors: Factors of the learning rates of the optimizer's groups.
-            monitor: Score that selects the best epoch, and ``max`` or ``min``.
+            monitor: Score that selects the best epoch.
+            mode_of: Function that returns ``max`` or ``min`` for a logged value.
 
         Raises:
             SettingError: The training has no end, or `ReduceLROnPlateau` is stepped every step.
@@ -82,9 +84,9 @@ class Schedule:
                 raise SettingError(
                     "trainer.max_epochs", found="no end", expected="a number", remedy=remedy
                 )
-        monitored = self.monitor or monitor[0]
+        monitored = self.monitor or monitor
         if self._is_null("mode"):
-            filled["mode"] = "min" if monitored.endswith("loss") else monitor[1]
+            filled["mode"] = mode_of(monitored)
         try:
             scheduler = self.build(optimizer, **filled)
         except ZeroDivisionError as error:

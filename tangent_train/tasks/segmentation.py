@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, get_args
 
@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
-from tangent_train.inference.engine import fill, sees_rays, upright_rays, view_scores
+from tangent_train.inference.engine import fill, view_scores
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
     AbsentClass,
@@ -30,41 +30,34 @@ from tangent_train.metrics.segmentation import (
     segmentation_scores,
 )
 from tangent_train.registry import registered
-from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
 from tangent_train.rendering.mosaic import ScoreMosaic
-from tangent_train.rendering.representations.views import Representation
 from tangent_train.results.evaluation import class_entries, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.results.tables import percent
-from tangent_train.tasks.base import RGB, Part, Task
+from tangent_train.tasks.base import RGB
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
+from tangent_train.tasks.views import ViewsTask, labels_of_views
 
 
 @registered
-class SegmentationTask(Task):
+class SegmentationTask(ViewsTask):
     """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
 
-    The views of all images of a batch, on all processes, contribute to one gradient (paper,
-    supplement, "Semantic segmentation"): the loss is the sum over their labeled pixels, divided by
-    the sum of the class weights of these pixels. Validation and test cover the whole sphere, or the
-    whole photo; the scores are rendered back and compared with the original labels.
+    The loss is the sum over the labeled pixels of all views of a step, divided by the sum of the
+    class weights of these pixels. Validation and test cover the whole sphere, or the whole photo;
+    the scores are rendered back and compared with the original labels.
 
     Args:
-        network: Module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with these
-            scores under ``"out"`` and optional auxiliary scores under ``"aux"``. Score k is that of
-            label k + 1. A network whose `forward` also takes ``rays`` and ``images_per_chunk``
-            gets the viewing rays of its images and bounds its memory (`models.SphereContext`).
+        network: Network, see `ViewsTask`. Score k is that of label k + 1.
         representation: Representation of the images.
         class_names: Names of the K + 1 labels, the unknown class first.
         *arguments: Optimizer and scheduler, see `Task`.
         class_weights: Weights of the loss: a name (``none``, ``log``, ``sqrt``), for weights that
             the data module computes, or K numbers.
-        auxiliary_weight: Weight of the loss of the auxiliary scores.
-        images_per_forward: Number of images per forward pass in evaluation, which bounds memory.
         absent_class: Treatment of classes absent from the ground truth in the means.
-        **settings: Further arguments of `Task`.
+        **settings: Further arguments of `ViewsTask`.
     """
 
     predicts: ClassVar[str] = PIXEL_CLASSES
@@ -85,8 +78,6 @@ class SegmentationTask(Task):
         class_names: Sequence[str],
         *arguments: Any,
         class_weights: ClassWeights | Sequence[float] = "log",
-        auxiliary_weight: float = 0.4,
-        images_per_forward: int = 32,
         absent_class: AbsentClass = "skip",
         **settings: Any,
     ) -> None:
@@ -94,7 +85,6 @@ class SegmentationTask(Task):
         names, classes = get_args(ClassWeights), self.class_names[1:]
         for name, value, fits, expected in (
             ("absent_class", absent_class, absent_class in get_args(AbsentClass), "skip or zero"),
-            ("auxiliary_weight", auxiliary_weight, auxiliary_weight >= 0, "0 or more"),
             (
                 "class_weights",
                 class_weights,
@@ -106,18 +96,7 @@ class SegmentationTask(Task):
         ):
             if not fits:
                 raise SettingError(f"task.{name}", found=value, expected=expected)
-        self.sees_rays = sees_rays(network)
-        whole = EquirectRepresentation | IcosphereRepresentation
-        if self.sees_rays and isinstance(representation, whole):
-            raise SettingError(
-                "representation",
-                found="one view of the whole sphere",
-                expected="tangent images or a cube map for a network with cross-image context",
-                remedy="Use the network without context.",
-            )
         self.weighting = class_weights
-        self.auxiliary_weight = auxiliary_weight
-        self.images_per_forward = at_least("task.images_per_forward", images_per_forward, 1)
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(classes)))
 
@@ -130,62 +109,11 @@ class SegmentationTask(Task):
             weights = self.trainer.datamodule.class_weights(weights)  # type: ignore[attr-defined]
         self.class_weights.copy_(torch.as_tensor(weights, dtype=torch.float32))
 
-    def forward(
-        self,
-        images: Float[Tensor, "images channels height width"],
-        rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
-    ) -> Float[Tensor, "images classes height width"]:
-        """Return the scores of every pixel.
-
-        Args:
-            images: Images of one or several spheres.
-            rays: Viewing rays, see `Views.rays`, for networks that take them.
-
-        Raises:
-            SettingError: The shape of the scores does not fit the images or the classes.
-        """
-        return self.outputs(images, rays)["out"]
-
-    def outputs(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
-        """Return all scores of the network by name, see `forward`."""
-        images = images.contiguous(memory_format=self.memory_format)
-        if rays is None:
-            returned = self.network(images)
-        else:
-            count = self.images_per_chunk if self.training else self.images_per_forward
-            returned = self.network(images, rays, count)
-        outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        expected = (len(images), self._num_scores, *images.shape[-2:])
-        self.checked_scores(outputs["out"], expected)
-        return outputs
-
     @property
-    def _num_scores(self) -> int:
+    def num_scores(self) -> int:
         """Number of scores: that of classes, plus one for unknown classes of imported networks."""
         count: int = getattr(self.network, "num_scores", len(self.class_weights))
         return count
-
-    def example(self, channels: int) -> Tensor:
-        """Return one empty image ``(1, C, h, w)``."""
-        return torch.zeros(1, channels, *self.representation.image_size)
-
-    @property
-    def inputs_per_sample(self) -> int:
-        """Number of views of a panorama; 1 for a photo's crop and for an equirectangular image."""
-        if not isinstance(self.representation, Representation):
-            return 1
-        return len(self.representation.sample(np.random.default_rng(0)).rays()) or 1
-
-    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Return all images of a batch ``(n, C, h, w)`` and their labels ``(n, h, w)``."""
-        return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
-
-    def training_parts(self, batch: Any) -> list[Part]:
-        """See `Task`; a network that takes rays gets all images, which it divides."""
-        if self.sees_rays and batch.rays.numel():
-            images, labels = self.training_pairs(batch)
-            return [((images, batch.rays), labels)]
-        return super().training_parts(batch)
 
     def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
         """Return the weighted cross-entropy, summed over pixels, including auxiliary scores."""
@@ -244,27 +172,15 @@ class SegmentationTask(Task):
         area: SphereArea | None,
     ) -> ScoreMosaic:
         """Combine the scores of all views of a panorama, see `predict_labels`."""
-        limited = self.representation.limited_to(area)
-        rotated = limited if rotation is None else limited.with_rotation(rotation)
-        sets = rotated.view_sets()
-        readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
-        rays: Iterable[Tensor | None] = [None] * len(sets)
-        if self.sees_rays:
-            rays = upright_rays(sets, rotation, images.device)
-        count, several = self._num_scores, len(sets) > 1
-        mosaic = ScoreMosaic(shape, count, rotated.blend, averaged=several, device=images.device)
-        inputs = zip(sets, readers, rays, strict=True)
+        sets = self.view_sets(images, rotation, area)
+        averaged, blend = len(sets) > 1, self.representation.blend
+        mosaic = ScoreMosaic(shape, self.num_scores, blend, averaged=averaged, device=images.device)
 
         def add_loss(scores: Tensor, views: Any) -> None:
-            if target is None:
-                return
-            if target.is_cpu:
-                labels = torch.from_numpy(views.render(target.numpy(), "nearest"))
-            else:
-                labels = views.render(target[None], "nearest")[:, 0]
-            self._add_loss(scores, labels)
+            if target is not None:
+                self._add_loss(scores, labels_of_views(target, views))
 
-        return fill(mosaic, self, inputs, self.images_per_forward, scored=add_loss)
+        return fill(mosaic, self, sets, self.images_per_forward, scored=add_loss)
 
     def _add_loss(self, scores: Tensor, labels: Tensor) -> None:
         """Add the cross-entropy of views, without auxiliary scores, to the validation loss."""

@@ -34,8 +34,6 @@ def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> 
     distance = 2 * lengths
     if kind == "canonical_inverse":
         with pytest.raises(ValueError, match="uncanonical first"):
-            from_distance(distance, kind, lengths)
-        with pytest.raises(ValueError, match="uncanonical first"):
             along_rays(distance, kind, lengths)
         return
     output = from_distance(distance, kind, lengths)
@@ -65,6 +63,10 @@ def test_canonical_depth_is_multiplied_by_the_focal_length_in_widths() -> None:
         assert kind == "metric_z"
         torch.testing.assert_close(
             found, 1 / (depth[..., :columns] * columns * pitch), rtol=1e-4, atol=0
+        )
+        distance = found * lengths.flip(-1)
+        torch.testing.assert_close(
+            from_distance(distance, "canonical_inverse", lengths.flip(-1)), depth[..., :columns]
         )
     whole, kind = uncanonical(depth, "canonical_inverse", torch.ones(1, 1, 1, 1))
     torch.testing.assert_close(whole, 1 / (depth * 2 * math.pi))

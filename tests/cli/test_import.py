@@ -194,7 +194,7 @@ OF_DEPTH = ("network=onnx", "file=depth.onnx", "normalization=unit", "output=our
 
 @pytest.mark.parametrize("squeezed", [True, False])
 def test_an_onnx_file_predicts_depth(squeezed: bool, here: Path, run: Run, capsys: Capture) -> None:
-    """Of shape (B, h, w) or (B, 1, h, w), for images of any size."""
+    """Its output is ``(B, h, w)`` or ``(B, 1, h, w)``."""
     after = [helper.make_node("Squeeze", ["linear", "axes"], ["scores"])] if squeezed else []
     axes = {"axes": np.array([1])} if squeezed else {}
     write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), *after, **axes)

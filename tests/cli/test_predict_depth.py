@@ -81,7 +81,7 @@ def test_files_of_a_panorama(
     content = (output / "points" / "hall.ply").read_bytes()
     assert content.startswith(b"ply\nformat binary_little_endian 1.0\n")
     assert b"property float x\nproperty float y\nproperty float z\nproperty uchar red" in content
-    directions = equirect_directions((64, 128)).reshape(-1, 3)
+    directions = equirect_directions((64, 128)).reshape(-1, 3) * (1, -1, 1)
     distance_m = np.linalg.norm(cloud.vertices, axis=-1)
     pixels = (cloud.vertices @ directions.T).argmax(axis=1)
     np.testing.assert_allclose(directions[pixels] * distance_m[:, None], cloud.vertices, atol=1e-6)

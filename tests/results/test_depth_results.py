@@ -46,9 +46,11 @@ def test_points_are_directions_times_distance_without_unknown_pixels() -> None:
     assert not np.isnan(depth[rows, columns]).any()
     assert len(set(zip(rows, columns, strict=True))) == len(rows)
     points, colors = points_of(image, pixels)
-    expected = equirect_directions((20, 40)) * depth[..., None].astype(np.float64)
+    expected = equirect_directions((20, 40)) * depth[..., None].astype(np.float64) * (1, -1, 1)
     np.testing.assert_allclose(points, expected[rows, columns], atol=1e-12)
     np.testing.assert_array_equal(colors, image.image.rgb[rows, columns])
+    (right,), _ = points_of(image._replace(pixels=np.full_like(depth, 2)), np.array([[10], [30]]))
+    np.testing.assert_allclose(right, [0, -2, 0], atol=0.2)  # ahead, left, up
     empty = image._replace(pixels=np.full_like(depth, np.nan))
     assert spread_pixels(empty, 100).shape == (2, 0)
 
@@ -60,7 +62,8 @@ def test_points_of_a_part_and_of_a_photo() -> None:
     part = PredictedImage(InputImage(rgb), np.full((16, 32), 2, np.float32), area)
     points, colors = points_of(part, np.array([[0, 15], [0, 31]]))
     rows, columns = [16, 31], [112, 15]
-    np.testing.assert_allclose(points, 2 * equirect_directions((64, 128))[rows, columns])
+    expected = 2 * equirect_directions((64, 128))[rows, columns] * (1, -1, 1)
+    np.testing.assert_allclose(points, expected)
     np.testing.assert_array_equal(colors, rgb[rows, columns])
     camera = camera_matrix_from_fov(90.0, (64, 128))
     photo = PredictedImage(InputImage(rgb, camera_matrix=camera), np.full((64, 128), 3.0))
@@ -100,7 +103,8 @@ def test_a_video_has_one_range_of_colors() -> None:
     everywhere = np.array(True)
     entries = [{"depth": results.summarize(frame, everywhere)} for frame in frames]
     assert [entry["depth"].get("median") for entry in entries] == [1, 4, None, 9]
-    painted = [results.paint("color", f.image.rgb, f.pixels, entries)[0, 0] for f in frames]
+    paint = results.painter("color", entries)
+    painted = [paint(frame.image.rgb, frame.pixels)[0, 0] for frame in frames]
     assert (painted[0] == distance_colors()[0]).all()
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()

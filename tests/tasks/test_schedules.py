@@ -16,6 +16,7 @@ from transformers import get_scheduler
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.errors import SettingError
+from tangent_train.tasks import SegmentationTask
 from tangent_train.tasks.schedules import Schedule, warmup_cosine
 from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
 
@@ -151,7 +152,9 @@ def test_warm_up_and_cosine_have_their_closed_form(interval: Any) -> None:
     length = {"epoch": 8, "step": 24}
     schedule = Schedule(partial(warmup_cosine, warmup_share=0.25, total_steps=_NULL), interval)
     optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=LR)
-    configured = schedule.configure(optimizer, lambda: length, [1], ("val/miou", "max"))
+    configured = schedule.configure(
+        optimizer, lambda: length, [1], "val/miou", SegmentationTask.mode_of
+    )
     total = length[interval]
     for step in range(total + 1):
         rise = 0.01 + 0.99 * step / (total / 4)

@@ -26,11 +26,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([1.0, 3.0])
 WHOLE = torch.from_numpy(SphereArea.of(None).numbers)
+ONE = torch.ones(1, 1, 1)
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
 def _sample(images: Tensor, target: Tensor) -> Any:
-    return EvaluationSample(images, target, torch.eye(3).double(), WHOLE, 0)
+    return EvaluationSample(images, target, torch.eye(3).double(), ONE, WHOLE, 0)
 
 
 class Data(lightning.LightningDataModule):
@@ -56,7 +57,7 @@ class Data(lightning.LightningDataModule):
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             labels[:7, 1:] = 0
             labels *= len(self.train) != 1
-            self.train.append(TrainingSample(tensor, labels, torch.tensor(whole.rays()), 0))
+            self.train.append(TrainingSample(tensor, labels, torch.tensor(whole.rays()), ONE, 0))
             self.test.append(_sample(tensor, torch.from_numpy(truth)))
 
     def train_dataloader(self) -> DataLoader[Any]:

@@ -125,9 +125,10 @@ def test_views_look_around_as_asked() -> None:
         kind: np.array(
             [draw_rays(rng, kind, PLACE, 8).pose.world_from_camera[2, 2] for _ in range(2000)]
         )
-        for kind in ("uniform", "stanford")
+        for kind in ("uniform", "stanford", "wide")
     }
     # Archimedes: the height of uniform directions is uniform in [-1, 1], with variance 1/3.
     assert up["uniform"].var() == pytest.approx(1 / 3, abs=0.02)
     assert abs(up["uniform"].mean()) < 0.05
     assert np.degrees(np.arcsin(up["stanford"])).std() == pytest.approx(20, abs=1.5)
+    assert np.degrees(np.arcsin(up["wide"])).std() == pytest.approx(34, abs=2)

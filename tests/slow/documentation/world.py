@@ -40,6 +40,7 @@ from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pa
 from tests.datamodules.structured3d.structured3d_format import write_structured3d
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
+from tests.inference.photo_networks import depth_networks
 from tests.inference.photo_networks import huggingface_networks as networks
 from tests.slow.documentation.commands import TIME, fill_in, small_settings
 
@@ -48,6 +49,7 @@ SCRIPTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scrip
 ROWS = 128
 SEGFORMER = "nvidia/segformer-b0-finetuned-ade-512-512"
 OF_CITYSCAPES = "nvidia/segformer-b0-finetuned-cityscapes-1024-1024"
+DEPTH_ANYTHING = "depth-anything/Depth-Anything-V2-Small-hf"
 """Photo networks as the hub has them, where their names on the hub are paths."""
 _SEQUENCES = dict.fromkeys(("01", "02", "04", "05", "06"), 2)
 _TWO_BATCHES = {"PL_TRAINER_LIMIT_TRAIN_BATCHES": "2", "PL_TRAINER_LIMIT_VAL_BATCHES": "2"}
@@ -74,6 +76,7 @@ def build_world(folder: Path) -> Path:
     _write_colmap_model(folder / "project")
     small_photos = {"height": 32, "width": 32}
     networks.saved(networks.segformer, folder / SEGFORMER, size=small_photos)
+    networks.saved(depth_networks.depth_anything, folder / DEPTH_ANYTHING)
     of_streets = partial(networks.segformer, CLASSES)
     networks.saved(of_streets, folder / OF_CITYSCAPES, size=small_photos)
     demo = f"runs/demo/{TIME}"

@@ -17,9 +17,9 @@ from tangent_train.tasks.base import Task
 class ShareOfClass(Task):
     """Regresses the share of the pixels of a class, with any network for segmentation."""
 
-    monitor, monitor_mode = "val/mae", "min"
+    monitor = "val/mae"
     takes = "images (n, C, h, w) to numbers (n, 1, h, w)"
-    headings: ClassVar = {"mae": Heading("mean absolute error", "")}
+    headings: ClassVar = {"mae": Heading("mean absolute error", "", better="lower")}
 
     def __init__(self, *arguments: Any, class_name: str, **settings: Any) -> None:
         super().__init__(*arguments, **settings)

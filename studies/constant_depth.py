@@ -1,0 +1,62 @@
+"""Scores of distances that ignore the image, on the test split: a constant, or one of each row.
+
+``python -m studies.constant_depth experiment=rooms/depth`` takes the settings of tangent-train.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+import torch
+from hydra import compose, initialize_config_dir
+from numpy.typing import NDArray
+from omegaconf import OmegaConf
+from torch import nn
+
+from datamodules.core.panoramas import STEPS_PER_M
+from tangent_train.cli.run import build_data
+from tangent_train.files import config_folder
+from tangent_train.registry import build_from_config
+from tangent_train.results.evaluation import headline
+
+
+def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
+    """Return distances in meters ``(H or 1, 1)`` that ignore the image, by their name.
+
+    Args:
+        steps: Distances of the training panoramas ``(n, H, W)`` in steps, 0 where unknown.
+    """
+    known = np.sort(steps[steps > 0]).astype(np.float64)
+    share = np.cumsum(1 / known)  # the absolute relative error weights an error by 1 / distance
+    constant = known[np.searchsorted(share, share[-1] / 2)]
+    rows = np.ma.median(np.ma.masked_equal(steps.swapaxes(0, 1).reshape(steps.shape[1], -1), 0), 1)
+    filled = rows.filled(np.median(known))[:, None]
+    found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": filled}
+    return {name: np.atleast_2d(value) / STEPS_PER_M for name, value in found.items()}
+
+
+def main() -> None:
+    """Print the scores of each constant."""
+    with initialize_config_dir(str(config_folder()), version_base="1.3"):
+        config = compose("train", sys.argv[1:])
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    data = build_data(settings)
+    data.make_files()
+    train, test, view = data.source("train"), data.source("test"), data.representation
+    targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
+    empty = {"network": nn.Identity(), "class_names": (), "optimizer": None}
+    for name, meters in constants(np.stack(targets)).items():
+        task = build_from_config(settings["task"], "task", representation=view, **empty)
+        for index in range(len(test)):
+            truth = task.meters(torch.from_numpy(test.read(index).target(view).astype(np.int32)))
+            guess = torch.from_numpy(meters).float().expand(truth.shape)
+            task.metric.update(task.protocol.aligned(guess, truth), truth)
+        task.evaluated = len(test)
+        record = task.record(task.metric.compute(), data.noun)
+        print(f"{name}, {np.median(meters):.2f} m: {headline(record)}")
+
+
+if __name__ == "__main__":
+    main()

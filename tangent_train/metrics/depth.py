@@ -1,0 +1,257 @@
+"""Depth: errors of predicted distances, per image and then over images.
+
+With predicted distances d and true distances g of an image, in meters (Eigen, Puhrsch and Fergus,
+NeurIPS 2014, section 4.3):
+
+* AbsRel: mean of ``|d − g| / g``; SqRel: mean of ``(d − g)² / g``; MAE: mean of ``|d − g|``.
+* RMSE: root of the mean of ``(d − g)²``; RMSElog: the same of natural logarithms.
+* δ1, δ2, δ3: share of pixels with ``max(d/g, g/d)`` below 1.25, 1.25² and 1.25³.
+
+Pixels with a true but without a predicted distance are wrong in δ, have no error in the other
+scores, and are reported as a share (``missing``). Each score is that of an image, averaged over the
+images that have it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.utilities import dim_zero_cat
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.segmentation import (
+    BAND_EDGES_DEG,
+    Interval,
+    band_of_rows,
+    bootstrap,
+    defined_mean,
+)
+
+Alignment = Literal["none", "median", "scale", "affine"]
+"""Alignment of a prediction with the true distances of the image: ``median`` and ``scale`` multiply
+it by a number (the ratio of the medians, or least squares), ``affine`` also adds one (least
+squares)."""
+
+Quantity = Literal["distance", "disparity"]
+"""Quantity in which predictions are aligned; disparity is the reciprocal of the distance."""
+
+_ERRORS = ("absrel", "sqrel", "rmse", "rmse_log", "mae")
+_SHARES = ("delta1", "delta2", "delta3")
+_SUMS = 2 + len(_ERRORS) + len(_SHARES)
+_THRESHOLD = 1.25
+_PANORAMA_DIMENSIONS = 2
+
+
+@dataclass(frozen=True)
+class DepthProtocol:
+    """Comparison of predicted distances with true ones; scores depend on all of its settings.
+
+    Attributes:
+        alignment: Alignment of each prediction, see `Alignment`.
+        alignment_in: Quantity of the alignment.
+        min_distance: Pixels with a smaller true distance, in meters, are ignored.
+        max_distance: Pixels with a larger true distance, in meters, are ignored; None for no limit.
+        clip: True to clip aligned predictions to these distances.
+
+    Raises:
+        SettingError: A setting is invalid.
+    """
+
+    alignment: Alignment = "none"
+    alignment_in: Quantity = "distance"
+    min_distance: float = 0.0
+    max_distance: float | None = None
+    clip: bool = False
+
+    def __post_init__(self) -> None:
+        for name, kinds in (("alignment", Alignment), ("alignment_in", Quantity)):
+            value, options = getattr(self, name), get_args(kinds)
+            if value not in options:
+                raise SettingError(f"task.{name}", found=value, expected=" or ".join(options))
+        if self.min_distance < 0:
+            raise SettingError("task.min_distance", found=self.min_distance, expected="0 or more")
+        if self.max_distance is not None and self.max_distance <= self.min_distance:
+            expected = f"more than task.min_distance={self.min_distance}, or null"
+            raise SettingError("task.max_distance", found=self.max_distance, expected=expected)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """The settings as texts, for the records of scores."""
+        quantity = "" if self.alignment == "none" else f" in {self.alignment_in}"
+        far = "∞" if self.max_distance is None else f"{self.max_distance:g}"
+        clipped = ", predictions clipped" if self.clip else ""
+        return {
+            "alignment": self.alignment + quantity,
+            "range": f"{self.min_distance:g} to {far} m{clipped}",
+        }
+
+    def limited(self, truth: Float[Tensor, "*shape"]) -> Float[Tensor, "*shape"]:
+        """Return true distances in meters, with NaN outside the limits."""
+        far = torch.inf if self.max_distance is None else self.max_distance
+        known = (truth > 0) & (truth >= self.min_distance) & (truth <= far)
+        return torch.where(known, truth, torch.nan)
+
+    def aligned(
+        self,
+        prediction: Float[Tensor, "*shape"],
+        truth: Float[Tensor, "*shape"],
+        ray_lengths: Tensor | None = None,
+    ) -> Float[Tensor, "*shape"]:
+        """Align the prediction for an image with its true distances, and clip it.
+
+        Args:
+            prediction: Predicted distances in any unit; NaN where unknown.
+            truth: True distances in meters; NaN where unknown or outside the limits.
+            ray_lengths: Distance divided by z-depth of the pixels of a photo, whose z-depth is
+                aligned; None for a panorama.
+
+        Returns:
+            Distances in meters; NaN where unknown, or where the alignment makes them negative.
+        """
+        distances = torch.where(prediction > 0, prediction.double(), torch.nan)
+        lengths = 1.0 if ray_lengths is None else ray_lengths.double()
+        used = (truth > 0) & distances.isfinite()
+        if self.alignment != "none" and used.any():
+            values, true = distances / lengths, truth.double() / lengths
+            is_disparity = self.alignment_in == "disparity"
+            if is_disparity:
+                values, true = 1 / values, 1 / true
+            scale, shift = _fit(values[used], true[used], self.alignment)
+            values = scale * values + shift
+            if is_disparity and self.clip:
+                values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
+            distances = lengths * (1 / values if is_disparity else values)
+        if self.clip:
+            distances = distances.clamp(self.min_distance, self.max_distance)
+        return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)
+
+
+def _fit(values: Tensor, true: Tensor, alignment: Alignment) -> tuple[Any, Any]:
+    """Return scale and shift of values for some true values."""
+    if alignment == "median":
+        return true.median() / values.median(), 0.0
+    if alignment == "scale":
+        return (values * true).sum() / values.square().sum(), 0.0
+    centered = values - values.mean()
+    variance = centered.square().sum()
+    scale = torch.where(variance > 0, (centered * true).sum() / variance, 0.0)
+    return scale, true.mean() - scale * values.mean()
+
+
+def error_sums(
+    prediction: Float[Tensor, "*shape"], truth: Float[Tensor, "*shape"]
+) -> Float[Tensor, "weightings sums"]:
+    """Sum the errors of one panorama ``(H, W)``, or of the crops of one photo ``(n, h, w)``.
+
+    Args:
+        prediction: Predicted distances in meters; NaN where there are none.
+        truth: True distances in meters; NaN where unknown.
+
+    Returns:
+        ``(8, 10)`` float64 sums by weighting: pixels, solid angles, and pixels of the latitude
+        bands `BAND_EDGES_DEG`; the last seven are 0 for photos. See `depth_scores`.
+
+    Raises:
+        SettingError: The shapes differ.
+    """
+    if prediction.shape != truth.shape:
+        raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
+    known = truth > 0  # False for NaN
+    predicted = known & (prediction > 0) & prediction.isfinite()
+    d, g = (torch.where(predicted, x, 1.0).double() for x in (prediction, truth))
+    away, ratio = (d - g).abs(), torch.maximum(d / g, g / d)
+    values = [known, predicted, away / g, away**2 / g, away**2, (d / g).log() ** 2, away]
+    values += [predicted & (ratio < _THRESHOLD**n) for n in (1, 2, 3)]
+    if truth.ndim != _PANORAMA_DIMENSIONS:
+        sums = torch.stack([value.double().sum() for value in values])
+        return torch.cat([sums[None], sums.new_zeros(len(BAND_EDGES_DEG), _SUMS)])
+    rows = torch.stack([value.double().sum(dim=1) for value in values], dim=1)
+    return torch.from_numpy(_row_weights(tuple(truth.shape))).to(rows.device) @ rows
+
+
+@lru_cache(maxsize=4)
+def _row_weights(shape: tuple[int, int]) -> NDArray[np.float64]:
+    """Return the weights of the rows of a panorama, see `error_sums`."""
+    bands = np.eye(len(BAND_EDGES_DEG) - 1)[:, band_of_rows(shape[0])]
+    return np.stack([np.ones(shape[0]), equirect_solid_angles(shape), *bands])
+
+
+def depth_scores(sums: Float[np.ndarray, "*some sums"]) -> dict[str, NDArray[np.float64]]:
+    """Compute the scores of images, or of parts of images, from the sums of their errors.
+
+    Args:
+        sums: Results of `error_sums`.
+
+    Returns:
+        Scores by name; NaN without pixels to compute them from.
+    """
+    known, predicted = (np.where(x > 0, x, np.nan) for x in (sums[..., 0], sums[..., 1]))
+    means = dict(zip(_ERRORS, np.moveaxis(sums[..., 2:7], -1, 0) / predicted, strict=True))
+    shares = dict(zip(_SHARES, np.moveaxis(sums[..., 7:], -1, 0) / known, strict=True))
+    roots = {name: np.sqrt(means[name]) for name in ("rmse", "rmse_log")}
+    return means | roots | shares | {"missing": 1 - sums[..., 1] / known}
+
+
+def mean_depth_scores(sums: Float[np.ndarray, "images sums"]) -> dict[str, float]:
+    """Return the means of the scores over the images that have them.
+
+    Args:
+        sums: Sums of each image with one weighting.
+    """
+    return {name: float(defined_mean(scores)) for name, scores in depth_scores(sums).items()}
+
+
+def depth_intervals(sums: Float[np.ndarray, "images sums"]) -> dict[str, Interval]:
+    """Return 95 % bootstrap intervals of `mean_depth_scores`, see `bootstrap`.
+
+    Args:
+        sums: Sums of each image with one weighting.
+    """
+    scores = depth_scores(sums)
+    columns = np.stack([*scores.values()], axis=1)
+    defined = ~np.isnan(columns)
+
+    def means(totals: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+        """Return the mean scores of draws ``(draws, 2, scores)``: sums and numbers of images."""
+        numbers = np.where(totals[:, 1] > 0, totals[:, 1], np.nan)
+        return dict(zip(scores, (totals[:, 0] / numbers).T, strict=True))
+
+    return bootstrap(np.stack([np.where(defined, columns, 0), defined], axis=1), means)
+
+
+class DepthMetric(Metric):
+    """Collects the errors of all images of a data set, see `error_sums`."""
+
+    full_state_update = False
+    of_images: list[Tensor]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        # Processes without images contribute an empty part of the same dtype and shape.
+        shape = (0, 1 + len(BAND_EDGES_DEG), _SUMS)
+        self.of_images = [torch.zeros(shape, dtype=torch.float64, device=self.device)]
+
+    def update(self, prediction: Tensor, truth: Tensor) -> None:
+        """Add the errors of one image, see `error_sums`."""
+        self.of_images.append(error_sums(prediction, truth)[None])
+
+    def compute(self) -> NDArray[np.float64]:
+        """Return the sums ``(images, 8, 10)`` of all processes."""
+        sums: NDArray[np.float64] = dim_zero_cat(self.of_images).cpu().numpy()
+        return sums

@@ -1,0 +1,342 @@
+"""Depth of panoramas and photos: the distance from the center at every pixel."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torch.nn import functional
+
+from datamodules.core.labels import DISTANCE
+from datamodules.core.panoramas import STEPS_PER_M
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.distances import (
+    along_rays,
+    distance_of,
+    from_distance,
+    is_disparity,
+    is_metric,
+    uncanonical,
+)
+from tangent_train.errors import SettingError
+from tangent_train.geometry import SphereArea
+from tangent_train.inference.alignment import Align
+from tangent_train.inference.depth import combine_depth
+from tangent_train.inference.engine import view_scores
+from tangent_train.metrics.depth import (
+    Alignment,
+    DepthMetric,
+    DepthProtocol,
+    Quantity,
+    depth_intervals,
+    depth_scores,
+    error_sums,
+    mean_depth_scores,
+)
+from tangent_train.metrics.segmentation import BAND_EDGES_DEG
+from tangent_train.registry import registered
+from tangent_train.results.evaluation import plain_scores
+from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.pictures import distance_panel, shown_arrays
+from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
+from tangent_train.tasks.base import RGB
+from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
+from tangent_train.tasks.views import ViewsTask, labels_of_views
+
+_PANORAMA_DIMENSIONS = 2
+_LEAST = 1e-3
+"""Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
+
+
+@registered
+class DepthTask(ViewsTask):
+    """Trains a network that predicts distances, and scores whole panoramas or photos.
+
+    The loss is a sum over the pixels of a step whose distance is known, divided by their number.
+    Validation and test align the views of a panorama with each other, and compare the distances of
+    the panorama with the true ones, which are the labels of the data.
+
+    Args:
+        network: Network with one output, see `ViewsTask`: the natural logarithm of the distance, or
+            `depth_kind`.
+        representation: Representation of the images.
+        class_names: Empty.
+        *arguments: Optimizer and scheduler, see `Task`.
+        depth_kind: Kind of the network's output; None for that of a network from a file, else
+            ``log_distance``.
+        loss: Kind of loss, see `log_error_sum`.
+        scale_invariance: λ of the loss `scale_invariant`.
+        align: Alignment of the views of a panorama with each other, see `inference.alignment`; None
+            for the usual one of `depth_kind`.
+        alignment: See `DepthProtocol`.
+        alignment_in: See `DepthProtocol`; None for the quantity in which the network predicts.
+        min_distance: See `DepthProtocol`; pixels beyond the limits are ignored in training too.
+        max_distance: See `DepthProtocol`.
+        clip: See `DepthProtocol`.
+        **settings: Further arguments of `ViewsTask`.
+
+    Attributes:
+        result: Sums ``(images, 8, 10)`` of the last evaluation, see `error_sums`.
+    """
+
+    labels: ClassVar[str] = DISTANCE
+    predicts: ClassVar[str] = DISTANCE
+    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+        {
+            "absrel": Heading("AbsRel", "", better="lower"),
+            "delta1": Heading("δ1"),
+            "rmse": Heading("RMSE", "m", better="lower"),
+            "mae": Heading("MAE", "m", better="lower", is_main=False),
+            "sqrel": Heading("SqRel", "m", better="lower", is_main=False),
+            "rmse_log": Heading("RMSElog", "", better="lower", is_main=False),
+            "delta2": Heading("δ2", is_main=False),
+            "delta3": Heading("δ3", is_main=False),
+            "missing": Heading("missing", better="lower", is_main=False),
+        }
+    )
+    monitor: ClassVar[str] = "val/absrel"
+    takes: ClassVar[str] = "images (n, C, h, w) to one number for every pixel (n, 1, h, w)"
+    num_scores = 1
+
+    def __init__(
+        self,
+        network: nn.Module,
+        representation: Any,
+        class_names: Sequence[str],
+        *arguments: Any,
+        depth_kind: DepthKind | None = None,
+        loss: DepthLoss = "log_l1",
+        scale_invariance: float = 0.5,
+        align: Align | None = None,
+        alignment: Alignment = "none",
+        alignment_in: Quantity | None = None,
+        min_distance: float = 0.0,
+        max_distance: float | None = None,
+        clip: bool = False,
+        **settings: Any,
+    ) -> None:
+        super().__init__(network, representation, class_names, *arguments, **settings)
+        of_file = getattr(network, "kind", None)
+        kinds, losses, aligns = map(get_args, (DepthKind, DepthLoss, Align))
+        if of_file is not None:
+            kinds = (of_file,)
+        for name, value, fits, expected in (
+            ("depth_kind", depth_kind, depth_kind in (None, *kinds), " or ".join(kinds)),
+            ("align", align, align in (None, *aligns), f"null, {' or '.join(aligns)}"),
+            ("loss", loss, loss in losses, " or ".join(losses)),
+            ("scale_invariance", scale_invariance, 0 <= scale_invariance <= 1, "0 to 1"),
+            ("label_smoothing", self.label_smoothing, self.label_smoothing == 0, "0 for distances"),
+        ):
+            if not fits:
+                raise SettingError(f"task.{name}", found=value, expected=expected)
+        self.depth_kind: DepthKind = depth_kind or of_file or "log_distance"
+        if alignment == "none" and not is_metric(self.depth_kind):
+            raise SettingError(
+                "task.alignment",
+                found=f"none, for a network that predicts {self.depth_kind}",
+                expected="median, scale or affine: the scale of its distances is unknown",
+                remedy="task.alignment=affine",
+            )
+        if alignment_in is None:
+            alignment_in = "disparity" if is_disparity(self.depth_kind) else "distance"
+        self.protocol = DepthProtocol(alignment, alignment_in, min_distance, max_distance, clip)
+        self.loss: DepthLoss = loss
+        self.scale_invariance = float(scale_invariance)
+        self.align = align
+
+    @staticmethod
+    def num_outputs(num_classes: int) -> int:
+        """See `Task`: one output."""
+        return 1
+
+    def meters(self, labels: Tensor) -> Float[Tensor, "*shape"]:
+        """Return true distances in meters; NaN where they are unknown or beyond the limits.
+
+        Args:
+            labels: Distances in steps of 1/512 m, 0 where unknown.
+        """
+        return self.protocol.limited(labels.float() / STEPS_PER_M)
+
+    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Return all images of a batch, and the output ``(n, h, w)`` that would be correct."""
+        images, labels = super().training_pairs(batch)
+        lengths = batch.ray_lengths.expand(*batch.labels.shape[:2], *batch.ray_lengths.shape[-2:])
+        truth = self.meters(labels)
+        return images, from_distance(truth, self.depth_kind, lengths.flatten(0, 1))
+
+    def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
+        """Return the loss, summed over pixels, including that of an auxiliary head."""
+        outputs = self.outputs(*inputs)
+        loss = self._loss(outputs["out"], labels)
+        if "aux" not in outputs:
+            return loss
+        enlarged = functional.interpolate(outputs["aux"], labels.shape[-2:], mode="bilinear")
+        return loss + self.auxiliary_weight * self._loss(enlarged, labels)
+
+    def _loss(self, outputs: Tensor, truth: Tensor) -> Tensor:
+        """Return the loss of outputs ``(n, 1, h, w)``, given the correct ones ``(n, h, w)``."""
+        return log_error_sum(self.errors(outputs, truth), self.loss, self.scale_invariance)
+
+    def errors(
+        self, outputs: Float[Tensor, "images 1 height width"], truth: Tensor
+    ) -> Float[Tensor, "images height width"]:
+        """Return the errors of the logarithm of the network's depth, or disparity.
+
+        Relative outputs are first scaled and shifted, see `scaled_and_shifted`.
+
+        Args:
+            outputs: Outputs of the network.
+            truth: The correct outputs ``(n, h, w)``; NaN where unknown.
+        """
+        values = outputs[:, 0].to(truth.dtype)  # float32 in half-precision training
+        if self.depth_kind == "log_distance":
+            return values - truth
+        if not is_metric(self.depth_kind):
+            values = scaled_and_shifted(values, truth)
+        return values.clamp(min=_LEAST).log() - truth.log()
+
+    def loss_norm(self, labels: Tensor) -> Tensor:
+        """Return the number of pixels whose distance is known."""
+        return (~labels.isnan()).sum().float()
+
+    def _add_loss(self, outputs: Tensor, truth: Tensor, ray_lengths: Tensor) -> None:
+        """Add the loss of views, given their true distances, to the validation loss."""
+        labels = from_distance(truth, self.depth_kind, ray_lengths)
+        self.add_validation_loss(self._loss(outputs, labels), labels)
+
+    @torch.no_grad()
+    def predict_distances(
+        self,
+        images: Float[Tensor, "images channels height width"],
+        shape: tuple[int, ...],
+        ray_lengths: Float[Tensor, "some height width"],
+        rotation: NDArray[np.float64] | None = None,
+        truth: Tensor | None = None,
+        area: SphereArea | None = None,
+    ) -> Float[Tensor, "*shape"]:
+        """Predict the distances of one panorama, or of the crops of a photo.
+
+        Args:
+            images: Images of all view sets of the representation, in this order.
+            shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
+                crops.
+            ray_lengths: Ray lengths of each view set, or of each crop.
+            rotation: Rotation of the representation ``(3, 3)``.
+            truth: True distances in meters, to add to the validation loss; None to compute no loss.
+            area: Area of a partial panorama; None for the whole sphere.
+
+        Returns:
+            Distances of that shape; NaN where unknown.
+        """
+        kind = self.depth_kind
+        if len(shape) != _PANORAMA_DIMENSIONS:  # crops, each separately
+            depth = self._depth_of(images.__getitem__, len(images))
+            if truth is not None:
+                self._add_loss(depth, truth, ray_lengths)
+            lengths = ray_lengths[:, None]
+            values, kind = uncanonical(depth, kind, lengths)
+            return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
+        outputs = []
+        for views, of_set, rays in self.view_sets(images, rotation, area):
+            depth = self._depth_of(of_set, len(views), rays)
+            if truth is not None:
+                lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
+                self._add_loss(depth, labels_of_views(truth, views), lengths)
+            outputs.append((views, depth))
+        size, blend = (shape[0], shape[1]), self.representation.blend
+        combined = combine_depth(outputs, size, kind, blend, self.align, area=area)
+        return combined.distance.to(images.device)
+
+    def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
+        """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
+        parts = view_scores(self, images, count, self.images_per_forward, rays)
+        return torch.cat([depth for _, depth in parts])
+
+    def evaluate(self, batch: Any) -> Tensor:
+        """Add a batch of panoramas or photos to `metric`; return the aligned distances."""
+        predictions = []
+        for images, target, lengths, rotation, numbers in zip(
+            batch.images, batch.target, batch.ray_lengths, batch.rotation, batch.area, strict=True
+        ):
+            truth = self.meters(target)
+            distances = self.predict_distances(
+                images,
+                tuple(target.shape),
+                lengths,
+                rotation.cpu().numpy(),
+                None if self.is_tested else truth,
+                SphereArea.of_numbers(numbers.cpu().numpy()),
+            )
+            if target.ndim != _PANORAMA_DIMENSIONS:  # the crops of a photo have separate scales
+                crops = zip(distances, truth, lengths, strict=True)
+                aligned = torch.stack([self.protocol.aligned(*crop) for crop in crops])
+            else:
+                aligned = self.protocol.aligned(distances, truth)
+            self.metric.update(aligned, truth)
+            predictions.append(aligned)
+        return torch.stack(predictions)
+
+    def build_metric(self) -> DepthMetric:
+        """Build the metric, which keeps the sums of the errors of each image."""
+        return DepthMetric()
+
+    def logged_scores(self, result: NDArray[np.float64]) -> dict[str, float]:
+        """Return means over images; for panoramas, also weighted by solid angle."""
+        scores = mean_depth_scores(result[:, 0])
+        if result[:, 1].any():
+            scores |= by_solid_angle(mean_depth_scores(result[:, 1]))
+        return {name: scores[name] for name in self.headings if name in scores}
+
+    def record(self, result: NDArray[np.float64], noun: str) -> Record:
+        """Return the record with scores of latitude bands, and confidence intervals."""
+        bands = zip(itertools.pairwise(BAND_EDGES_DEG), result[:, 2:].swapaxes(0, 1), strict=True)
+        return replace(
+            super().record(result, noun),
+            latitude_bands=[
+                {"latitude_deg": [south, north]} | plain_scores(mean_depth_scores(band))
+                for (north, south), band in bands
+                if result[:, 1].any()
+            ],
+            intervals=depth_intervals(result[:, 0]) | by_solid_angle(depth_intervals(result[:, 1])),
+        )
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """See `Task`: errors are those of the pixels of an image, averaged over the images."""
+        return {"weighting": "pixels, then images", **self.protocol.facts}
+
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB:
+        """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
+        truth = self.meters(target)
+        return distance_panel(
+            *shown_arrays(image, truth, prediction, self.representation, most_rows)
+        )
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage:
+        """Return the image with its true and predicted distances, aligned as for the scores."""
+        truth = self.meters(target)
+        scores = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())
+        arrays = shown_arrays(image, truth, prediction, self.representation, cut=False)
+        return encode_image(
+            name,
+            arrays[0],
+            distance=arrays[2],
+            true_distance=arrays[1],
+            sphere=target.ndim == _PANORAMA_DIMENSIONS,
+            note=f"AbsRel {scores['absrel']:.3g}",
+        )
+
+    def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
+        """See `Task`."""
+        return self.logged_scores(result[list(places)])

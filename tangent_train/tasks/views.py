@@ -1,0 +1,153 @@
+"""Base class of tasks for every pixel of the views of panoramas and photos."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from tangent_train.errors import SettingError, at_least
+from tangent_train.geometry import SphereArea
+from tangent_train.inference.engine import sees_rays, upright_rays
+from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
+from tangent_train.rendering.representations.views import Representation
+from tangent_train.tasks.base import Part, Task
+
+ViewSet = tuple[Any, Any, Tensor | None]
+"""Views, a function that returns some of their images, and viewing rays for networks that take
+them."""
+
+
+class ViewsTask(Task):
+    """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
+
+    The views of all images of a batch, on all processes, contribute to one gradient (paper,
+    supplement, "Semantic segmentation").
+
+    Args:
+        network: Module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with this
+            output under ``"out"`` and optionally that of an auxiliary head under ``"aux"``. A
+            network whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing
+            rays of its images and bounds its memory (`models.SphereContext`).
+        representation: Representation of the images.
+        class_names: Names of the labels.
+        *arguments: Optimizer and scheduler, see `Task`.
+        auxiliary_weight: Weight of the loss of the auxiliary output.
+        images_per_forward: Number of images per forward pass in evaluation, which bounds memory.
+        **settings: Further arguments of `Task`.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        representation: Any,
+        class_names: Sequence[str],
+        *arguments: Any,
+        auxiliary_weight: float = 0.4,
+        images_per_forward: int = 32,
+        **settings: Any,
+    ) -> None:
+        super().__init__(network, representation, class_names, *arguments, **settings)
+        if not auxiliary_weight >= 0:
+            expected = "0 or more"
+            raise SettingError("task.auxiliary_weight", found=auxiliary_weight, expected=expected)
+        self.sees_rays = sees_rays(network)
+        whole = EquirectRepresentation | IcosphereRepresentation
+        if self.sees_rays and isinstance(representation, whole):
+            raise SettingError(
+                "representation",
+                found="one view of the whole sphere",
+                expected="tangent images or a cube map for a network with cross-image context",
+                remedy="Use the network without context.",
+            )
+        self.auxiliary_weight = auxiliary_weight
+        self.images_per_forward = at_least("task.images_per_forward", images_per_forward, 1)
+
+    @property
+    @abstractmethod
+    def num_scores(self) -> int:
+        """Number of outputs of the network at every pixel."""
+
+    def forward(
+        self,
+        images: Float[Tensor, "images channels height width"],
+        rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
+    ) -> Float[Tensor, "images outputs height width"]:
+        """Return the output of the network at every pixel.
+
+        Args:
+            images: Images of one or several spheres.
+            rays: Viewing rays, see `Views.rays`, for networks that take them.
+
+        Raises:
+            SettingError: The shape of the output does not fit the images or the labels.
+        """
+        return self.outputs(images, rays)["out"]
+
+    def outputs(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
+        """Return all outputs of the network by name, see `forward`."""
+        images = images.contiguous(memory_format=self.memory_format)
+        if rays is None:
+            returned = self.network(images)
+        else:
+            count = self.images_per_chunk if self.training else self.images_per_forward
+            returned = self.network(images, rays, count)
+        outputs = returned if isinstance(returned, Mapping) else {"out": returned}
+        expected = (len(images), self.num_scores, *images.shape[-2:])
+        self.checked_scores(outputs["out"], expected)
+        return outputs
+
+    def example(self, channels: int) -> Tensor:
+        """Return one empty image ``(1, C, h, w)``."""
+        return torch.zeros(1, channels, *self.representation.image_size)
+
+    @property
+    def inputs_per_sample(self) -> int:
+        """Number of views of a panorama; 1 for a photo's crop and for an equirectangular image."""
+        if not isinstance(self.representation, Representation):
+            return 1
+        return len(self.representation.sample(np.random.default_rng(0)).rays()) or 1
+
+    def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
+        """Return all images of a batch ``(n, C, h, w)`` and their labels ``(n, h, w)``."""
+        return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
+
+    def training_parts(self, batch: Any) -> list[Part]:
+        """See `Task`; a network that takes rays gets all images, which it divides."""
+        if self.sees_rays and batch.rays.numel():
+            images, labels = self.training_pairs(batch)
+            return [((images, batch.rays), labels)]
+        return super().training_parts(batch)
+
+    def view_sets(
+        self, images: Tensor, rotation: NDArray[np.float64] | None, area: SphereArea | None
+    ) -> list[ViewSet]:
+        """Return the sets of views of a panorama, with their images.
+
+        Args:
+            images: Images of all view sets of the representation, in this order.
+            rotation: Rotation of the representation ``(3, 3)``.
+            area: Area of a partial panorama; None for the whole sphere.
+        """
+        limited = self.representation.limited_to(area)
+        rotated = limited if rotation is None else limited.with_rotation(rotation)
+        sets = rotated.view_sets()
+        readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
+        rays: Iterable[Tensor | None] = [None] * len(sets)
+        if self.sees_rays:
+            rays = upright_rays(sets, rotation, images.device)
+        return list(zip(sets, readers, rays, strict=True))
+
+
+def labels_of_views(target: Tensor, views: Any) -> Tensor:
+    """Render the labels of a panorama ``(H, W)`` to views ``(n, h, w)``."""
+    if target.is_cpu:
+        return torch.from_numpy(views.render(target.numpy(), "nearest"))
+    rendered: Tensor = views.render(target[None], "nearest")
+    return rendered[:, 0]

@@ -1,0 +1,428 @@
+"""Alignment of views: known corrections of true distances of a synthetic room are recovered."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict
+from functools import cache
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from datamodules.synthrooms.raycast import RayScene
+from datamodules.synthrooms.render import draw_camera
+from datamodules.synthrooms.scene import draw_room_type, furnish
+from tangent_train.errors import SettingError
+from tangent_train.geometry import (
+    CubeGrid,
+    RingGrid,
+    TangentGrid,
+    camera_matrix_from_fov,
+    equirect_directions,
+    random_rotation,
+)
+from tangent_train.inference.alignment import (
+    Alignment,
+    ViewSamples,
+    align,
+    photo_points,
+    sample_views,
+    sphere_points,
+)
+from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
+from tangent_train.rendering.representations.views import PinholeViews, Views
+
+Kind = Any
+SHAPE = (256, 512)
+RINGS = [{"pitch": 0, "views": 6}, {"pitch": 45, "views": 5}, {"pitch": -45, "views": 5}]
+KINDS = ["log_distance", "metric_distance", "metric_z", "relative_depth", "relative_disparity"]
+EXACT = 1e-6
+
+
+@cache
+def _room(seed: int = 0) -> Any:
+    """Return a function from directions ``(…, 3)`` to true distances, and its scene."""
+    rng = np.random.default_rng(seed)
+    room = furnish(rng, draw_room_type(rng))
+    scene = RayScene(room)
+    location = draw_camera(rng, scene, room.plan, []).location
+
+    def distances(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+        rays = np.ascontiguousarray(directions.reshape(-1, 3), dtype=np.float32)
+        return scene.cast(location, rays).distance.reshape(directions.shape[:-1]).astype(float)
+
+    return distances
+
+
+@cache
+def _sets(name: str) -> list[PinholeViews]:
+    rotation = random_rotation(np.random.default_rng(8))
+    wide = RingGrid(RINGS, (110.0, 110.0), (24, 24), by_owners=False)
+    return {
+        "tangent": [PinholeViews(TangentGrid(0, 5))],
+        "rotated": [PinholeViews(TangentGrid(0, 5).with_rotation(rotation))],
+        "levels": [PinholeViews(TangentGrid(0, 5)), PinholeViews(TangentGrid(0, 4, 32))],
+        "cube": [PinholeViews(TangentGrid(0, 5)), PinholeViews(CubeGrid(32))],
+        "ring": [PinholeViews(wide)],
+    }[name]
+
+
+class Truth(NamedTuple):
+    """Samples with the true distance, and the output of a network without errors."""
+
+    samples: ViewSamples
+    distance: NDArray[np.float64]
+
+
+@cache
+def _truth(name: str) -> Truth:
+    points = sphere_points(SHAPE)[::4]
+    empty = [np.zeros((len(views), *views.grid.size)) for views in _sets(name)]
+    parts = [sample_views(a, v, SHAPE, points) for a, v in zip(empty, _sets(name), strict=True)]
+    samples = ViewSamples.joined(parts)
+    rows, columns = points[samples.point].T
+    return Truth(samples, _room()(equirect_directions(SHAPE)[rows, columns]))
+
+
+def _output(distance: Any, ray_length: Any, kind: Kind) -> Any:
+    """Return what a network of a kind returns, from the definitions of the kinds."""
+    z_depth = distance / ray_length
+    return {
+        "log_distance": np.log(distance),
+        "metric_distance": distance,
+        "metric_z": z_depth,
+        "relative_depth": z_depth,
+        "relative_disparity": 1 / z_depth,
+    }[kind]
+
+
+def _corrupted(truth: Truth, kind: Kind, rng: np.random.Generator) -> ViewSamples:
+    """Return outputs of a network that multiplies each view by 0.2 to 5, and shifts it."""
+    samples, count = truth.samples, truth.samples.num_views
+    scale = np.exp(rng.normal(0, math.log(5) / 2, count)).clip(0.2, 5)[samples.view]
+    output = _output(truth.distance, samples.ray_length, kind)
+    if kind == "log_distance":
+        return samples._replace(value=output + np.log(scale))
+    shift = rng.uniform(-1, 1, count)[samples.view] * kind.startswith("relative")
+    return samples._replace(value=output * scale + shift)
+
+
+def _errors(found: Alignment, samples: ViewSamples, distance: NDArray[np.float64]) -> Any:
+    """Return errors of logarithms of distances at the samples, up to one common scale."""
+    value = np.exp(samples.value) if found.kind == "log_distance" else samples.value
+    value = found.scale[samples.view] * value + found.shift[samples.view]
+    if found.kind in ("metric_z", "relative_depth"):
+        value = value * samples.ray_length
+    if found.kind == "relative_disparity":
+        value = samples.ray_length / value
+    with np.errstate(invalid="ignore"):
+        errors = np.log(value) - np.log(distance)
+    return errors - np.nanmedian(errors)
+
+
+CASES = [*((kind, "levels") for kind in KINDS), *((kind, "ring") for kind in KINDS[2:])]
+
+
+@pytest.mark.parametrize(("kind", "views"), CASES)
+def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> None:
+    truth, rng = _truth(views), np.random.default_rng(5)
+    samples = _corrupted(truth, kind, rng)
+    found: Any = align([samples], kind)
+    assert np.abs(_errors(found, samples, truth.distance)).max() < EXACT
+    assert found.report.mode == ("affine" if kind.startswith("relative") else "scale")
+    assert np.median(np.log(found.scale)) == pytest.approx(0, abs=1e-12)
+    assert found.report.step_before > 0.3
+    assert found.report.step_after < EXACT
+    assert found.report.groups == 1
+
+    bad = rng.random(len(samples.value)) < 0.2
+    wild = np.where(bad, samples.value * np.exp(rng.normal(0, 1, len(bad))), samples.value)
+    wrong = samples._replace(value=wild)
+    errors = _errors(align([wrong], kind), wrong, truth.distance)[~bad]
+    assert np.abs(errors).max() < 1e-2
+
+
+def test_order_of_views_and_rotation_of_the_grid_do_not_matter() -> None:
+    truth, rng = _truth("levels"), np.random.default_rng(6)
+    samples = _corrupted(truth, "relative_disparity", rng)
+    noisy = samples._replace(value=samples.value * np.exp(rng.normal(0, 0.02, len(samples.value))))
+    found = align([noisy], "relative_disparity")
+    order, shuffled = map(rng.permutation, (samples.num_views, len(samples.value)))
+    arrays: Any = (array[shuffled] for array in noisy[1:])
+    other = ViewSamples(samples.num_views, *arrays)
+    other = other._replace(view=order[other.view])
+    again = align([other], "relative_disparity")
+    np.testing.assert_allclose(again.scale[order], found.scale, rtol=1e-5)
+    np.testing.assert_allclose(again.shift[order], found.shift, rtol=1e-5, atol=1e-5)
+
+    rotated = _truth("rotated")
+    samples = _corrupted(rotated, "metric_z", rng)
+    errors = _errors(align([samples], "metric_z"), samples, rotated.distance)
+    assert np.abs(errors).max() < EXACT
+
+
+def _pairs(samples: ViewSamples) -> list[tuple[int, int]]:
+    """Return pairs of samples of one point, by comparing all samples."""
+    points = samples.point.tolist()
+    count = range(len(points))
+    return [(i, j) for i in count for j in count if points[i] == points[j] and i < j]
+
+
+def _huber(residual: NDArray[np.float64], noise: float) -> NDArray[np.float64]:
+    limit = 1.345 * noise
+    far = limit * (2 * np.abs(residual) - limit)
+    return np.where(np.abs(residual) <= limit, residual**2, far)
+
+
+def _few_samples(rng: np.random.Generator, kind: Kind) -> ViewSamples:
+    """Return 4 views of 90 points that all see, with noise, outliers, and other ray lengths."""
+    view, point = (part.ravel() for part in np.mgrid[:4, :90])
+    distance = rng.uniform(1, 4, 90)[point]
+    lengths = rng.uniform(1, 1.6, len(view))
+    samples = ViewSamples(4, view, point, distance, lengths, np.zeros((len(view), 2)))
+    output = _corrupted(Truth(samples, distance), kind, rng).value
+    noise = rng.normal(0, 0.03, len(view)) + 2 * (rng.random(len(view)) < 0.1)
+    return samples._replace(value=output * np.exp(noise))
+
+
+@pytest.mark.parametrize("kind", ["metric_z", "relative_depth"])
+def test_the_fit_minimizes_the_huber_loss(kind: Kind) -> None:
+    """Scales and shifts are those of a general optimizer, which evaluates the loss as defined."""
+    samples = _few_samples(np.random.default_rng(1), kind)
+    first, second = np.array(_pairs(samples)).T
+    view, value, lengths = samples.view, samples.value, samples.ray_length
+    quartiles = np.array([np.quantile(value[view == k], (0.25, 0.5, 0.75)) for k in range(4)])
+    spread = (quartiles[:, 2] - quartiles[:, 0]) / 1.349
+    farness = np.maximum(1, np.abs(value - quartiles[view, 1]) / spread[view] / 2.5)
+    weight = 1 / (farness[first] * farness[second]) ** 2
+
+    def residuals(unknowns: NDArray[np.float64]) -> Any:
+        scale = np.exp(unknowns[:4])
+        if kind == "metric_z":
+            logs = np.log(scale[view] * value * lengths)
+            return logs[first] - logs[second]
+        depth = (scale[view] * value + unknowns[4:][view]) * lengths
+        caused = (scale * spread)[view]
+        return (depth[first] - depth[second]) / np.hypot(caused[first], caused[second]) * 2**0.5
+
+    def loss(unknowns: NDArray[np.float64], noise: float) -> float:
+        if kind == "metric_z":
+            return float(_huber(residuals(unknowns), noise).sum() + unknowns.mean() ** 2)
+        logs, shift = unknowns[:4], unknowns[4:] / np.exp(unknowns[:4])
+        deviation = np.maximum(spread, np.abs(quartiles[:, 1]))
+        prior = 30 * noise**2 * (((logs / 2) ** 2).sum() + ((shift / deviation) ** 2).sum())
+        return float((weight * _huber(residuals(unknowns), noise)).sum() + prior)
+
+    unknowns = np.zeros(4 if kind == "metric_z" else 8)
+    for _ in range(12):
+        noise = 1.4826 * float(np.median(np.abs(residuals(unknowns))))
+        unknowns = minimize(loss, unknowns, (noise,), "BFGS", options={"gtol": 1e-9}).x
+    found = align([samples], kind)
+    expected = np.exp(unknowns[:4] - np.median(unknowns[:4]))
+    np.testing.assert_allclose(found.scale, expected, rtol=1e-4)
+    if kind == "relative_depth":
+        shift = unknowns[4:] / np.exp(np.median(unknowns[:4]))
+        np.testing.assert_allclose(found.shift, shift, atol=1e-4)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.4])
+def test_noise_does_not_shrink_scales(noise: float) -> None:
+    """Least squares without the unit of noise would shrink the noisier contrast by 1 / (1 + n²)."""
+    rng = np.random.default_rng(2)
+    view, point = (part.ravel() for part in np.mgrid[:3, :4000])
+    lengths = rng.uniform(1, 1.6, len(view))
+    z_depth = rng.normal(5, 1, 4000)[point] / lengths
+    noisy = z_depth + rng.normal(0, noise, len(view))
+    scale = np.array([0.5, 1.0, 3.0])
+    samples = ViewSamples(3, view, point, noisy / scale[view], lengths, np.zeros((len(view), 2)))
+    found = align([samples], "relative_depth")
+    np.testing.assert_allclose(found.scale, scale, rtol=0.05)
+
+
+def test_unobservable_shifts_remain_small() -> None:
+    """Without different ray lengths, only the prior knows that 0 is the center of projection."""
+    truth, rng = _truth("ring"), np.random.default_rng(3)
+    samples = truth.samples._replace(ray_length=np.ones(len(truth.distance)))
+    scale = np.exp(rng.normal(0, 0.5, samples.num_views))[samples.view]
+    noise = np.exp(rng.normal(0, 0.01, len(scale)))
+    samples = samples._replace(value=scale * noise / truth.distance)
+    errors = _errors(align([samples], "relative_disparity"), samples, truth.distance)
+    assert np.quantile(np.abs(errors), 0.9) < 0.05
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_views_that_cannot_be_compared_are_reported(kind: Kind) -> None:
+    truth, rng = _truth("cube"), np.random.default_rng(4)
+    samples = _corrupted(truth, kind, rng)
+    value, view = samples.value.copy(), samples.view
+    value[view == 2] = np.nan
+    value[view == 5] = np.inf
+    value[view == 7] = 3.0
+    is_sky = rng.random(len(value)) < 0.05
+    value[is_sky] = 0 if kind == "relative_disparity" else np.nan
+    # Views 20 to 25, the cube, share no point with the others: a group of its own.
+    point = np.where(view >= 20, samples.point + 10**6, samples.point)
+    found = align([samples._replace(value=value, point=point)], kind)
+    report = found.report
+    assert report.empty == (2, 5)
+    assert report.groups == 7  # the faces of a cube have no direction in common
+    assert report.isolated == tuple(range(20, 26))
+    assert report.constant == ((7,) if kind.startswith("relative") else ())
+    assert 0.05 < report.invalid < 0.3
+    assert len(report.lines()) == 5 + (kind.startswith("relative"))
+    assert (found.scale[[2, 5, *range(20, 26)]] == 1).all()
+    assert (found.shift[[2, 5, 7, *range(20, 26)]] == 0).all()
+    assert np.isfinite(found.scale).all()
+    assert np.isfinite(found.shift).all()
+    used = (view < 20) & ~np.isin(view, (2, 5, 7)) & ~is_sky
+    errors = _errors(found, samples, truth.distance)[used]
+    assert np.abs(errors - np.median(errors)).max() < 1e-4
+    assert all(np.isfinite(v) for v in asdict(report).values() if isinstance(v, float))
+
+
+def _of_first_view(samples: ViewSamples) -> Any:
+    return (array[samples.view == 0] for array in samples[1:])
+
+
+@pytest.mark.parametrize("mode", [None, "scale", "affine", "grid"])
+def test_one_view_and_no_valid_view(mode: Any) -> None:
+    samples = _truth("ring").samples
+    nothing = samples._replace(value=np.full(len(samples.value), np.nan))
+    found = align([nothing], "relative_disparity", mode)
+    assert len(found.report.empty) == samples.num_views
+    assert found.report.step_after is None
+    assert (found.scale == 1).all()
+    one = ViewSamples(1, *_of_first_view(samples))
+    alone = align([one._replace(value=one.ray_length)], "metric_z", mode)
+    assert (alone.scale.item(), alone.shift.item(), alone.report.groups) == (1, 0, 1)
+    assert alone.report.isolated == ()
+    if mode is None:
+        assert alone.report.mode == "none"
+
+
+def _smooth(xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+    return 3 + np.asarray(xyz) @ (0.5, -0.3, 0.8)
+
+
+def _views(name: str) -> tuple[Views, tuple[int, int], bool]:
+    """Return views, the shape of their canvas, and if it is a panorama."""
+    rotation = random_rotation(np.random.default_rng(2))
+    if name == "erp":
+        whole = EquirectRepresentation(6, rotations=3).with_rotation(rotation)
+        return whole.view_sets()[1], SHAPE, True
+    if name == "photo":
+        camera = PerspectiveRepresentation(6, 45.0, (48, 64))
+        sampler = camera.of_camera(camera_matrix_from_fov(80.0, (120, 160)), (120, 160))
+        return sampler.view_sets()[0], (120, 160), False
+    return PinholeViews(TangentGrid(0, 6).with_rotation(rotation)), SHAPE, True
+
+
+@pytest.mark.parametrize("name", ["tangent", "erp", "photo"])
+def test_views_are_sampled_where_the_canvas_is(name: str) -> None:
+    views, shape, is_panorama = _views(name)
+    points = sphere_points(shape) if is_panorama else photo_points(shape)
+    rows, columns = points.T
+    if is_panorama:
+        image = _smooth(equirect_directions(shape))
+    else:
+        row, column = np.mgrid[: shape[0], : shape[1]]
+        image = 3 + 0.01 * row - 0.005 * column
+    rendered = views.render(torch.from_numpy(image[None].astype(np.float32)), "bilinear")
+    outputs = rendered[:, 0].numpy()
+    outputs[:, 5, 7] = np.inf
+    samples = sample_views(outputs, views, shape, points)
+    assert samples.num_views == len(views)
+    expected = image[rows, columns][samples.point]
+    known = np.isfinite(samples.value)
+    assert 0 < (~known).sum() < 0.02 * len(known)
+    errors = np.abs(samples.value - expected)
+    pixel = 1 / np.array(outputs.shape[:0:-1])
+    inside = (np.abs(samples.position) < 1 - pixel).all(axis=1) if name != "erp" else known
+    assert errors[known & inside].max() < 3e-3
+    assert errors[known].max() < 3e-2  # the outer half of the outermost pixels is constant
+    assert set(samples.point) == set(range(len(points)))  # the views cover the canvas
+    if name == "erp":
+        assert np.isnan(samples.position).all()
+        assert (samples.ray_length == 1).all()
+        with pytest.raises(SettingError, match=r"grid.*none, scale or affine"):
+            align([samples], "metric_z", "grid")
+        return
+    assert np.abs(samples.position).max() <= 1
+    if name == "tangent":
+        across, down = (samples.position * views.grid.half_size).T  # type: ignore[attr-defined]
+        np.testing.assert_allclose(samples.ray_length, np.sqrt(1 + across**2 + down**2), rtol=1e-2)
+    else:
+        camera = camera_matrix_from_fov(80.0, shape)
+        x = (columns - camera[0, 2])[samples.point] / camera[0, 0]
+        y = (rows - camera[1, 2])[samples.point] / camera[1, 1]
+        np.testing.assert_allclose(samples.ray_length, np.sqrt(1 + x**2 + y**2), rtol=1e-2)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rendered_views_of_a_room_agree_after_the_alignment(kind: Kind) -> None:
+    """End to end, with depth of every pixel and bilinear samples: nearly exact."""
+    grid, rng, points = TangentGrid(0, 6), np.random.default_rng(9), sphere_points(SHAPE)[::4]
+    views = PinholeViews(grid)
+    lengths = views.ray_lengths().astype(float)
+    distance = _room()(grid.directions())
+    scale = np.exp(rng.normal(0, 0.5, 20))[:, None, None]
+    output = _output(distance, lengths, kind)
+    if kind == "log_distance":
+        output = output + np.log(scale)
+    else:
+        output = output * scale + rng.normal(0, 0.5, scale.shape) * kind.startswith("relative")
+    found = align([sample_views(output, views, SHAPE, points)], kind)
+    part = slice(3, 17)
+    raw, lengths_of_rays = torch.from_numpy(output[part, None]), torch.from_numpy(lengths)
+    applied = found.applied(raw, part, lengths_of_rays)[:, 0].numpy()
+    if kind == "relative_disparity":
+        applied = -np.log(applied)
+    errors = applied - np.log(distance[part])
+    assert np.quantile(np.abs(errors - np.median(errors)), 0.99) < 2e-3
+
+
+def test_a_grid_removes_smooth_errors_of_views() -> None:
+    """Corrections of the logarithm, bilinear between 5 × 5 nodes, are applied where fitted."""
+    grid, rng, points = TangentGrid(0, 5), np.random.default_rng(10), sphere_points(SHAPE)[::4]
+    views = PinholeViews(grid)
+    distance, lengths = _room()(grid.directions()), views.ray_lengths()
+    y, x = np.mgrid[-1:1:32j, -1:1:32j]
+    bent = rng.normal(0, 0.2, (20, 2, 1, 1)) * (x * y, y**2)
+    output = distance / lengths * np.exp(bent.sum(axis=1))
+    samples = sample_views(output, views, SHAPE, points)
+    plain: Any = align([samples], "metric_z", "scale")
+    corrected: Any = align([samples], "metric_z", "grid")
+    assert plain.report.step_after > 0.05
+    assert corrected.report.step_after < 0.2 * plain.report.step_after
+    assert corrected.grid.shape == (20, 5, 5)
+    assert np.median(corrected.grid.mean(axis=(1, 2))) == pytest.approx(0, abs=1e-12)
+    raw, rays = torch.from_numpy(output[:, None]), torch.from_numpy(lengths)
+    applied = np.exp(corrected.applied(raw, slice(0, 20), rays)[:, 0].numpy())
+    again = align([sample_views(applied, views, SHAPE, points)], "metric_distance", "none").report
+    assert again.step_before == pytest.approx(corrected.report.step_after, rel=0.1)
+    assert again.step_after == again.step_before
+
+    exact = sample_views(distance / lengths, views, SHAPE, points)
+    nothing: Any = align([exact], "metric_z", "grid")
+    assert np.quantile(np.abs(nothing.grid), 0.9) < 0.02
+
+
+def test_sky_and_invalid_pixels_after_the_alignment() -> None:
+    samples = _truth("ring").samples
+    one = ViewSamples(1, *_of_first_view(samples))
+    raw = torch.tensor([2.0, 0.0, -1.0, math.nan, math.inf])[None, None, None]
+    lengths = torch.full((1, 1, 5), 2.0)
+    found = align([one], "relative_disparity", "none")
+    values = found.applied(raw, slice(0, 1), lengths)[0, 0, 0].tolist()
+    assert values[:3] == [1, 0, 0]
+    assert all(map(math.isnan, values[3:]))
+    shifted = Alignment("relative_disparity", np.array([2.0]), np.array([3.0]), None, found.report)
+    assert shifted.applied(raw, slice(0, 1), lengths)[0, 0, 0, :3].tolist() == [3.5, 0, 0.5]
+    depth = Alignment("relative_depth", np.array([2.0]), np.array([3.0]), None, found.report)
+    values = depth.applied(raw, slice(0, 1), lengths)[0, 0, 0].tolist()
+    np.testing.assert_allclose(values[:3], np.log([14, 6, 2]), rtol=1e-6)
+    assert all(map(math.isnan, values[3:]))

@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+import math
+from typing import Any, get_args
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torchmetrics import MeanAbsoluteError, MeanAbsolutePercentageError, MeanSquaredError
+from torchmetrics.utilities import dim_zero_cat
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.depth import (
+    Alignment,
+    DepthMetric,
+    DepthProtocol,
+    depth_intervals,
+    depth_scores,
+    error_sums,
+    mean_depth_scores,
+)
+
+Image = tuple[NDArray[np.float64], NDArray[np.float64]]
+
+
+def _image(seed: int, shape: tuple[int, ...] = (12, 24)) -> Image:
+    """Predicted and true distances in meters; both have holes."""
+    rng = np.random.default_rng(seed)
+    truth = rng.uniform(0.5, 12, shape)
+    prediction = truth * np.exp(rng.normal(0, 0.3, shape))
+    truth[rng.random(shape) < 0.1] = np.nan
+    prediction[rng.random(shape) < 0.1] = np.nan
+    return prediction, truth
+
+
+def _in_loops(prediction: Any, truth: Any, weights: Any) -> dict[str, float]:
+    """The scores of one image, pixel by pixel, in the words of the module's docstring."""
+    total = seen = 0.0
+    sums = dict.fromkeys(("absrel", "sqrel", "rmse", "rmse_log", "mae", "1", "2", "3"), 0.0)
+    for d, g, w in zip(prediction.ravel(), truth.ravel(), weights.ravel(), strict=True):
+        if math.isnan(g) or w == 0:
+            continue
+        total += w
+        if math.isnan(d):
+            continue
+        seen += w
+        sums["absrel"] += w * abs(d - g) / g
+        sums["sqrel"] += w * (d - g) ** 2 / g
+        sums["rmse"] += w * (d - g) ** 2
+        sums["rmse_log"] += w * (math.log(d) - math.log(g)) ** 2
+        sums["mae"] += w * abs(d - g)
+        for n in (1, 2, 3):
+            sums[str(n)] += w * (max(d / g, g / d) < 1.25**n)
+    means = {name: value / seen for name, value in sums.items() if not name.isdigit()}
+    means |= {name: math.sqrt(means[name]) for name in ("rmse", "rmse_log")}
+    shares = {f"delta{n}": sums[n] / total for n in "123"}
+    return means | shares | {"missing": 1 - seen / total}
+
+
+def test_scores_equal_loops_by_pixels_by_solid_angle_and_in_latitude_bands() -> None:
+    prediction, truth = _image(0)
+    sums = error_sums(torch.from_numpy(prediction), torch.from_numpy(truth)).numpy()
+    rows = np.arange(12)[:, None] + np.zeros((1, 24))
+    angles = np.broadcast_to(equirect_solid_angles((12, 24))[:, None], (12, 24))
+    # 12 rows of 15°: two rows in each band of 30°.
+    weights = [np.ones((12, 24)), angles, *(rows // 2 == band for band in range(6))]
+    for of_weighting, weight in zip(sums, weights, strict=True):
+        expected = _in_loops(prediction, truth, weight)
+        assert {n: float(s) for n, s in depth_scores(of_weighting).items()} == pytest.approx(
+            expected, rel=1e-12
+        )
+
+
+def test_the_crops_of_a_photo_are_one_image_without_solid_angles() -> None:
+    prediction, truth = _image(1, (3, 5, 4))
+    sums = error_sums(torch.from_numpy(prediction), torch.from_numpy(truth)).numpy()
+    assert depth_scores(sums[0]) == pytest.approx(_in_loops(prediction, truth, np.ones((3, 5, 4))))
+    assert not sums[1:].any()
+
+
+def test_scores_equal_those_of_torchmetrics() -> None:
+    pairs = [torch.from_numpy(x) for x in _image(2)]
+    known = ~torch.stack(pairs).isnan().any(0)
+    d, g = (x[known] for x in pairs)
+    scores = depth_scores(error_sums(*pairs).numpy()[0])
+    for name, metric in (
+        ("absrel", MeanAbsolutePercentageError()),
+        ("mae", MeanAbsoluteError()),
+        ("rmse", MeanSquaredError(squared=False)),
+    ):
+        assert scores[name] == pytest.approx(float(metric(d, g)), rel=1e-6), name
+    logs = MeanSquaredError(squared=False)(d.log(), g.log())
+    assert scores["rmse_log"] == pytest.approx(float(logs), rel=1e-6)
+
+
+def test_images_count_the_same_and_images_without_truth_do_not_count() -> None:
+    images = [_image(3), _image(4, (30, 60)), (np.ones((6, 12)), np.full((6, 12), np.nan))]
+    metric = DepthMetric()
+    for prediction, truth in images:
+        metric.update(torch.from_numpy(prediction), torch.from_numpy(truth))
+    of_each = [_in_loops(p, g, np.ones(p.shape)) for p, g in images[:2]]
+    means = mean_depth_scores(metric.compute()[:, 0])
+    assert means == pytest.approx({n: (of_each[0][n] + of_each[1][n]) / 2 for n in of_each[0]})
+    metric.reset()
+    empty = dim_zero_cat(metric.of_images).numpy()
+    assert empty.shape == (0, 8, 10)
+    assert all(math.isnan(value) for value in mean_depth_scores(empty[:, 0]).values())
+
+
+@pytest.mark.filterwarnings("error")
+def test_intervals_contain_the_mean_and_leave_out_images_without_truth() -> None:
+    sums = np.stack(
+        [error_sums(*map(torch.from_numpy, _image(k))).numpy()[0] for k in range(12)]
+        + [np.zeros(10)]
+    )
+    intervals, means = depth_intervals(sums), mean_depth_scores(sums)
+    assert intervals.keys() == means.keys()
+    for name, (low, high) in intervals.items():
+        assert low <= means[name] <= high, name
+    scores = depth_scores(sums[:12])["absrel"]  # the mean of 12 numbers: ± 1.96 standard errors
+    error = scores.std(ddof=1) / math.sqrt(12)
+    low, high = intervals["absrel"]
+    assert (high - low) / (2 * 1.96 * error) == pytest.approx(1, abs=0.15)
+    assert depth_intervals(sums[::-1]) == intervals
+    assert depth_intervals(sums[:1]) == {}
+
+
+@pytest.mark.parametrize("quantity", ["distance", "disparity"])
+@pytest.mark.parametrize("alignment", get_args(Alignment))
+def test_alignments_equal_least_squares_of_numpy(alignment: Alignment, quantity: Any) -> None:
+    prediction, truth = _image(5)
+    used = ~np.isnan(prediction) & ~np.isnan(truth)
+
+    def as_quantity(x: Any) -> Any:
+        return x if quantity == "distance" else 1 / x
+
+    p, g = as_quantity(prediction), as_quantity(truth)
+    medians = [np.quantile(x[used], 0.5, method="lower") for x in (g, p)]
+    fits: dict[str, Any] = {
+        "none": (1.0, 0.0),
+        "median": (medians[0] / medians[1], 0.0),
+        "scale": (np.linalg.lstsq(p[used][:, None], g[used])[0][0], 0.0),
+        "affine": np.polyfit(p[used], g[used], 1),
+    }
+    scale, shift = fits[alignment]
+    expected = as_quantity(scale * p + shift)
+    expected[~(expected > 0)] = np.nan
+    aligned = DepthProtocol(alignment, quantity).aligned(
+        torch.from_numpy(prediction), torch.from_numpy(truth)
+    )
+    np.testing.assert_allclose(aligned.numpy(), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("quantity", ["distance", "disparity"])
+def test_aligned_predictions_equal_the_truth_up_to_what_the_alignment_finds(quantity: Any) -> None:
+    _, truth = _image(6)
+    q = truth if quantity == "distance" else 1 / truth
+    for alignment, changed in (("median", 7 * q), ("scale", 7 * q), ("affine", 0.2 * q + 3)):
+        prediction = changed if quantity == "distance" else 1 / changed
+        protocol = DepthProtocol(alignment, quantity)  # type: ignore[arg-type]
+        aligned = protocol.aligned(torch.from_numpy(prediction), torch.from_numpy(truth))
+        np.testing.assert_allclose(aligned.numpy(), truth, rtol=1e-9)
+
+
+def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> None:
+    truth = torch.tensor([[0.05, 1.0, 9.0, 11.0], [2.0, torch.nan, 0.0, 10.0]])
+    prediction = torch.tensor([[9.0, 1.0, 30.0, 1.0], [-2.0, 1.0, 1.0, torch.inf]])
+    near, clipped = DepthProtocol("none", "distance", 0.1, 10.0), {"clip": True}
+    limited = near.limited(truth)
+    assert limited.isnan().tolist() == [[True, False, False, True], [False, True, True, False]]
+    scores = depth_scores(error_sums(near.aligned(prediction, truth), limited).numpy()[0])
+    assert scores["mae"] == pytest.approx((0 + 21) / 2)  # two of four have a prediction
+    assert scores["missing"] == pytest.approx(2 / 4)
+    assert scores["delta1"] == pytest.approx(1 / 4)  # a missing prediction is wrong
+    near = DepthProtocol("none", "distance", 0.1, 10.0, **clipped)
+    scores = depth_scores(error_sums(near.aligned(prediction, truth), limited).numpy()[0])
+    assert scores["mae"] == pytest.approx((0 + 1 + 0) / 3)
+    assert near.facts == {"alignment": "none", "range": "0.1 to 10 m, predictions clipped"}
+
+
+def test_an_alignment_without_anything_to_align_changes_nothing_and_a_constant_gets_the_mean() -> (
+    None
+):
+    truth, constant = torch.tensor([[1.0, 2.0], [3.0, torch.nan]]), torch.full((2, 2), 5.0)
+    unknown = torch.full((2, 2), torch.nan)
+    for alignment in get_args(Alignment):
+        assert DepthProtocol(alignment).aligned(constant, unknown).equal(constant)
+    assert DepthProtocol("affine").aligned(constant, truth).equal(torch.full((2, 2), 2.0))
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"alignment": "mean"}, "task.alignment"),
+        ({"alignment_in": "log"}, "task.alignment_in"),
+        ({"min_distance": -1}, "task.min_distance"),
+        ({"min_distance": 2, "max_distance": 2}, "task.max_distance"),
+    ],
+)
+def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
+    with pytest.raises(SettingError, match=named):
+        DepthProtocol(**settings)
+
+
+def test_another_shape_is_refused() -> None:
+    with pytest.raises(SettingError, match="prediction"):
+        error_sums(torch.ones(2, 4), torch.ones(4, 8))

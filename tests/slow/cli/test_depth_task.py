@@ -1,0 +1,180 @@
+"""``task=depth`` through the commands: training to prediction, sweeps and transfers."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.images.pixel_files import read_depth_m, write_pixels
+from tangent_train.checkpoints.content import read_checkpoint
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.errors import SettingError
+from tests.checkpoints.test_distances import write_depth_checkpoint
+from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
+from tests.inference.trained import sphere
+from tests.slow.cli.test_sweeps import OLD_SQLALCHEMY
+
+SETTINGS = (
+    "experiment=rooms/depth",
+    *SMALL_ROOMS,
+    "data.root='../small rooms'",
+    "data.rooms.views_per_camera=2",
+    "data.rooms.view_size=32",
+    "data.validation_fraction=0.4",
+    "network.widths=[4,8]",
+    "trainer.check_val_every_n_epoch=1",
+    "panels=1",
+    "logger=csv",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a finished run of three epochs, with a moving average of its weights."""
+    folder = tmp_path_factory.mktemp("depth") / "here"
+    folder.mkdir()
+    more = ("ema=0.5", "callbacks=early_stopping", "trainer.max_epochs=3")
+    run_in(folder, "train", *SETTINGS, *more, "hydra.run.dir=whole")
+    return folder
+
+
+@pytest.fixture
+def run(folder: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs a command in the folder of the finished run."""
+    monkeypatch.chdir(folder)
+    return run
+
+
+def _logged(path: Path) -> dict[int, float]:
+    (file,) = path.rglob("metrics.csv")
+    with file.open(newline="") as lines:
+        rows = [row for row in csv.DictReader(lines) if row["val/absrel"]]
+    return {int(row["epoch"]): float(row["val/absrel"]) for row in rows}
+
+
+def test_the_best_epoch_has_the_smallest_error_and_is_reported(folder: Path, run: Run) -> None:
+    scores = _logged(folder / "whole")
+    best = read_checkpoint(folder / "whole" / "checkpoints" / "best.ckpt")
+    assert len(scores) == 3
+    assert scores[best["epoch"]] == min(scores.values()) < max(scores.values())
+    content = results(folder / "whole")
+    assert content["protocol"]["alignment"] == "none"
+    assert content["protocol"]["range"] == "0 to ∞ m"
+    assert len(content["latitude_bands"]) == 6
+    assert content["headings"]["absrel"]["better"] == "lower"
+    low, high = content["intervals"]["absrel"]
+    assert low <= content["absrel"] <= high
+    assert "AbsRel" in (folder / "whole" / "report.html").read_text()
+    assert len(list((folder / "whole" / "panels").iterdir())) == 1
+    run("report", "whole")
+    with Path("report/report.csv").open(newline="") as file:
+        means = {r["score"]: float(r["mean"]) for r in csv.DictReader(file) if r["fold"] == "1"}
+    assert means.keys() >= {"absrel", "delta1", "mae", "absrel_solid_angle"}
+
+
+def test_evaluation_takes_other_alignments_and_limits(run: Run) -> None:
+    checkpoint = "checkpoint=whole/checkpoints/best.ckpt"
+    run("evaluate", checkpoint, "hydra.run.dir=again")
+    assert results(Path("again")) == results(Path("whole"))
+    limits = ("task.alignment=affine", "task.max_distance=3", "task.clip=true", "task.align=none")
+    run("evaluate", checkpoint, *limits, "hydra.run.dir=aligned")
+    content = results(Path("aligned"))
+    assert content["protocol"]["alignment"] == "affine in distance"
+    assert content["protocol"]["range"] == "0 to 3 m, predictions clipped"
+    assert content["rmse"] < results(Path("whole"))["rmse"]
+
+
+def test_a_resumed_run_is_the_same(run: Run) -> None:
+    """Stopped after the first epoch, by the limit of a setting that may change."""
+    plain = (*SETTINGS, "scheduler=constant", "panels=0")
+    run("train", *plain, "trainer.max_epochs=2", "hydra.run.dir=two")
+    run("train", *plain, "trainer.max_epochs=1", "hydra.run.dir=one")
+    run("train", "resume=one", "trainer.max_epochs=2")
+    tensors = [
+        read_checkpoint(Path(n) / "checkpoints" / "last.ckpt")["state_dict"] for n in ("one", "two")
+    ]
+    for name, tensor in tensors[0].items():
+        assert tensor.equal(tensors[1][name]), name
+    assert results(Path("one"))["absrel"] == results(Path("two"))["absrel"]
+
+
+def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network(
+    run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
+    once = (*SETTINGS[:-2], "panels=0", "logger=none", "trainer.max_epochs=1")
+    run("train", *once, "init_from=whole/checkpoints/best.ckpt", "hydra.run.dir=tuned")
+    assert read_checkpoint(Path("tuned/checkpoints/last.ckpt"))["depth_kind"] == "log_distance"
+
+    write_depth_checkpoint(Path("photos.ckpt"), depth_kind="relative_disparity")
+    tuned = (*once, "~network.widths", "init_from=photos.ckpt", "trust=[torch.nn.Conv2d]")
+    with pytest.raises(SettingError, match=r"task\.alignment.*relative_disparity"):
+        run("train", *[s for s in tuned if "widths" not in s], "hydra.run.dir=refused")
+    given = [s for s in tuned if "widths" not in s]
+    run("train", *given, "task.alignment=affine", "hydra.run.dir=relative")
+    assert "Output of the network: relative_disparity" in capsys.readouterr().out
+    trained = load_trained(Path("relative/checkpoints/best.ckpt"), ["torch.nn.Conv2d"])
+    assert trained.depth_kind == "relative_disparity"
+    assert results(Path("relative"))["protocol"]["alignment"] == "affine in disparity"
+
+
+def test_an_imported_network_is_evaluated(run: Run) -> None:
+    write_depth_checkpoint(Path("metric.ckpt"), depth_kind="metric_z")
+    data: tuple[str, ...] = ("data=synthrooms", "data.inputs=[rgb]", "task=depth", "level=4")
+    data += tuple(s for s in SETTINGS if s.startswith("data.rooms") or "root" in s)
+    run("evaluate", "checkpoint=metric.ckpt", *data, "task.alignment=median", "hydra.run.dir=im")
+    assert results(Path("im"))["protocol"]["alignment"] == "median in distance"
+
+
+def test_an_exported_network_predicts_the_same_depth(run: Run) -> None:
+    write_pixels(Path("in/hall.png"), sphere(32))
+    checkpoint = "whole/checkpoints/best.ckpt"
+    run("predict", f"checkpoint={checkpoint}", "input=in", "output=out", "write=[depth]")
+    run("export", f"checkpoint={checkpoint}", "output=network.safetensors")
+    exported = ("checkpoint=network.safetensors", "input=in", "output=exported", "write=[depth]")
+    run("predict", *exported)
+    assert predicted(Path("out")).keys() == {"hall"}
+    depth, other = (read_depth_m(Path(n) / "depth" / "hall.png", 1000) for n in ("out", "exported"))
+    np.testing.assert_allclose(depth, other, atol=2e-3)
+    assert 0.1 < np.nanmedian(depth) < 20
+
+
+@OLD_SQLALCHEMY
+def test_sweeps_compare_errors_and_search_for_the_smallest(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
+    once = (*SETTINGS, "panels=0", "trainer.max_epochs=1")
+    run("train", "-m", *once, "task.loss=log_l1,scale_invariant", "hydra.sweep.dir=grid")
+    losses = [results(Path("grid") / number)["absrel"] for number in "01"]
+    assert losses[0] != losses[1]
+    study = ("sweep=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=study")
+    with pytest.raises(SystemExit):
+        run("train", "-m", *study, *once)
+    assert "expected minimize, for val/absrel" in capsys.readouterr().err
+    run("train", "-m", *study, *once, "hydra.sweeper.direction=minimize")
+    scores = [json.loads((Path("study") / n / "validation.json").read_text())["best"] for n in "01"]
+    assert f"{min(scores)}" in (Path("study") / "optimization_results.yaml").read_text()
+
+
+@pytest.mark.usefixtures("stages")
+def test_a_transfer_compares_views_and_their_alignment(run: Run) -> None:
+    shown = ("compare=[{name: unaligned, task.align: none}, erp]", "fine_tuning.epochs=[1]")
+    more: tuple[str, ...] = (*shown, "trainer.max_epochs=1", "photos.representation.dim=16")
+    given = [s.replace("rooms/depth", "rooms/transfer_depth") for s in SETTINGS]
+    run("transfer", *given, *more, "photos.data.photos_per_step=4", "name=mine", "panels=0")
+    stages: dict[str, Any] = {}
+    for path in Path("runs/transfer/mine").rglob("results.json"):
+        stages[path.parent.name] = results(path.parent)
+    assert stages.keys() == {"P", "S", "S-unaligned", "S-erp", "P-FT-1", "S-FT-1"}
+    assert stages["S"]["absrel"] != stages["S-unaligned"]["absrel"]
+    assert stages["P"]["absrel_solid_angle"] is None
+    text = Path("runs/transfer/mine/transfer.md").read_text()
+    assert "AbsRel ↓" in text
+    assert "S-unaligned" in text
+    assert torch.isfinite(torch.tensor([s["absrel"] for s in stages.values()])).all()

@@ -1,0 +1,266 @@
+"""Depth: what is minimized, what is compared, and with what."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, get_args
+
+import lightning
+import numpy as np
+import pytest
+import torch
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from datamodules.core.samples import EvaluationSample, TrainingSample
+from models import AuxiliaryHead
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.distances import DistanceNetwork, from_distance, is_metric
+from tangent_train.errors import SettingError
+from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.metrics.depth import depth_scores
+from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+from tangent_train.tasks import DepthTask
+from tests.tasks.shapes import Gradients, quiet_trainer
+from tests.tasks.test_segmentation import WHOLE
+
+pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+
+TANGENT = TangentRepresentation(base_level=0, level=4)
+KINDS = get_args(DepthKind)
+
+
+def _views(steps: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """Views of a panorama: the logarithms of true distances and noise, labels, ray lengths."""
+    (whole,) = TANGENT.view_sets()
+    labels = torch.from_numpy(whole.render(steps, "nearest").astype(np.int32))
+    shown = (labels.clamp(min=1) / 512).log()
+    noise = torch.randn(labels.shape, generator=torch.Generator().manual_seed(int(labels.sum())))
+    return torch.stack([shown, noise], dim=1), labels, torch.from_numpy(whole.ray_lengths())
+
+
+class Data(lightning.LightningDataModule):
+    """Panoramas whose first channel is the logarithm of the distance; some distances are unknown.
+
+    In training the distances of the second panorama are unknown.
+    """
+
+    def __init__(self, batch_size: int = 3) -> None:
+        super().__init__()
+        self.batch_size = batch_size
+        rng = np.random.default_rng(0)
+        coarse = rng.uniform(500, 3000, (3, 4, 8)).astype(np.uint16)
+        self.train: Any = []
+        self.test: Any = []
+        for steps in coarse.repeat(8, axis=1).repeat(8, axis=2):
+            images, labels, lengths = _views(steps)
+            steps[:3] = 0
+            labels[:7, 1:] = 0
+            labels *= len(self.train) != 1
+            rays = torch.zeros(0, 3, 3)
+            self.train.append(TrainingSample(images, labels, rays, lengths, 0))
+            target = torch.from_numpy(steps.astype(np.int32))
+            rotation = torch.eye(3).double()
+            self.test.append(EvaluationSample(images, target, rotation, lengths, WHOLE, 0))
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.train, self.batch_size)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.test, batch_size=2)
+
+    test_dataloader = val_dataloader
+
+
+class Right(nn.Module):
+    """Returns the true depth of a kind, of the views of tangent images or the given crops.
+
+    A relative network gives each view, told by its noise, a scale and a shift of its own.
+    """
+
+    def __init__(self, kind: DepthKind, lengths: Any = None) -> None:
+        super().__init__()
+        self.kind: DepthKind = kind
+        whole = TANGENT.view_sets()[0]
+        self.lengths = torch.from_numpy(whole.ray_lengths()) if lengths is None else lengths
+
+    def forward(self, images: Tensor) -> Tensor:
+        depth = from_distance(images[:, :1].exp(), self.kind, self.lengths[:, None])
+        if is_metric(self.kind):
+            return depth
+        scale, shift = (images[:, 1, k, 0].exp()[:, None, None, None] for k in (0, 1))
+        return scale * depth + shift
+
+
+def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> DepthTask:
+    kind: Any = getattr(network, "kind", "log_distance")
+    settings = {"alignment": "none" if is_metric(kind) else "affine"} | settings
+    optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))
+    return DepthTask(network, representation, (), optimizer, **settings)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None:
+    task = _task(Right(kind), images_per_forward=7)
+    (scores,) = quiet_trainer().test(task, datamodule=Data(), verbose=False)
+    assert task.evaluated == 3
+    assert task.result[:, 0, 0].tolist() == [29 * 64] * 3, "unknown truth counts for nothing"
+    # Pixels at the borders of the blocks are interpolated.
+    assert scores["test/absrel"] < 0.09
+    assert scores["test/delta1"] > 0.9
+    assert scores["test/missing"] == 0
+    record = task.record(task.result, "panoramas")
+    assert next(band["latitude_deg"] for band in record.latitude_bands) == [60, 90]
+    assert record.intervals.keys() == record.means.keys() == task.headings.keys()
+    assert task.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_loss_of_the_truth_is_zero_and_validation_computes_the_same(kind: DepthKind) -> None:
+    task = _task(Right(kind))
+    data = Data()
+    (batch,) = data.train_dataloader()
+    images, truth = task.training_pairs(batch)
+    assert task.loss_norm(truth).item() == int((batch.labels > 0).sum())
+    loss = task.loss_sum((images,), truth) / task.loss_norm(truth)
+    assert loss.item() == pytest.approx(0, abs=2e-5)
+    (logged,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
+    assert logged["val/loss"] == pytest.approx(0, abs=2e-5)
+    if is_metric(kind):  # 10 % too far
+        images[:, 0] += np.log(1.1)
+        loss = task.loss_sum((images,), truth) / task.loss_norm(truth)
+        assert loss.item() == pytest.approx(np.log(1.1), rel=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_own(
+    kind: DepthKind,
+) -> None:
+    representation = PerspectiveRepresentation(5, dim=16)
+    steps = np.random.default_rng(0).uniform(500, 3000, (6, 10)).astype(np.uint16)
+    steps = steps.repeat(8, axis=0).repeat(8, axis=1)
+    camera = camera_matrix_from_fov(80.0, steps.shape)
+    (crops,) = representation.of_camera(camera, steps.shape).view_sets()
+    target = torch.from_numpy(crops.render(steps, "nearest").astype(np.int32))
+    shown = (target / 512).log()
+    images = torch.stack([shown, torch.randn(shown.shape)], dim=1)
+    lengths = torch.from_numpy(crops.ray_lengths())
+    assert len(crops) > 1
+    assert lengths.amax() > 1.2
+    area, rotation = WHOLE[None], torch.eye(3).double()[None]
+    batch = EvaluationSample(images[None], target[None], rotation, lengths[None], area, 0)
+    task = _task(Right(kind, lengths), representation)
+    torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
+    scores = task.logged_scores(task.metric.compute())
+    assert scores["absrel"] < 1e-3
+    assert "absrel_solid_angle" not in scores
+
+
+def test_views_are_aligned_with_each_other_as_set() -> None:
+    """A network of the right distances, but for a scale of each view."""
+
+    class Scaled(nn.Module):
+        def forward(self, images: Tensor) -> Tensor:
+            return images[:, :1] + 0.5 * images[:, 1:, :1, :1]
+
+    errors = {}
+    for align in (None, "scale", "none"):
+        (scores,) = quiet_trainer().test(
+            _task(Scaled(), align=align, alignment="median"), datamodule=Data(), verbose=False
+        )
+        errors[align] = scores["test/absrel"]
+    assert errors[None] == errors["scale"] < 0.1 < 0.2 < errors["none"]
+
+
+def _network() -> nn.Module:
+    torch.manual_seed(0)
+    last = nn.Conv2d(8, 1, 3, padding=1)
+    nn.init.constant_(last.bias, 1)  # type: ignore[arg-type]  # positive
+    return nn.Sequential(nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), last)
+
+
+def _gradients(images_per_chunk: int | None, batch_size: int = 3, **settings: Any) -> list[Tensor]:
+    """Return the gradients of a step of three panoramas."""
+    found = Gradients()
+    trainer = quiet_trainer(
+        max_epochs=1,
+        limit_val_batches=0,
+        accumulate_grad_batches=3 // batch_size,
+        callbacks=[found],
+    )
+    task = _task(_network(), images_per_chunk=images_per_chunk, **settings)
+    trainer.fit(task, datamodule=Data(batch_size))
+    return found.found
+
+
+@pytest.mark.parametrize("kind", ["log_distance", "metric_z", "relative_disparity"])
+@pytest.mark.parametrize("loss", ["log_l1", "scale_invariant"])
+def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
+    loss: Any, kind: DepthKind
+) -> None:
+    settings = {"loss": loss, "depth_kind": kind, "alignment": "affine"}
+    network, task = _network(), _task(nn.Identity(), **settings)
+    images, truth = task.training_pairs(next(iter(Data().train_dataloader())))
+    errors = task.errors(network(images), truth)
+    known = ~errors.isnan()
+    if loss == "log_l1":
+        mean = errors[known].abs().mean()
+    else:
+        of_images = [e[~e.isnan()] for e in errors if not e.isnan().all()]
+        sums = [e.square().sum() - 0.5 * e.sum() ** 2 / len(e) for e in of_images]
+        mean = torch.stack(sums).sum() / known.sum()
+    expected = torch.autograd.grad(mean, list(network.parameters()))
+    whole = torch.cat([part.flatten() for part in expected])
+    for size, batch_size in ((None, 3), (7, 3), (7, 1)):
+        found = torch.cat([g.flatten() for g in _gradients(size, batch_size, **settings)])
+        assert float((found - whole).norm() / whole.norm()) < 1e-4
+
+
+def test_the_auxiliary_head_adds_its_loss() -> None:
+    images, truth = torch.randn(6, 2, 16, 16), torch.randn(6, 16, 16)
+    network = AuxiliaryHead(nn.Sequential(nn.Conv2d(2, 1, 1)), "0", 2, 1)
+    task = _task(network, auxiliary_weight=0.4)
+    main, auxiliary = ((out[:, 0] - truth).abs().sum() for out in network(images).values())
+    torch.testing.assert_close(task.loss_sum((images,), truth), main + 0.4 * auxiliary)
+
+
+@pytest.mark.parametrize(
+    ("network", "settings", "named"),
+    [
+        (Right("relative_depth"), {"alignment": "none"}, "task.alignment.*relative_depth"),
+        (
+            DistanceNetwork(Right("metric_z"), "metric_z"),
+            {"depth_kind": "log_distance"},
+            "metric_z",
+        ),
+        (nn.Identity(), {"depth_kind": "depth"}, "task.depth_kind"),
+        (nn.Identity(), {"loss": "l2"}, "task.loss"),
+        (nn.Identity(), {"align": "median"}, "task.align"),
+        (nn.Identity(), {"scale_invariance": 1.5}, "task.scale_invariance"),
+        (nn.Identity(), {"label_smoothing": 0.1}, "task.label_smoothing"),
+        (nn.Identity(), {"max_distance": -1.0}, "task.max_distance"),
+    ],
+)
+def test_settings_that_do_not_fit_are_refused(
+    network: nn.Module, settings: dict[str, Any], named: str
+) -> None:
+    with pytest.raises(SettingError, match=named):
+        _task(network, **settings)
+
+
+def test_a_network_of_classes_is_refused() -> None:
+    with pytest.raises(SettingError, match="scores of the network"):
+        _task(nn.Conv2d(2, 5, 1))(torch.zeros(1, 2, 8, 8))
+
+
+def test_limits_hold_in_training_and_evaluation() -> None:
+    task = _task(Right("log_distance"), max_distance=3.0)
+    data = Data()
+    (batch,) = data.train_dataloader()
+    near = (batch.labels > 0) & (batch.labels <= 3 * 512)
+    assert task.loss_norm(task.training_pairs(batch)[1]).item() == int(near.sum())
+    quiet_trainer().test(task, datamodule=data, verbose=False)
+    targets = [sample.target for sample in data.test]
+    counts = [int(((t > 0) & (t <= 3 * 512)).sum()) for t in targets]
+    assert task.result[:, 0, 0].tolist() == counts
+    assert task.facts["range"] == "0 to 3 m"
