@@ -111,6 +111,10 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.require_one_of("labels", PIXEL_CLASSES, DISTANCE)
+        if self.has_distances:
+            self.class_names = ()
+            reason = self.no_depth or self.no_distances
+            self.require("labels", not reason, f"{PIXEL_CLASSES}: {reason}", _DISTANCES)
         class_sets = {} if self.has_distances else self.class_sets
         chosen = next(iter(class_sets), None) if self.classes is None else str(self.classes)
         fine = chosen is None or chosen in class_sets
@@ -122,12 +126,8 @@ class ImageDataModule(SplitDataModule[ImageFiles]):
         self.inputs = ordered_inputs(self.inputs)
         with_depth = "depth" in self.inputs
         self.require("inputs", not (with_depth and self.no_depth), f"no depth: {self.no_depth}")
-        if self.has_distances:
-            self.class_names = ()
-            reason = self.no_depth or self.no_distances
-            self.require("labels", not reason, f"{PIXEL_CLASSES}: {reason}", _DISTANCES)
-            expected = "no depth: it is the target"
-            self.require("inputs", not with_depth, expected, "Give data.inputs=[rgb].")
+        fine = not (with_depth and self.has_distances)
+        self.require("inputs", fine, "no depth: it is the target", "Give data.inputs=[rgb].")
         given = self.normalization or self.normalizations[with_depth]
         self.normalization = Normalization.of(given, 3 + with_depth, "data.normalization")
         self.require("color_jitter", 0 <= self.color_jitter <= 1, "0 to 1")

@@ -102,7 +102,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         rgb, *others = render_inputs(image, views, self.inputs)
         if self.color_jitter:
             rgb = jitter_colors(rgb, self.color_jitter, rng)
-        labels = _label_tensor(views.render(image.labels, "nearest"))
+        labels = _tensor(_for_torch(views.render(image.labels, "nearest")))
         rays = torch.from_numpy(world_rays(views, image.up))
         return TrainingSample((rgb, *others), labels, rays, _ray_lengths([views], image), index)
 
@@ -131,7 +131,7 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
         of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
-        target = _label_tensor(image.target(self.representation))
+        target = torch.tensor(_for_torch(image.target(self.representation)))
         area = torch.from_numpy((image.area or _WHOLE).numbers)
         lengths = _ray_lengths(view_sets, image)
         return EvaluationSample(images, target, torch.from_numpy(rotation), lengths, area, index)
@@ -192,9 +192,9 @@ def _ray_lengths(view_sets: Sequence[Views], image: Any) -> Tensor:
     return torch.from_numpy(np.concatenate([views.ray_lengths() for views in view_sets]))
 
 
-def _label_tensor(labels: NDArray[Any]) -> Tensor:
+def _for_torch(labels: NDArray[Any]) -> NDArray[Any]:
     # torch has few operations on uint16.
-    return _tensor(labels.astype(np.int32) if labels.dtype == np.uint16 else labels)
+    return labels.astype(np.int32) if labels.dtype == np.uint16 else labels
 
 
 _HUE_SHARE = 0.1

@@ -46,8 +46,8 @@ _DEPTHS: dict[DepthKind, str] = {
     "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
 }
 
-_OF_CLASSES = ("classes", "unknown_classes", "scores")
-"""Settings that depth networks do not have, beside ``unknown_wins``."""
+_OF_CLASSES = {"classes": None, "unknown_classes": (), "unknown_wins": True, "scores": None}
+"""Settings that depth networks do not have, and their defaults."""
 
 
 def import_network(config: Mapping[str, Any]) -> None:
@@ -129,15 +129,11 @@ def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
 def _check_kind(settings: ImportSettings, network: PhotoNetwork) -> None:
     """Refuse settings of depth networks for one that predicts classes, and the reverse."""
     is_depth = network.depth_kind is not None
-    given = [name for name in (_OF_CLASSES if is_depth else ("depth",)) if getattr(settings, name)]
-    given += ["unknown_wins"] * (is_depth and not settings.unknown_wins)
-    for name in given:
-        predicted = "depth" if is_depth else "classes"
-        raise SettingError(
-            name,
-            found=getattr(settings, name),
-            expected=f"its default, because the network predicts {predicted}",
-        )
+    for name, default in (_OF_CLASSES if is_depth else {"depth": None}).items():
+        if (found := getattr(settings, name)) != default:
+            predicted = "depth" if is_depth else "classes"
+            expected = f"its default, because the network predicts {predicted}"
+            raise SettingError(name, found=found, expected=expected)
 
 
 def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:

@@ -33,11 +33,12 @@ from torch import Tensor
 
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import along_rays, is_disparity
-from tangent_train.errors import SettingError, counted
+from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
 from tangent_train.rendering.accumulate import NO_OWNERS
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.views import Views
+from tangent_train.rendering.sampling import image_taps, sample
 
 Align = Literal["none", "scale", "affine", "grid"]
 """Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
@@ -45,13 +46,7 @@ Align = Literal["none", "scale", "affine", "grid"]
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-_POWERS: dict[DepthKind, int] = {
-    "log_distance": 0,
-    "metric_distance": 0,
-    "metric_z": 1,
-    "relative_depth": 1,
-    "relative_disparity": -1,
-}
+_RAY_POWERS = {"metric_z": 1, "relative_depth": 1, "relative_disparity": -1}
 """Powers of the ray length that convert output to distance or disparity along the ray."""
 
 _LEVEL = 5
@@ -140,38 +135,32 @@ def sample_views(
         points: ``(P, 2)`` rows and columns of the canvas.
     """
     placed, images = views.placed(torch.from_numpy(np.ascontiguousarray(outputs))[:, None], shape)
-    pixels = placed[:, 0].numpy()
+    height, width = placed.shape[-2:]
     geometry = images.geometry(shape, slice(0, shape[0]), NO_OWNERS)
     rows, columns = geometry.rows[points[:, 0]].T, geometry.columns[:, points[:, 1]]
     rays = np.stack([rows[0] * columns[0], rows[0] * columns[1], rows[1]])
     u, v, w = np.moveaxis(geometry.matrices @ rays, 1, 0)
-    height, width = pixels.shape[1:]
-    x, y = ((side + w) / size for side, size in ((2 * u, width), (2 * v, height)))
-    view, point = np.nonzero((np.maximum(np.abs(x - w), np.abs(y - w)) <= w) & (w > 0))
-    w = w[view, point]
-    position = np.stack([x[view, point] / w - 1, y[view, point] / w - 1], axis=-1)
-    at = ((position + 1) * (width, height) - 1) / 2
-    value = _bilinear(pixels, view, at)
-    lengths = views.ray_lengths()
-    length = np.ones(len(view))
-    if images is views and lengths.size > 1:
-        length = _bilinear(lengths, view if len(lengths) > 1 else 0 * view, at)
-    elif images is not views:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, y = (2 * u / w + 1) / width - 1, (2 * v / w + 1) / height - 1
+    view, point = np.nonzero((np.maximum(np.abs(x), np.abs(y)) <= 1) & (w > 0))
+    position = np.stack([x[view, point], y[view, point]], axis=-1)
+    value = _interpolated(placed[:, 0], view, position)
+    lengths, length = torch.from_numpy(views.ray_lengths()), np.ones(len(view))
+    if lengths.numel() > 1:
+        length = _interpolated(lengths, view % len(lengths), position)
+    if images is not views:
         position = np.full_like(position, np.nan)
-    return ViewSamples(len(pixels), view, point, value, length, position)
+    return ViewSamples(len(placed), view, point, value, length, position)
 
 
-def _bilinear(images: NDArray[np.floating], image: Indices, at: Floats) -> Floats:
-    """Return interpolated values ``(n,)`` at columns and rows ``(n, 2)``, clamped at the edges."""
-    last = np.array(images.shape[:0:-1]) - 1
-    at = at.clip(0, last)
-    low = np.minimum(np.floor(at), np.maximum(last - 1, 0)).astype(np.int64)
-    (right, below), (column, row) = (at - low).T, low.T
-    up, left = np.minimum(row + 1, last[1]), np.minimum(column + 1, last[0])
-    corners = [(row, column), (row, left), (up, column), (up, left)]
-    a, b, c, d = (images[image, i, j].astype(np.float64) for i, j in corners)
-    value = (1 - below) * ((1 - right) * a + right * b) + below * ((1 - right) * c + right * d)
-    return np.where(np.isfinite(value), value, np.nan)
+def _interpolated(images: Tensor, image: Indices, position: Floats) -> Floats:
+    """Return bilinear values ``(n,)`` at positions ``(n, 2)``; NaN where one is not finite."""
+    height, width = images.shape[1:]
+    u, v = torch.from_numpy(((position + 1) * (width, height) - 1) / 2).T[:, None]
+    number, ones = torch.from_numpy(image)[None], torch.ones_like(u)
+    taps = image_taps(number, u, v, (height, width), ones, height * width)
+    values = sample(images.reshape(1, -1), taps)[0].double().numpy()
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 @dataclass(frozen=True)
@@ -202,20 +191,6 @@ class AlignmentReport:
     outliers: float = 0.0
     step_before: float | None = None
     step_after: float | None = None
-
-    def lines(self) -> list[str]:
-        """Return the report as sentences."""
-        lines = [f"Aligned {counted(self.views, 'views')} ({self.mode})."]
-        if self.step_before is not None and self.step_after is not None:
-            steps = f"{self.step_before:.1%} before and {self.step_after:.1%} after"
-            lines.append(f"Median step between views: {steps}; {self.outliers:.0%} outliers.")
-        if self.groups > 1:
-            lines.append(f"{self.groups} groups of views do not overlap: their scales differ.")
-        named = {"without a valid value": self.empty, "with constant output": self.constant}
-        lines += [f"Views {what}: {', '.join(map(str, n))}." for what, n in named.items() if n]
-        if self.invalid:
-            lines.append(f"{self.invalid:.1%} of the samples have no valid value, such as sky.")
-        return lines
 
 
 @dataclass(frozen=True)
@@ -294,7 +269,7 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     base = usual if mode == "grid" else mode
     if kind == "log_distance":
         value = np.exp(value)
-    factor = samples.ray_length ** _POWERS[kind]
+    factor = samples.ray_length ** _RAY_POWERS.get(kind, 0)
     is_valid = np.isfinite(value) & (value != 0 if base == "affine" else value > 0)
     pairs = _pairs(samples, np.flatnonzero(is_valid))
     scale, shift, grid = np.ones(count), np.zeros(count), None
@@ -305,16 +280,13 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     elif base == "affine" and len(outliers):
         scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
     groups = pairs.groups(count)
-    for group in np.unique(groups):
-        unit = np.exp(np.median(np.log(scale[groups == group])))
-        scale[groups == group] /= unit
-        shift[groups == group] /= unit
+    unit = np.exp(_medians(np.log(scale), groups))
+    scale, shift = scale / unit, shift / unit
     before = _logarithm(value * factor)
     after = _logarithm((scale[view] * value + shift[view]) * factor)
     if mode == "grid" and len(outliers):
         grid, added, outliers = _fit_grid(pairs, after, samples)
-        for group in np.unique(groups):
-            grid[groups == group] -= np.median(grid[groups == group].mean(axis=(1, 2)))
+        grid -= _medians(grid.mean(axis=(1, 2)), groups)[:, None, None]
         after = after + added
     is_empty = np.bincount(view[is_valid], minlength=count) == 0
     alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
@@ -335,6 +307,11 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
 
 def _numbers(mask: NDArray[np.bool_]) -> tuple[int, ...]:
     return tuple(np.flatnonzero(mask).tolist())
+
+
+def _medians(values: Floats, groups: Indices) -> Floats:
+    """Return the median of the group of each value."""
+    return np.array([np.median(values[groups == k]) for k in range(groups.max() + 1)])[groups]
 
 
 def _logarithm(values: Floats) -> Floats:

@@ -89,9 +89,11 @@ def export_network(
                 else:
                     _write_safetensors(trained, temporary)
                 return _verified(trained, size, temporary)
-        except (SettingError, OSError):
-            raise
         except Exception as error:  # exporters raise many kinds; a fixed size may still work
+            if isinstance(error, OSError) or (
+                isinstance(error, SettingError) and size == sizes[-1]
+            ):
+                raise
             failure = error
     cause: Any = failure
     while getattr(cause, "__cause__", None):

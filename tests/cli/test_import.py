@@ -213,6 +213,22 @@ def test_an_onnx_file_predicts_depth(squeezed: bool, here: Path, run: Run, capsy
     torch.testing.assert_close(trained.network(images), 1 + images.sum(1, keepdim=True))
 
 
+def test_depth_of_an_import_is_predicted_and_resumed(
+    here: Path, run: Run, predict: Predict, capsys: Capture
+) -> None:
+    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32))
+    run("import", *OF_DEPTH, "depth=metric_z", "image_size=32")
+    rgb = _write_room()
+    settings = {"checkpoint": "ours.onnx", "output": "out", "depth_format": "npy", "report": 0}
+    predict(**settings, input="room.png", write="[depth]")
+    found = np.load("out/depth/room.npy")
+    assert 1 < np.nanmin(found) < np.nanmax(found)
+    np.testing.assert_array_equal(found, tt.load("ours.onnx").depth(rgb))
+    capsys.readouterr()
+    predict(**settings, input="room.png", write="[depth]", resume="true")
+    assert "1 image, 1 done already" in capsys.readouterr().out
+
+
 def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capture) -> None:
     """A remark is printed, because its depth may be negative."""
     torch.manual_seed(0)

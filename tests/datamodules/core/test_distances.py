@@ -98,6 +98,7 @@ def _folder(root: Path) -> None:
 
 
 _BOTH = dict.fromkeys(("5a", "5b"), ("office_1",))
+_SCENES = (0, 1, 2, 3000, 3250)
 _HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
 SOURCES = {
     "stanford2d3ds": Source(
@@ -107,7 +108,7 @@ SOURCES = {
         512,
     ),
     "structured3d": Source(
-        *(Structured3D, lambda root: write_structured3d(root, height=40)),
+        *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
         *("*/*/*/panorama/full/depth.png", 1000),
     ),
     "matterport360": Source(
@@ -127,7 +128,7 @@ SOURCES = {
     ),
     "structured3d_perspective": Source(
         Structured3DPerspective,
-        lambda root: write_structured3d(root, photos=True),
+        lambda root: write_structured3d(root, _SCENES, photos=True),
         "*/*/*/perspective/full/*/depth.png",
         1000,
         (*_HALF, 15.5, 15.5),
@@ -216,9 +217,12 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
             torch.testing.assert_close(one, other, rtol=0, atol=0)
     classes = {"labels": "pixel_classes"}
     if source.module not in (FolderPanoramas, FolderPhotos):  # they have no classes here
-        data = _data(source, root, store=tmp_path, **classes)
+        data = _data(source, root, store=tmp_path, in_memory=True, **classes)
         data.prepare_data()
-        assert data.dataset("test")[0].target.max() < 50
+        target = data.dataset("test")[0].target
+        assert 0 < target.max() < 50
+        target.zero_()
+        assert data.dataset("test")[0].target.max() > 0, "a copy of what is in memory"
     assert len(list(tmp_path.iterdir())) == 1 + (source.module.__name__[:6] != "Folder")
 
 
@@ -357,8 +361,9 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
     ("data", "settings", "message"),
     [
         *(
-            (module, {}, r"data\.labels: found distance; .*Choose|data=synthrooms")
+            (module, settings, r"data\.labels: found distance; .* choose data=synthrooms")
             for module in (Cityscapes, DensePASS, SynPASS, Zind, OmniSynthia)
+            for settings in ({}, {"classes": 13, "inputs": ["rgb", "depth"]})
         ),
         (Stanford2D3DS, {"inputs": ["rgb", "depth"]}, r"data\.inputs: .*no depth: .*\[rgb\]"),
         (Stanford2D3DS, {"classes": 8}, r"data\.classes: found 8; expected null"),

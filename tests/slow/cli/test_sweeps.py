@@ -109,13 +109,14 @@ def test_a_search_without_a_validation_split_is_refused(
 
 
 @OLD_SQLALCHEMY
-def test_a_search_for_the_worse_score_is_refused(
-    rooms: str, run: Run, monkeypatch: pytest.MonkeyPatch
+def test_a_search_for_the_worse_score_is_refused_before_the_first_run(
+    rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package = ROOT / "tests" / "tasks" / "toy_regression"
-    monkeypatch.setenv("PYTHONPATH", f"{ROOT}:{package.parent}")
+    monkeypatch.syspath_prepend(package.parent)
     toy = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
     settings = (*SMALL_ROOMS, rooms, "network.widths=[4,8]", "trainer.max_epochs=1")
     study = ("sweep=optuna", "hydra.sweeper.n_trials=1")
     with pytest.raises(SystemExit, match="found maximize; expected minimize, for val/mae"):
         run("train", "-m", *toy, *settings, *study)
+    assert not list(tmp_path.rglob("checkpoints"))

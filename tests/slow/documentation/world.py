@@ -83,6 +83,7 @@ def build_world(folder: Path) -> Path:
     for line in (
         f"tangent-train experiment=rooms/demo hydra.run.dir={demo}",
         f"tangent-train experiment=rooms/demo data.inputs=[rgb] hydra.run.dir=runs/rgb/{TIME}",
+        f"tangent-train experiment=rooms/depth hydra.run.dir=runs/rooms/depth/{TIME}",
         f"tangent-train experiment=shapes/default hydra.run.dir=runs/shapes/default/{TIME}",
         "tangent-prepare data=synthshapes data.root=data/ModelNet40",
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.onnx",

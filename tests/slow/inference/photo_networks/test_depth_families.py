@@ -1,23 +1,56 @@
-"""Depth networks of all families of transformers, from a saved folder to files of predictions."""
+"""Depth networks of all families of transformers, from a saved folder to exported files."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
+import tangent_train as tt
 from models.huggingface import DEPTH, network_types
-from tangent_train.inference.photo_networks import depth_kinds
+from tangent_train.inference.export import export_network
+from tangent_train.inference.photo_networks import depth_kinds, huggingface, import_network
 from tests.inference.photo_networks import depth_networks as depth
+from tests.inference.photo_networks.huggingface_networks import saved
 from tests.inference.photo_networks.test_depth import check_family
 
+each_family = pytest.mark.parametrize("family", depth.FAMILIES, ids=lambda one: one[0].__name__)
 
-@pytest.mark.parametrize("family", depth.FAMILIES, ids=lambda family: family[0].__name__)
+
+@each_family
 def test_depth_is_that_of_the_library(family: Any, tmp_path: Path) -> None:
     check_family(tmp_path, *family)
 
 
-def test_all_families_are_tried_or_refused(tmp_path: Path) -> None:
+def test_all_families_are_tried_or_refused() -> None:
     tried = {make()[0].config.model_type for make, *_ in depth.FAMILIES}
     assert tried | set(depth_kinds._REFUSED) == network_types(DEPTH)
+
+
+@each_family
+def test_depth_of_a_panorama_is_that_of_the_exported_network(family: Any, tmp_path: Path) -> None:
+    make, side, given, kind = family
+    saved(make, tmp_path)
+    network = huggingface.load(model=str(tmp_path), classes=None, normalization=None, depth=given)
+    path = tmp_path / "net.ckpt"
+    trained = import_network(network, path, image_size=(side, side), views="ring_economy")
+    panorama = np.concatenate([depth.photo(64), depth.photo(64)[:, ::-1]], axis=1)
+    expected = tt.load(path).depth(panorama)
+    assert expected.shape == (64, 128)
+    assert np.isfinite(expected).mean() > 0.5
+    assert np.nanstd(np.log(expected)) > 1e-4
+    for name in ("net.safetensors", "net.onnx"):
+        if name == "net.onnx" and make in _NOT_ONNX:
+            continue
+        export_network(trained, tmp_path / name)
+        again = tt.load(tmp_path / name)
+        assert again.trained.depth_kind == kind
+        found = again.depth(panorama)
+        np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
+        np.testing.assert_allclose(np.log(found), np.log(expected), atol=1e-3)
+
+
+_NOT_ONNX: tuple[Any, ...] = ()
+"""Networks that torch's exporter does not support."""
