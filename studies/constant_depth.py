@@ -23,15 +23,12 @@ from tangent_train.results.evaluation import headline
 
 
 def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
-    """Return distances in meters ``(H or 1, 1)`` that ignore the image, by their name.
-
-    Args:
-        steps: Distances of the training panoramas ``(n, H, W)`` in steps, 0 where unknown.
-    """
+    """Return distances in meters ``(H or 1, 1)`` by name, from those of training ``(n, H, W)``."""
     known = np.sort(steps[steps > 0]).astype(np.float64)
     share = np.cumsum(1 / known)  # the absolute relative error weights an error by 1 / distance
     constant = known[np.searchsorted(share, share[-1] / 2)]
-    rows = np.ma.median(np.ma.masked_equal(steps.swapaxes(0, 1).reshape(steps.shape[1], -1), 0), 1)
+    by_row = np.ma.masked_equal(steps.swapaxes(0, 1).reshape(steps.shape[1], -1), 0)
+    rows: Any = np.ma.median(by_row, 1)  # type: ignore[no-untyped-call]
     filled = rows.filled(np.median(known))[:, None]
     found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": filled}
     return {name: np.atleast_2d(value) / STEPS_PER_M for name, value in found.items()}
@@ -40,15 +37,15 @@ def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
 def main() -> None:
     """Print the scores of each constant."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("overrides", nargs="+", metavar="setting=value")
+    parser.add_argument("settings", nargs="+", metavar="<setting>=<value>")
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", parser.parse_args().overrides)
+        config = compose("train", parser.parse_args().settings)
     settings: Any = OmegaConf.to_container(config, resolve=True)
     data = build_data(settings)
     data.make_files()
     train, test, view = data.source("train"), data.source("test"), data.representation
     targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
-    empty = {"network": nn.Identity(), "class_names": (), "optimizer": None}
+    empty: dict[str, Any] = {"network": nn.Identity(), "class_names": (), "optimizer": None}
     for name, meters in constants(np.stack(targets)).items():
         task = build_from_config(settings["task"], "task", representation=view, **empty)
         for index in range(len(test)):

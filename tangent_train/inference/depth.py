@@ -9,13 +9,13 @@ import numpy as np
 import torch
 
 from datamodules.core.labels import DISTANCE
+from datamodules.core.panoramas import ray_lengths
 from tangent_train.checkpoints.distances import distance_of, is_metric, uncanonical
 from tangent_train.inference.alignment import Align, photo_points, sample_views, sphere_points
 from tangent_train.inference.alignment import align as align_views
 from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic
-from tangent_train.rendering.representations.views import lengths_of_rays
 from tangent_train.rendering.sampling import sphere_rays
 
 if TYPE_CHECKING:
@@ -59,7 +59,7 @@ class DistanceMap:
         """
         if camera_matrix is None:
             return self.distance
-        lengths = _photo_ray_lengths(camera_matrix, self.distance.shape)
+        lengths = ray_lengths(camera_matrix, self.distance.shape)
         return self.distance / torch.from_numpy(lengths).to(self.distance)
 
 
@@ -190,7 +190,7 @@ def _median(
         if area is not None:
             weight *= area.contains(directions)
     else:
-        weight = _photo_ray_lengths(camera_matrix, distance.shape)[rows][:, columns] ** -3.0
+        weight = ray_lengths(camera_matrix, distance.shape)[rows][:, columns] ** -3.0
     known = np.isfinite(values) & (weight > 0)
     order = np.argsort(values[known])
     total = weight[known][order].cumsum()
@@ -206,14 +206,3 @@ def _directions(
     of_columns, of_rows = sphere_rays((shape[0], shape[1]))
     (x, y), (across, z) = of_columns[:, columns], np.moveaxis(of_rows[rows], -1, 0)
     return np.stack(np.broadcast_arrays(across * x, across * y, z), axis=-1)
-
-
-def _photo_ray_lengths(
-    camera_matrix: NDArray[np.float64], shape: Sequence[int]
-) -> NDArray[np.float32]:
-    """Return distance divided by z-depth at every pixel of a photo, ``(H, W)``."""
-    y, x = (
-        (np.arange(shape[i]) - camera_matrix[1 - i, 2]) / camera_matrix[1 - i, 1 - i]
-        for i in (0, 1)
-    )
-    return lengths_of_rays(x[None], y[None])[0]

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from datamodules.core.panoramas import ray_lengths
 from datamodules.images.videos import write_video
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
@@ -77,10 +78,7 @@ def solid_angles(predicted: PredictedImage) -> Iterator[NDArray[np.float64]]:
         for weight in rows if predicted.area is None else rows[predicted.area.places()[0]]:
             yield np.full(width, weight)
         return
-    (fx, _, cx), (_, fy, cy), _ = image.camera_matrix
-    x = (np.arange(width) - cx) / fx
-    for row in range(height):
-        yield (1 + x**2 + ((row - cy) / fy) ** 2) ** -1.5
+    yield from ray_lengths(image.camera_matrix, (height, width)) ** -3.0
 
 
 class ImageResults(ABC):

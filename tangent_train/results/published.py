@@ -120,7 +120,8 @@ class Comparison(NamedTuple):
         groups: dict[tuple[str, ...], list[Publication]] = defaultdict(list)
         for publication in publications():
             stage, data = publication.stage, facts(publication.protocol)["data"]
-            on_data = [record for record in records if record.protocol.get("data") == data]
+            names = {line["score"] for line in publication.lines}
+            on_data = [r for r in records if r.protocol.get("data") == data and names & {*r.means}]
             if on_data and (stage or publication.trained_on if transfer else not stage):
                 groups[min(map(publication.differences, on_data), key=len)].append(publication)
         same = groups.pop((), [])

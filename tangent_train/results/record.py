@@ -97,7 +97,7 @@ _SHOWN = {
 _FIELDS = {
     "noun": Text,
     "images": int,
-    "headings": dict[str, dict],
+    "headings": dict[str, dict[str, Text | bool]],
     "classes": list,
     "latitude_bands": list,
     "groups": list,

@@ -182,14 +182,11 @@ def test_relative_depth_is_marked(
     ("settings", "refused"),
     [
         ({"class_map": "ade20k_to_stanford2d3ds"}, "class_map: found .*expected null for depth"),
-        ({"unmapped": "never"}, "unmapped: found never; expected unknown for depth networks"),
         ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0 for depth networks"),
-        ({"min_share": 0.5}, "min_share: found 0.5"),
         ({"upright": "auto"}, "upright: found auto; expected pose or null"),
         ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),
         ({"depth_scale": 0}, "depth_scale: found 0"),
         ({"points": 0}, "points: found 0"),
-        ({"align": "twice"}, "align: found twice; expected none or scale"),
         ({"depth": "."}, "depth: found .*expected null"),
     ],
 )

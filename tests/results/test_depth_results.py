@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from numpy.typing import NDArray
 from datamodules.images.gpano import area_of_angles, whole_area
 from datamodules.images.palette import distance_colors
 from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m
+from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
 from tangent_train.inference.images import InputImage
 from tangent_train.results.depth_results import DepthResults, points_of, spread_pixels
@@ -109,3 +112,12 @@ def test_a_video_has_one_range_of_colors() -> None:
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
     assert not painted[2].any()
+
+
+def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    how: dict[str, Any] = {"is_metric": True, "points": None}
+    with pytest.raises(SettingError, match=r"depth_format: found a missing package.*\[exr\]"):
+        DepthResults(**how, depth_format="exr", depth_scale=1000)
+    with pytest.raises(SettingError, match="depth_scale: found inf; expected more than 0"):
+        DepthResults(**how, depth_format=None, depth_scale=math.inf)

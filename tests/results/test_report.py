@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -10,13 +11,15 @@ import pytest
 
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
+from tangent_train.checkpoints.content import write_settings
+from tangent_train.files import write_text
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import runs_report, transfer_report
 from tangent_train.results.published import Comparison, facts, published_lines
-from tangent_train.results.record import Record
+from tangent_train.results.record import Record, load_record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
-from tangent_train.tasks import ClassificationTask
+from tangent_train.tasks import ClassificationTask, DepthTask
 from tests.decoded import decoded
 from tests.results.made_records import PROTOCOL, made_record, without_solid_angle
 
@@ -234,3 +237,31 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
     assert high - middle == pytest.approx(middle - low, abs=8)
     assert high - low > 200
+
+
+def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:
+    """Depth: no classes, no published scores of the data set, and smaller errors are better."""
+    headings = DepthTask.headings
+    means = dict.fromkeys(headings, 0.25)
+    protocol = {"data": "Stanford2D3DS", "alignment": "none"}
+    settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}
+    records = []
+    for number, alignment in enumerate(("none", "median in distance")):
+        folder = tmp_path / str(number)
+        written = Record("panoramas", 2, headings, means, protocol=protocol)
+        written = replace(written, protocol=protocol | {"alignment": alignment})
+        write_text(folder / "results.json", written.json())
+        write_settings(folder / "config.yaml", settings | {"task": {"alignment": alignment}})
+        records.append(load_record(folder))
+    assert records[0].headings == headings
+    assert records[0].means == means
+    assert Comparison.of(records) == ([], [])
+    report = runs_report(records)
+    header, rows = report.tables()[0].header, report.tables()[0].rows
+    assert header[-6:] == (
+        *("AbsRel ↓", "δ1 %", "RMSE m ↓"),
+        *("AbsRel by solid angle ↓", "δ1 by solid angle %", "RMSE by solid angle m ↓"),
+    )
+    assert [row[-6:-3] for row in rows] == [("0.25", "25.0", "0.25")] * 2
+    assert {"none", "median in distance"} <= {cell for row in rows for cell in row}
+    assert {line["score"] for line in report.figures()} == {*headings}, "the CSV file has all"

@@ -98,6 +98,7 @@ def _folder(root: Path) -> None:
 
 
 _BOTH = dict.fromkeys(("5a", "5b"), ("office_1",))
+_SCENES = (0, 1, 2, 3000, 3250)
 _HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
 SOURCES = {
     "stanford2d3ds": Source(
@@ -107,7 +108,7 @@ SOURCES = {
         512,
     ),
     "structured3d": Source(
-        *(Structured3D, lambda root: write_structured3d(root, height=40)),
+        *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
         *("*/*/*/panorama/full/depth.png", 1000),
     ),
     "matterport360": Source(
@@ -127,7 +128,7 @@ SOURCES = {
     ),
     "structured3d_perspective": Source(
         Structured3DPerspective,
-        lambda root: write_structured3d(root, photos=True),
+        lambda root: write_structured3d(root, _SCENES, photos=True),
         "*/*/*/perspective/full/*/depth.png",
         1000,
         (*_HALF, 15.5, 15.5),
