@@ -64,7 +64,8 @@ class DistanceNetwork(nn.Module):
         depth = plain_scores(self.network(images, *arguments, **settings))
         if depth.ndim == _MAP:
             depth = depth[:, None]
-        if depth.shape != (len(images), 1, *images.shape[-2:]):
+        is_traced = torch.compiler.is_compiling()  # comparing would fix the sizes of the graph
+        if not is_traced and depth.shape != (len(images), 1, *images.shape[-2:]):
             raise SettingError(
                 "depth network",
                 found=f"output {tuple(depth.shape)}, for images {tuple(images.shape)}",

@@ -38,11 +38,13 @@ def export(config: Mapping[str, Any]) -> None:
     fixed, multiple = written.trained.fixed_size, trained.size_multiple
     sides = width_height(fixed) if fixed else "any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
+    scores, of_what = f"scores: {trained.network.num_scores} classes", "scores"
+    if trained.depth_kind is not None:
+        scores, of_what = f"depth: {trained.depth_kind}", "depth"
     print_text(
         f"{output}: {output.stat().st_size / 1e6:.1f} MB\n"
-        f"images: {trained.in_channels} channels, {sides}; scores: {trained.network.num_scores} "
-        f"classes\nlargest difference from PyTorch: {written.difference:.1e} of the range of the "
-        "scores"
+        f"images: {trained.in_channels} channels, {sides}; {scores}\n"
+        f"largest difference from PyTorch: {written.difference:.1e} of the range of the {of_what}"
     )
     if output.suffix.lower() == ".onnx" and sees_rays(trained.network):
         print_text(f"{output.name} lacks the cross-image attention; .safetensors contains it.")

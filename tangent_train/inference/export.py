@@ -29,7 +29,7 @@ from tangent_train.imports import hide_output
 SUFFIXES = (".onnx", ".safetensors")
 
 TOLERANCE = 1e-4
-"""Largest difference allowed between scores of the file and of PyTorch, relative to their range."""
+"""Largest difference allowed between outputs of the file and PyTorch, relative to their range."""
 
 _BATCHES = (1, 3)
 """Batch sizes that are compared; the graph is traced with batch size 2."""
@@ -73,7 +73,7 @@ def export_network(
 
     Raises:
         SettingError: A setting does not fit the format, the network cannot be exported, or the
-            scores differ by more than `TOLERANCE` of their range.
+            scores or the depth differ by more than `TOLERANCE` of their range.
     """
     _check(trained, path, image_size, opset)
     is_onnx = path.suffix.lower() == ".onnx"
@@ -154,7 +154,7 @@ def _write_onnx(
             (_random_images(trained, 2, size),),
             dynamo=True,
             input_names=["images"],
-            output_names=["scores"],
+            output_names=["scores" if trained.depth_kind is None else "depth"],
             dynamic_shapes=(shape,),
             opset_version=opset,
             verbose=False,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -145,6 +146,31 @@ def test_networks_that_are_hard_to_export_are_exported(
     assert_same(again.network(images).detach(), scores_of(trained, images))
     assert capfd.readouterr() == ("", ""), "the exporter is quiet"
     assert logging.getLogger("anybody").isEnabledFor(logging.WARNING)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_depth_networks_are_exported_and_read_back(suffix: str, tmp_path: Path) -> None:
+    trained = replace(
+        small_trained(UNET | {"num_classes": 1}),
+        class_names=(),
+        depth_kind="relative_disparity",
+        size_multiple=4,
+        fixed_size=None,
+    )
+    path = tmp_path / f"net{suffix}"
+    assert export_network(trained, path).difference < 1e-5
+    again = load_trained(path)
+    assert (again.depth_kind, again.predicts, again.class_names) == (
+        "relative_disparity",
+        "distance",
+        (),
+    )
+    assert again.fixed_size is None
+    images = some_images(trained, 2, (36, 64))
+    assert_same(again.network(images).detach(), scores_of(trained, images))
+    if suffix == ".onnx":
+        (output,) = onnxruntime.InferenceSession(path).get_outputs()
+        assert output.name == "depth"
 
 
 def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:

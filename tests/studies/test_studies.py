@@ -11,10 +11,12 @@ import torch
 from scipy.optimize import brentq
 
 from studies.angular_resolution import angular_resolution
+from studies.constant_depth import constants
 from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
 from studies.fov import fov
 from studies.methods import picture, table
 from studies.output import markdown
+from studies.point_views import SIDE, drawn
 from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.surface_area import surface_area
@@ -115,3 +117,37 @@ def test_the_chart_of_methods_names_every_method_once() -> None:
         heights = np.sort([text.get_position()[1] for text in axes.texts])
         assert np.diff(heights).min() > 0.05
         assert heights[-1] <= 1
+
+
+def test_constant_depths_minimize_their_errors() -> None:
+    steps = np.random.default_rng(0).integers(0, 3000, (3, 8, 5)).astype(np.int32)
+    found = constants(steps)
+    known = steps[steps > 0] / 512
+
+    def absrel(guess: float) -> float:
+        return float((abs(guess - known) / known).mean())
+
+    assert found["smallest AbsRel"].shape == (1, 1)
+    assert absrel(float(found["smallest AbsRel"][0, 0])) == pytest.approx(
+        min(absrel(guess) for guess in known)
+    )
+    assert found["median"][0, 0] == pytest.approx(np.median(known))
+    row = steps[:, 3][steps[:, 3] > 0] / 512
+    assert found["median of the row"].shape == (8, 1)
+    assert found["median of the row"][3, 0] == pytest.approx(np.median(row))
+
+
+def test_points_are_drawn_from_three_sides() -> None:
+    """A red wall 2 m ahead is at the top of the floor plan, and right in a view to the left."""
+    y, z = np.meshgrid(np.linspace(-0.5, 0.5, 99), np.linspace(-0.5, 0.5, 99))
+    wall = np.stack([np.full(y.size, 2.0), y.ravel(), z.ravel()], axis=-1)
+    hidden = wall * (2, 1, 1)  # behind it, from the camera
+    colors = np.repeat(np.array([[255, 0, 0], [0, 255, 0]], np.uint8), y.size, axis=0)
+    views = drawn(np.concatenate([wall, hidden]), colors, 5).reshape(SIDE, 3, SIDE, 3)
+    red, green = ((views == color).all(axis=-1) for color in ([255, 0, 0], [0, 255, 0]))
+    plan, ahead, left = (np.argwhere(red[:, k]).mean(axis=0) for k in range(3))
+    assert plan == pytest.approx([SIDE * (1 - 2 / 5) / 2, SIDE / 2], abs=1)
+    assert ahead == pytest.approx([SIDE / 2, SIDE / 2], abs=1)
+    assert left == pytest.approx([SIDE / 2, SIDE * (1 + 2 / 5) / 2], abs=1)
+    assert not green[:, 1].any()
+    assert green[:, 2].any()
