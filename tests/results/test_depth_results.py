@@ -26,7 +26,7 @@ RNG = np.random.default_rng(0)
 
 def _panorama(depth: NDArray[np.float32]) -> PredictedImage:
     rgb = RNG.integers(0, 256, (*depth.shape, 3), np.uint8)
-    return PredictedImage(InputImage(rgb), depth, whole_area(Path("a"), depth.shape))
+    return PredictedImage(InputImage(rgb, area=whole_area(Path("a"), depth.shape)), depth)
 
 
 def test_points_are_evenly_spread_over_the_sphere() -> None:
@@ -62,7 +62,7 @@ def test_points_of_a_part_and_of_a_photo() -> None:
     """A part across the seam has its place on the sphere; a photo is in camera axes, z ahead."""
     rgb = RNG.integers(0, 256, (64, 128, 3), np.uint8)
     area = area_of_angles((16, 32), [135, -135, 0, 45])
-    part = PredictedImage(InputImage(rgb), np.full((16, 32), 2, np.float32), area)
+    part = PredictedImage(InputImage(rgb, area=area), np.full((16, 32), 2, np.float32))
     points, colors = points_of(part, np.array([[0, 15], [0, 31]]))
     rows, columns = [16, 31], [112, 15]
     expected = 2 * equirect_directions((64, 128))[rows, columns] * (1, -1, 1)
