@@ -122,11 +122,13 @@ SOURCES = {
     ),
     "structured3d_perspective": Source(
         *(Structured3DPerspective, lambda root: write_structured3d(root, _SCENES, photos=True)),
-        *("*/*/*/perspective/full/*/depth.png", 1000, (*_HALF, 15.5, 15.5)),
+        *("*/*/*/perspective/full/*/depth.png", 1000),
+        (*_HALF, 15.5, 15.5),
     ),
     "synthia_perspective": Source(
         *(SynthiaPerspective, lambda root: write_views(root, dict.fromkeys(SEQUENCES, 2))),
-        *("*/Depth/Stereo_Left/*/*.png", 100, (FOCAL, FOCAL, CENTER_X - 0.5, CENTER_Y - 0.5)),
+        *("*/Depth/Stereo_Left/*/*.png", 100),
+        (FOCAL, FOCAL, CENTER_X - 0.5, CENTER_Y - 0.5),
     ),
     "folder_photos": Source(
         FolderPhotos, _folder_photos, "depth/*/*.png", 1000, (60, 50, 20, 30.5)
