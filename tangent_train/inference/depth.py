@@ -10,9 +10,10 @@ import torch
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import ray_lengths
+from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import distance_of, is_metric, uncanonical
-from tangent_train.inference.alignment import Align, photo_points, sample_views, sphere_points
 from tangent_train.inference.alignment import align as align_views
+from tangent_train.inference.alignment import photo_points, sample_views, sphere_points
 from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic
