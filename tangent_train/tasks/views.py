@@ -138,8 +138,8 @@ class ViewsTask(Task):
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; return the predictions."""
         predictions = []
-        for sample in map(EvaluationSample._make, zip(*batch, strict=True)):
-            prediction, truth = self.predict_sample(sample)
+        for fields in zip(*batch, strict=True):
+            prediction, truth = self.predict_sample(EvaluationSample(*fields))
             self.metric.update(prediction, truth)
             predictions.append(prediction)
         return torch.stack(predictions)
