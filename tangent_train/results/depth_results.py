@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.core.panoramas import ray_lengths
 from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
-from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz, ray_lengths
 from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import colorize_distance, distance_limits, distance_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import Any, get_args
 
@@ -68,12 +67,7 @@ def _true_depth(representation: dict[str, Any], kind: DepthKind) -> list[tuple[A
     for views in built.view_sets():
         distance = views.render(panorama, "bilinear")
         lengths = torch.from_numpy(views.ray_lengths())[:, None]
-        if kind == "canonical_inverse":
-            grid = getattr(views, "grid", None)
-            width = 2 * math.pi if grid is None else 2 * grid.half_size[0]
-            found.append((views, lengths / distance / width))
-        else:
-            found.append((views, from_distance(distance, kind, lengths)))
+        found.append((views, from_distance(distance, kind, lengths)))
     return found
 
 
