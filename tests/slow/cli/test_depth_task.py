@@ -144,14 +144,9 @@ def test_an_exported_network_predicts_the_same_depth(run: Run) -> None:
 
 
 @OLD_SQLALCHEMY
-def test_sweeps_compare_errors_and_search_for_the_smallest(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_sweep_searches_for_the_smallest_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
     once = (*SETTINGS, "panels=0", "trainer.max_epochs=1")
-    run("train", "-m", *once, "task.loss=log_l1,scale_invariant", "hydra.sweep.dir=grid")
-    losses = [results(Path("grid") / number)["absrel"] for number in "01"]
-    assert losses[0] != losses[1]
     study = ("sweep=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=study")
     with pytest.raises(SystemExit, match="expected minimize, for val/absrel"):
         run("train", "-m", *study, *once)
