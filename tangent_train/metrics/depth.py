@@ -154,7 +154,7 @@ def error_sums(
     """Sum the errors of one panorama ``(H, W)``, or of the crops of one photo ``(n, h, w)``.
 
     Args:
-        prediction: Predicted distances in meters; NaN where there are none.
+        prediction: Predicted distances in meters; NaN where unknown.
         truth: True distances in meters; NaN where unknown.
 
     Returns:

@@ -155,7 +155,7 @@ def bootstrap(
         seed: Seed of the draws.
 
     Returns:
-        Intervals by name; empty for a single image. Undefined scores have none.
+        Intervals by name; empty for a single image. Undefined scores have no interval.
     """
     count = len(of_images)
     if count <= 1:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from tangent_train.errors import DataError
-from tangent_train.results.record import find_runs, load_record, unfinished_runs
+from tangent_train.results.record import Heading, find_runs, load_record, unfinished_runs
 from tests.results.made_records import BANDS, made_record, write_run
 
 SCORES = (0.1, 0.2, None)
@@ -38,7 +38,9 @@ def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
         (["headings", "miou", "of_class"], 1),
         (["headings", "miou"], "mIoU"),
         (["headings"], {}),
-        (["headings"], {"a b": {"text": "", "unit": "", "of_class": "", "class_text": ""}}),
+        (["headings"], {"a b": Heading("")._asdict()}),
+        (["headings", "miou", "is_main"], "yes"),
+        (["headings", "miou", "better"], True),
     ],
 )
 def test_headings_are_plain_text(place: list[str], value: Any, tmp_path: Path) -> None:
@@ -48,7 +50,8 @@ def test_headings_are_plain_text(place: list[str], value: Any, tmp_path: Path) -
         part = part[name]
     part[place[-1]] = value
     path.write_text(json.dumps(results))
-    with pytest.raises(DataError, match=r"results\.json: found (headings|no score with a heading)"):
+    found = r"results\.json: found (headings|is_main|better|no score with a heading)"
+    with pytest.raises(DataError, match=found):
         load_record(path.parent)
 
 

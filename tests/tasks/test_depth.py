@@ -75,7 +75,7 @@ class Data(lightning.LightningDataModule):
 class Right(nn.Module):
     """Returns the true depth of a kind, of the views of tangent images or the given crops.
 
-    A relative network gives each view, told by its noise, a scale and a shift of its own.
+    A relative network gives each view, which it recognizes by its noise, another scale and shift.
     """
 
     def __init__(self, kind: DepthKind, lengths: Any = None) -> None:
