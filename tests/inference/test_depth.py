@@ -96,7 +96,7 @@ def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind)
         ratio = found.distance.numpy() / _truth()
         np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02 if single else 0.01)
     plain = combine_depth(scaled, SHAPE, kind, "feather", "none").distance.numpy() / _truth()
-    assert single or np.ptp(plain / np.median(plain)) > 0.1
+    assert name in ("equirectangular", "icosphere") or np.ptp(plain / np.median(plain)) > 0.1
     if is_metric(kind):
         exact = combine_depth(outputs, SHAPE, kind, "feather").distance.numpy()
         np.testing.assert_allclose(exact, _truth(), rtol=0.02)

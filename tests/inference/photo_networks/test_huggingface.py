@@ -285,19 +285,19 @@ def test_undeclared_settings_are_left_out_or_refused(
     networks.saved(made, tmp_path / "net")
     path = tmp_path / "net" / "config.json"
     honest = json.loads(path.read_text())
-    checkpoint = tmp_path / "net" / "imported.ckpt"
     networks.imported(tmp_path / "net")
-    content = torch.load(checkpoint, weights_only=True)
+    content = torch.load(tmp_path / "net" / "imported.ckpt", weights_only=True)
+    hostile = tmp_path / "hostile.ckpt"
+    places: Any = ((), ("backbone_config",))
     for attack in undeclared_settings(tmp_path / "forbidden"):
-        for place in ((), ("backbone_config",)):
-            with watched(tmp_path / "forbidden") as happened:
-                path.write_text(json.dumps(_with(honest, place, attack)))
-                networks.imported(tmp_path / "net")
-                inner = ("config", "network", "config", *place)
-                torch.save(_with(content, inner, attack), checkpoint)
-                with pytest.raises(DataError, match=r"imported\.ckpt: found .*network\.config"):
-                    load_trained(checkpoint)
-            assert happened == [], attack
+        with watched(tmp_path / "forbidden") as happened:
+            path.write_text(json.dumps(_with(_with(honest, places[1], attack), (), attack)))
+            networks.imported(tmp_path / "net")
+            for place in places:
+                torch.save(_with(content, ("config", "network", "config", *place), attack), hostile)
+                with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
+                    load_trained(hostile)
+        assert happened == [], attack
 
 
 def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:

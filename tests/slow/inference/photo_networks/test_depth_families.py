@@ -53,3 +53,16 @@ def test_depth_of_a_panorama_is_that_of_the_exported_network(family: Any, tmp_pa
         found, near = again.depth(panorama), np.nanmax(1 / expected)
         np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
         np.testing.assert_allclose(1 / found, 1 / expected, rtol=1e-3, atol=1e-4 * near)
+
+
+_NOT_ONNX = (depth.zoedepth, depth.zoedepth_of_two)
+"""Networks that torch's exporter does not support."""
+
+
+def test_a_graph_that_the_exporter_specializes_is_for_one_size(tmp_path: Path) -> None:
+    """The size of the training, although the network takes others."""
+    saved(depth.depth_anything, tmp_path)
+    network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
+    trained = import_network(network, tmp_path / "net.ckpt")
+    assert (trained.size_multiple, trained.fixed_size) == (14, None)
+    assert export_network(trained, tmp_path / "net.onnx").trained.fixed_size == (70, 70)
