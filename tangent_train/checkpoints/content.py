@@ -33,6 +33,9 @@ ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "lab
   index K.
 """
 
+Align = Literal["none", "scale", "affine", "grid"]
+"""Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
+
 DepthKind = Literal[
     "log_distance",
     "metric_distance",

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import datamodules
-from tangent_train.checkpoints.content import DepthKind, ScoreKind
+from tangent_train.checkpoints.content import Align, DepthKind, ScoreKind
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.errors import DataError
 
@@ -73,9 +73,6 @@ def _check_class_map(name: str, value: Any) -> None:
         _check_exists(name, Path(value))
 
 
-Align = Literal["none", "scale", "affine", "grid"]
-OutputKind = Literal["labels", "color", "overlay", "probabilities", "depth", "points"]
-
 _EXISTS = {"check": _check_exists}
 _IMAGES = {"check": _check_pattern}
 _CLASS_MAP = {"check": _check_class_map}
@@ -122,7 +119,7 @@ class PredictSettings(InputSettings):
     min_confidence: float
     min_share: float
     align: Align | None
-    write: tuple[OutputKind, ...] | None
+    write: tuple[str, ...] | None
     depth_format: Literal["png", "npy", "exr"] | None
     points: int | None
     report: int

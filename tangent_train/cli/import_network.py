@@ -15,7 +15,7 @@ from rich.text import Text
 
 from tangent_train.checkpoints.content import DepthKind, ScoreKind
 from tangent_train.cli.command_settings import ImportSettings
-from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.cli.settings import check_new, check_unread, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.imports import elsewhere
@@ -71,7 +71,10 @@ def import_network(config: Mapping[str, Any]) -> None:
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings, config["normalization"])
-        _check_kind(settings, network)
+        if network.depth_kind is None:
+            check_unread(settings, "for networks of classes", depth=None)
+        else:
+            check_unread(settings, "for depth networks", **_OF_CLASSES)
         remarks = list(network.remarks)
         trained = photo_networks.import_network(
             network,
@@ -124,16 +127,6 @@ def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
         raise SettingError("network", found=name, expected=f"of {known}") from error
     section: Any = OmegaConf.to_container(config.section)
     return own_files.load_config(section, settings.weights, classes, normalization, depth)
-
-
-def _check_kind(settings: ImportSettings, network: PhotoNetwork) -> None:
-    """Refuse settings of depth networks for one that predicts classes, and the reverse."""
-    is_depth = network.depth_kind is not None
-    for name, default in (_OF_CLASSES if is_depth else {"depth": None}).items():
-        if (found := getattr(settings, name)) != default:
-            predicted = "depth" if is_depth else "classes"
-            expected = f"its default, because the network predicts {predicted}"
-            raise SettingError(name, found=found, expected=expected)
 
 
 def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.images.gpano import PanoramaArea
 from datamodules.images.masks import Masks
 from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
@@ -22,9 +21,7 @@ from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
 from tangent_train.cli.predict_kinds import (
     PREDICTIONS,
-    DepthPrediction,
-    LabelPrediction,
-    ReadsImage,
+    Prediction,
 )
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import check_unread, parse_settings
@@ -47,6 +44,9 @@ _DECISIVE = (
     "min_confidence", "min_share", "align", "depth_format", "points", "every",
 )  # fmt: skip
 """Settings that results depend on: resuming requires the same values."""
+
+_COUNTED_IMAGES = 32
+"""Images whose confidences are counted for `min_share`, at most."""
 
 _SAVED_EVERY_S = 10.0
 """Time between summaries: work that may be lost when a process is killed."""
@@ -77,7 +77,7 @@ def predict(config: Mapping[str, Any]) -> None:
     names = inputs.names()
     shown = [names[number] for number in evenly_spread(settings.report, len(names))]
     images = _Images(settings, prediction, folder, _depth_folder(settings, trained), shown)
-    prediction.prepare(partial(images.examples, inputs))
+    prediction.prepare(images.examples(inputs))
     if shard is None:
         done = _predict(settings, decisive, inputs, images, folder)
         _finish(settings, inputs, images, folder, done)
@@ -180,7 +180,7 @@ class _Images:
     def __init__(
         self,
         settings: PredictSettings,
-        prediction: LabelPrediction | DepthPrediction,
+        prediction: Prediction,
         folder: PredictionFolder,
         depth: DepthFolder | None,
         shown: Sequence[str],
@@ -189,34 +189,35 @@ class _Images:
         self._depth, self._masks = depth, Masks(settings.mask)
         self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
 
-    def examples(self, inputs: Inputs, count: int) -> tuple[int, Iterator[ReadsImage]]:
-        """Return at most `count` of all images: their number, and functions that read them."""
+    def examples(self, inputs: Inputs) -> Iterator[Callable[[], InputImage]]:
+        """Yield functions that read some of all images."""
         names = inputs.names()
-        chosen = {names[number] for number in evenly_spread(count, len(names))}
-        jobs = inputs.missing(set(names) - chosen)
-        return len(chosen), (partial(self.read, job) for job in jobs if not job.error)
+        chosen = {names[number] for number in evenly_spread(_COUNTED_IMAGES, len(names))}
+        print_text(f"Confidences are counted in {counted(len(chosen), 'images')}.")
+        for job in inputs.missing(set(names) - chosen):
+            if not job.error:
+                yield partial(self.read, job)
 
-    def read(self, job: Job) -> tuple[InputImage, PanoramaArea | None]:
-        """Read one image; return it with the area of a panorama, or with None for a photo."""
+    def read(self, job: Job) -> InputImage:
+        """Read one image."""
         settings, image = self._settings, job.path if job.value is None else job.value()
         stem = job.item.removesuffix(job.path.suffix)
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
-            return read_photo(image, settings.fov, depth), None
+            return read_photo(image, settings.fov, depth)
         return read_panorama(image, settings.area, settings.upright, depth)
 
     def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
         """Predict one image."""
-        image, area = job.value
-        return self._prediction(image, area, self._folder.files(job.item), progress)
+        return self._prediction(job.value, self._folder.files(job.item), progress)
 
     def write(self, job: Job) -> Entry:
         """Write the results of one image; return its entry in the summary."""
         predicted: PredictedImage = job.value
-        image, pixels, area = predicted.image, predicted.pixels, predicted.area
+        image, pixels, _ = predicted
         is_counted = np.array(True)
-        if area is not None:
-            is_counted = area.cut(self._masks.read(job.item, area)) > 0
+        if image.area is not None:
+            is_counted = image.cut(self._masks.read(job.item, image.area)) > 0
             unknown = pixels.dtype.type(self._folder.results.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         folder = self._folder.of_frames if is_video(job.path) else self._folder
@@ -246,8 +247,7 @@ class _Images:
         for job in inputs.missing(set(inputs.names()) - earlier):
             file = self._folder.files(job.item).get(results.source)
             if file is not None and not job.error:
-                image, area = self.read(job)
-                predicted = PredictedImage(image, results.read(file), area)
+                predicted = PredictedImage(self.read(job), results.read(file))
                 self._shown[job.item] = results.encode(job.item, predicted)
         others = [name for name in self._shown if name not in wanted]
         available = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
@@ -281,8 +281,7 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _check_videos(inputs: Inputs, folder: PredictionFolder) -> None:
-    results, source = folder.results, folder.results.source
-    pictures = set(results.pictures).intersection(folder.kinds)
+    source, pictures = folder.results.source, {*folder.kinds}.difference(folder.of_frames.kinds)
     if inputs.videos and pictures and source not in folder.kinds:
         raise SettingError(
             "write",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.images.gpano import PanoramaArea
 from tangent_train.checkpoints.distances import is_metric
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.confidences import class_thresholds, count_confidences
 from tangent_train.inference.depth import DepthPredictor
@@ -30,12 +29,6 @@ from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.depth_results import DepthResults
 from tangent_train.results.label_results import LabelResults
 from tangent_train.results.predictions import PredictedImage
-
-ReadsImage = Callable[[], tuple[InputImage, PanoramaArea | None]]
-"""Reads a panorama with its area, or a photo with None."""
-
-_COUNTED_IMAGES = 32
-"""Images whose confidences are counted for `min_share`, at most."""
 
 _OF_CLASSES = {"class_map": None, "unmapped": "unknown", "min_confidence": 0, "min_share": 0}
 _OF_DEPTH = {"align": None, "depth_format": None, "points": None}
@@ -78,65 +71,53 @@ class LabelPrediction:
         self._thresholds: NDArray[np.float64] | None = None
         self.results = LabelResults(self._trained.class_names)
 
-    def prepare(self, examples: Callable[[int], tuple[int, Iterator[ReadsImage]]]) -> None:
-        """Find the confidence that each class needs, see `min_share`; some images are predicted.
+    def prepare(self, examples: Iterable[Callable[[], InputImage]]) -> None:
+        """Find the confidence that each class needs, see `min_share`.
 
         Args:
-            examples: Function that returns at most a number of images: their number, and functions
-                that read them.
+            examples: Functions that read some of the images.
         """
         settings, names = self._settings, self._trained.class_names[1:]
         if not settings.min_share:
             return
         counts = np.zeros((len(names) + 1, 1), np.int64)
-        count, images = examples(_COUNTED_IMAGES)
-        print_text(f"Confidences are counted in {counted(count, 'images')}.")
-        for read in images:
+        for read in examples:
             with suppress(DataError, SettingError):  # reported when the image is labeled
-                image, area = read()
-                _, scores = self._scores(image, area)
-                maps: list[Any] = [self._trained.labels(scores.labels()), scores.confidences()]
-                labels, confidences = maps if area is None else [area.cut(m) for m in maps]
-                counts = counts + count_confidences(labels, confidences, len(names))
+                image, scores = self._scores(read())
+                labels = self._trained.labels(scores.labels())
+                maps = image.cut(labels), image.cut(scores.confidences())
+                counts = counts + count_confidences(*maps, len(names))
         self._thresholds = class_thresholds(counts, settings.min_confidence, settings.min_share)
         least = zip(names, self._thresholds[1:], strict=True)
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
         print_text(f"Smallest confidence of each class: {listed}.")
 
     def __call__(
-        self,
-        image: InputImage,
-        area: PanoramaArea | None,
-        files: Mapping[str, Path],
-        progress: Callable[[float], object],
+        self, image: InputImage, files: Mapping[str, Path], progress: Callable[[float], object]
     ) -> PredictedImage:
         """Predict the labels of one image; write its probabilities if `files` contains them.
 
         Args:
-            image: Panorama of the whole sphere, or photo.
-            area: Part of the sphere to predict; None for photos.
+            image: Panorama or photo.
             files: Files of the image by kind of output.
             progress: See `Predictor.predict`.
         """
-        image, scores = self._scores(image, area, progress)
+        image, scores = self._scores(image, progress)
         if "probabilities" in files:
             # Not written in another thread: scores take much memory.
-            self.results.write_probabilities(files["probabilities"], scores, area)
+            self.results.write_probabilities(files["probabilities"], scores, image.area)
         labels = self._trained.labels(scores.labels())
         if self._thresholds is not None:
             is_sure = scores.confidences() >= self._thresholds[labels]
             labels = np.where(is_sure, labels, labels.dtype.type(0))
-        return PredictedImage(image, labels if area is None else area.cut(labels), area)
+        return PredictedImage(image, image.cut(labels))
 
     def _scores(
-        self,
-        image: InputImage,
-        area: PanoramaArea | None,
-        progress: Callable[[float], object] = lambda share: None,
+        self, image: InputImage, progress: Callable[[float], object] = lambda share: None
     ) -> tuple[InputImage, ScoreMosaic]:
         """Predict the scores of one image; return it with its up direction."""
         settings = self._settings
-        if settings.upright == "auto" and area is not None:
+        if settings.upright == "auto":
             image = with_up(image, settings.max_tilt_deg, self._judge)
         keeps_sums = settings.min_share > 0 or "probabilities" in (settings.write or ())
         return image, self._predictor.predict(image, progress, probabilities=keeps_sums)
@@ -164,25 +145,23 @@ class DepthPrediction:
             points=settings.points,
         )
 
-    def prepare(self, examples: Callable[[int], Any]) -> None:
+    def prepare(self, examples: Iterable[Callable[[], InputImage]]) -> None:
         """Do nothing."""
 
     def __call__(
-        self,
-        image: InputImage,
-        area: PanoramaArea | None,
-        files: Mapping[str, Path],
-        progress: Callable[[float], object],
+        self, image: InputImage, files: Mapping[str, Path], progress: Callable[[float], object]
     ) -> PredictedImage:
         """Predict the depth of one image, see `DepthResults`."""
         found = self._predictor.predict(image, progress)
         depth = found.depth(image.camera_matrix).cpu().numpy()
         report = asdict(found.report)
         facts = {name: len(v) if isinstance(v, tuple) else v for name, v in report.items()}
-        return PredictedImage(image, depth if area is None else area.cut(depth), area, facts)
+        return PredictedImage(image, image.cut(depth), facts)
 
 
-PREDICTIONS: Mapping[str, type[LabelPrediction | DepthPrediction]] = {
+Prediction = LabelPrediction | DepthPrediction
+
+PREDICTIONS: dict[str, type[Prediction]] = {
     PIXEL_CLASSES: LabelPrediction,
     DISTANCE: DepthPrediction,
 }

@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 import torch
@@ -31,7 +31,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
@@ -39,9 +39,6 @@ from tangent_train.rendering.accumulate import NO_OWNERS
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.sampling import image_taps, sample
-
-Align = Literal["none", "scale", "affine", "grid"]
-"""Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.errors import SettingError, at_least
-from tangent_train.inference.alignment import Align
 from tangent_train.inference.depth import combine_depth
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
 from tangent_train.rendering.backward import tangent_to_equirect

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import torch
 
+from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.geometry import (
     equirect_solid_angles,
@@ -15,8 +16,8 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     ray_lengths,
 )
-from tangent_train.inference.alignment import Align, lattice, sample_views, sphere_points
 from tangent_train.inference.alignment import align as align_views
+from tangent_train.inference.alignment import lattice, sample_views, sphere_points
 from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic

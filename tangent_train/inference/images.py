@@ -53,7 +53,7 @@ class InputImage:
             from the center in panoramas, and z-depth in photos.
         up: ``(3,)`` direction of the zenith in a panorama; None if it is z.
         camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers; None for panoramas.
-        area: The part of the sphere that a panorama shows; it is black elsewhere. None for all.
+        area: The part of the sphere that a panorama shows; it is black elsewhere. None for photos.
     """
 
     rgb: NDArray[np.uint8]
@@ -66,6 +66,10 @@ class InputImage:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.rgb.shape[0], self.rgb.shape[1]
+
+    def cut(self, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Cut pixels ``(H, W[, C])`` to the area of a partial panorama."""
+        return pixels if self.area is None else self.area.cut(pixels)
 
     def resized(self, shape: tuple[int, int]) -> InputImage:
         """Return the image resized as in training; depth is not averaged."""
@@ -117,7 +121,7 @@ def read_panorama(
     angles: Sequence[float] | None = None,
     upright: Upright = None,
     depth: DepthOfSize | None = None,
-) -> tuple[InputImage, PanoramaArea]:
+) -> InputImage:
     """Read a panorama of the whole sphere or a part of it.
 
     Args:
@@ -128,7 +132,7 @@ def read_panorama(
         depth: Function that returns its depth.
 
     Returns:
-        An image of the whole sphere, black outside the area of the panorama; and that area.
+        An image of the whole sphere, black outside its area.
 
     Raises:
         DataError: A file cannot be used, or the image is not a whole panorama.
@@ -143,7 +147,7 @@ def read_panorama(
     steps = None if depth is None else depth(size)
     up = None if upright is None or path is None else read_up(path)
     placed = None if steps is None else area.place(steps)
-    return InputImage(area.place(rgb), placed, up, area=area), area
+    return InputImage(area.place(rgb), placed, up, area=area)
 
 
 def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:

@@ -18,9 +18,9 @@ from datamodules.core.panoramas import meters_to_steps
 from datamodules.images.gpano import Fill
 from datamodules.images.masks import Mask, Masks
 from datamodules.images.palette import class_colors
+from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
-from tangent_train.inference.alignment import Align
 from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
@@ -308,7 +308,7 @@ class Network:
                     expected="auto or None: only files have GPano tags",
                     remedy="Give the path of the panorama.",
                 )
-        panorama, _ = read_panorama(image, area, upright, of_size)
+        panorama = read_panorama(image, area, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._judge)
         return self._panoramas.predict(panorama, **settings), panorama

@@ -10,8 +10,7 @@ import numpy as np
 from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
-from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz, ray_lengths
-from tangent_train.results.html import EncodedImage, encode_image
+from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
 from tangent_train.results.pictures import colorize_distance, distance_limits, distance_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
 from tangent_train.results.tables import Table
@@ -44,8 +43,8 @@ _ROWS = {
 def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
     """Return known pixels, evenly spread over the solid angle that they cover.
 
-    Pixels are passed row by row. One is taken each time their solid angle has grown by a
-    `count`-th of the sum (systematic sampling).
+    Row by row, a pixel is taken each time the solid angle has grown by a `count`-th of the sum
+    (systematic sampling).
 
     Args:
         predicted: Image with its depth.
@@ -54,15 +53,10 @@ def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
     Returns:
         ``(2, n)`` rows and columns of the depth map.
     """
-    known, chosen, seen = np.isfinite(predicted.pixels), [], 0.0
-    total = sum(w @ k for w, k in zip(solid_angles(predicted), known, strict=True)) or 1.0
-    for row, weights in enumerate(solid_angles(predicted)):
-        columns = np.flatnonzero(known[row])
-        grown = np.cumsum([seen, *weights[columns]])
-        taken = columns[np.diff(np.floor(grown * (count / total))) > 0]
-        chosen.append(np.stack([np.full_like(taken, row), taken]))
-        seen = grown[-1]
-    return np.concatenate(chosen, axis=1)
+    grown = np.cumsum(np.where(np.isfinite(predicted.pixels), solid_angles(predicted), 0))
+    steps = np.floor(grown * (count / (grown[-1] or 1)))
+    chosen = np.flatnonzero(np.diff(steps, prepend=0) > 0)
+    return np.stack(np.unravel_index(chosen, predicted.pixels.shape))
 
 
 def points_of(
@@ -78,10 +72,10 @@ def points_of(
         Points in right-handed axes, as other programs expect: of panoramas x ahead (the middle of
         the panorama), y to the left, z up; of photos x to the right, y down, z ahead.
     """
-    image, depth, area = predicted.image, predicted.pixels[tuple(pixels)], predicted.area
-    rows, columns = pixels
-    if area is not None:
-        rows, columns = (places[index] for places, index in zip(area.places(), pixels, strict=True))
+    image, depth, (rows, columns) = predicted.image, predicted.pixels[tuple(pixels)], pixels
+    if image.area is not None:
+        of_rows, of_columns = image.area.places()
+        rows, columns = of_rows[rows], of_columns[columns]
         lonlat_rad = equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape)
         rays = lonlat_to_xyz(lonlat_rad) @ FLIP_Y
     else:
@@ -107,8 +101,6 @@ class DepthResults(ImageResults):
     """
 
     summary = "depth"
-    usual = ("depth", "color")
-    pictures = ("color",)
     unknown = math.nan
     columns = ("unit", *_ROWS)
 
@@ -123,7 +115,7 @@ class DepthResults(ImageResults):
             raise SettingError("depth_scale", found=depth_scale, expected="more than 0")
         self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
         self._points = _POINTS if points is None else at_least("points", points, 1)
-        self._is_metric = is_metric
+        self.is_metric = is_metric
         self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
@@ -131,9 +123,8 @@ class DepthResults(ImageResults):
         if "depth" in files:
             write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
         if "color" in files:
-            write_pixels(
-                files["color"], distance_picture(predicted.pixels, "m" if self._is_metric else "")
-            )
+            picture = distance_picture(predicted.pixels, "m" if self.is_metric else "")
+            write_pixels(files["color"], picture)
         if "points" in files:
             from trimesh import PointCloud  # half a second
 
@@ -155,13 +146,13 @@ class DepthResults(ImageResults):
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return unit, shares of the solid angle, distances, range of the colors, alignment."""
-        depth, shares = predicted.pixels, np.zeros(3)
-        counts = np.broadcast_to(is_counted, depth.shape)
-        for line, weights, counted in zip(depth, solid_angles(predicted), counts, strict=True):
-            shares += np.stack([counted, np.isfinite(line), line > self._most]) @ weights
-        known, too_far = shares[1:] / (shares[0] or 1)
+        depth, angles = predicted.pixels, solid_angles(predicted)
+        total = np.sum(angles, where=is_counted) or 1
+        known, too_far = (
+            np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
+        )
         facts = {"known": known, "too_far": too_far, **predicted.facts}
-        summary: dict[str, Any] = {"unit": "m" if self._is_metric else "relative"}
+        summary: dict[str, Any] = {"unit": "m" if self.is_metric else "relative"}
         if known:
             median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
             facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
@@ -173,21 +164,11 @@ class DepthResults(ImageResults):
 
     def table(self, entries: Sequence[Entry]) -> Table:
         """Return the means of the summaries over the images."""
-        rows, unit = [], ", m" if self._is_metric else ""
+        rows, unit = [], ", m" if self.is_metric else ""
         for name, title in _ROWS.items():
             values = [v for e in entries if (v := e["depth"].get(name)) is not None]
             if any(values):
                 mean = np.mean(values) * (100 if "%" in title else 1)
                 rows.append([title.format(unit=unit), f"{mean:.3g}"])
-        kind = "depth in meters" if self._is_metric else "relative depth: the median is 1"
+        kind = "depth in meters" if self.is_metric else "relative depth: the median is 1"
         return Table(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
-
-    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
-        """Compress an image with its distances."""
-        image, distance, area, _ = predicted
-        if area is not None:
-            distance = area.place(distance)  # 0 outside: unknown
-        elif image.camera_matrix is not None:
-            distance = distance * ray_lengths(image.camera_matrix, distance.shape)
-        how: dict[str, Any] = {"is_metric": self._is_metric, "camera_matrix": image.camera_matrix}
-        return encode_image(name, image.rgb, distance=distance, sphere=area is not None, **how)

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.folder.classes import UNKNOWN_NAME
-from datamodules.images.image_files import composed
 from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
-from tangent_train.files import write_text
-from tangent_train.results.html import EncodedImage, encode_image
 from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
 from tangent_train.results.tables import Table, percent
@@ -60,34 +55,22 @@ class LabelResults(ImageResults):
     """
 
     summary = "classes"
-    usual = ("labels", "color", "overlay")
-    pictures = ("color", "overlay")
+    suffixes = dict.fromkeys(("labels", "color", "overlay"), ".png") | {"probabilities": ".npy"}
     unknown = 0
 
     def __init__(self, class_names: Sequence[str]) -> None:
         self.class_names = self.columns = class_names
-        pictures = dict.fromkeys(("labels", "color", "overlay"), ".png")
-        self.suffixes = pictures | {"probabilities": ".npy"}
-
-    def write_description(self, folder: Path) -> None:
-        """Write ``classes.json`` (labels by name), without classes that are called unknown."""
-        labels: dict[str, list[int]] = {}
-        for label, name in enumerate(map(composed, self.class_names)):
-            if name != UNKNOWN_NAME:
-                labels.setdefault(name, []).append(label)
-        lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
-        write_text(folder / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write labels and pictures."""
-        image, labels, area, _ = predicted
+        image, labels, _ = predicted
         if "labels" in files:
             write_pixels(files["labels"], labels)
         if "color" in files:
             write_pixels(files["color"], colorize(labels, len(self.class_names)))
         if "overlay" in files:
-            rgb = image.rgb if area is None else area.cut(image.rgb)
-            write_pixels(files["overlay"], overlay_picture(rgb, labels, self.class_names))
+            picture = overlay_picture(image.cut(image.rgb), labels, self.class_names)
+            write_pixels(files["overlay"], picture)
 
     def write_probabilities(
         self, file: Path, scores: ScoreMosaic, area: PanoramaArea | None = None
@@ -130,9 +113,3 @@ class LabelResults(ImageResults):
         seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
         rows = [[name, percent(mean[name])] for name in seen]
         return Table("Mean over the images", ["class", "solid angle, %"], rows)
-
-    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
-        """Compress an image with its labels."""
-        (image, labels, area, _), count = predicted, len(self.class_names)
-        placed = labels if area is None else area.place(labels)
-        return encode_image(name, image.rgb, count, prediction=placed, sphere=area is not None)

@@ -13,26 +13,28 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
+from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.images.image_files import composed
 from datamodules.images.videos import write_video
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
-from tangent_train.results.html import EncodedImage, write_report
+from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator, Mapping, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from datamodules.images.gpano import PanoramaArea
     from tangent_train.inference.images import InputImage
 
     Painter = Callable[[NDArray[np.uint8], NDArray[Any]], NDArray[np.uint8]]
     """Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
 
-_SUMMARY, _CLASSES = "summary.json", "classes.json"
-_FILES = (_SUMMARY, _CLASSES, "summary.csv", "report.html", "shards")
+_SUMMARY = "summary.json"
+_FILES = (_SUMMARY, "classes.json", "summary.csv", "report.html", "shards")
+_PICTURES = ("color", "overlay")  # of the frames of a video: videos
 _FOLDERS = ("labels", "color", "overlay", "probabilities", "depth", "points")
 
 Entry = dict[str, Any]
@@ -55,29 +57,27 @@ class PredictedImage(NamedTuple):
 
     Attributes:
         image: Photo, or image of the whole sphere.
-        pixels: Prediction ``(h, w)`` for the image, or for its area; see `ImageResults`.
-        area: Part of the sphere that the prediction covers; None for photos.
+        pixels: Prediction ``(h, w)`` for the area of the image; see `ImageResults`.
         facts: Further facts about the prediction, for its summary.
     """
 
     image: InputImage
     pixels: NDArray[Any]
-    area: PanoramaArea | None = None
     facts: Mapping[str, Any] = MappingProxyType({})
 
 
-def solid_angles(predicted: PredictedImage) -> Iterator[NDArray[np.float64]]:
-    """Yield the relative solid angles of the pixels row by row, which saves memory.
+def solid_angles(predicted: PredictedImage) -> NDArray[np.floating]:
+    """Return the relative solid angles ``(h, w)`` of the pixels.
 
     A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
     """
-    image, (height, width) = predicted.image, predicted.pixels.shape
-    if image.camera_matrix is None:
-        rows = equirect_solid_angles((image.rgb.shape[0], image.rgb.shape[1])).ravel()
-        for weight in rows if predicted.area is None else rows[predicted.area.places()[0]]:
-            yield np.full(width, weight)
-        return
-    yield from ray_lengths(image.camera_matrix, (height, width)) ** -3.0
+    image, shape = predicted.image, predicted.pixels.shape
+    if image.camera_matrix is not None:
+        return ray_lengths(image.camera_matrix, shape) ** -3.0
+    of_rows = equirect_solid_angles(image.shape)[:, None]
+    if image.area is not None:
+        of_rows = of_rows[image.area.places()[0]]
+    return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory
 
 
 class ImageResults(ABC):
@@ -86,21 +86,19 @@ class ImageResults(ABC):
     Attributes:
         summary: Name of the summary of an image in its `Entry`.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
-            predicted pixels, from which pictures are made.
-        usual: Kinds that are written by default.
-        pictures: Kinds that are videos for the frames of a video.
+            predicted pixels, from which pictures are made. All but the last are usual.
         unknown: Value of unknown pixels.
         columns: Names in the summary of an image that ``summary.csv`` lists.
         class_names: Names of the labels; empty without classes.
+        is_metric: False for depth that is known up to a scale.
     """
 
     summary: ClassVar[str]
     suffixes: Mapping[str, str]
-    usual: ClassVar[Sequence[str]]
-    pictures: ClassVar[Sequence[str]]
     unknown: ClassVar[float]
     columns: Sequence[str]
     class_names: Sequence[str] = ()
+    is_metric: bool = True
 
     def kinds(self, write: Sequence[str] | None) -> Sequence[str]:
         """Return the kinds of output of the setting `write`.
@@ -114,15 +112,12 @@ class ImageResults(ABC):
                 found=", ".join(sorted(foreign)),
                 expected=f"{', '.join(self.suffixes)} for a network that predicts {self.source}",
             )
-        return self.usual if write is None else write
+        return list(self.suffixes)[:-1] if write is None else write
 
     @property
     def source(self) -> str:
         """Kind of output that holds the predicted pixels."""
         return next(iter(self.suffixes))
-
-    def write_description(self, folder: Path) -> None:  # noqa: B027, most have none
-        """Write files that describe the predictions of all images."""
 
     @abstractmethod
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
@@ -137,7 +132,7 @@ class ImageResults(ABC):
         """Return a function that paints the frames of a video.
 
         Args:
-            kind: One of `pictures`.
+            kind: ``color`` or ``overlay``.
             entries: Entries of all frames of the video.
         """
 
@@ -154,9 +149,18 @@ class ImageResults(ABC):
     def table(self, entries: Sequence[Entry]) -> Table:
         """Return a table of the summaries of all images."""
 
-    @abstractmethod
     def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
         """Compress an image for the report, to 0.1 to a few megabytes."""
+        image, pixels, _ = predicted
+        return encode_image(
+            name,
+            image.rgb,
+            len(self.class_names),
+            prediction=pixels if image.area is None else image.area.place(pixels),
+            is_metric=self.is_metric,
+            camera_matrix=image.camera_matrix,
+            sphere=image.camera_matrix is None,
+        )
 
 
 @dataclass(frozen=True)
@@ -239,7 +243,7 @@ class PredictionFolder:
     @property
     def of_frames(self) -> PredictionFolder:
         """The same folder for frames of a video, without pictures, which become videos."""
-        return replace(self, kinds=[k for k in self.kinds if k not in self.results.pictures])
+        return replace(self, kinds=[kind for kind in self.kinds if kind not in _PICTURES])
 
     def write_videos(
         self,
@@ -269,14 +273,14 @@ class PredictionFolder:
             file = self.of_frames.files(frame_name(name, number))[self.results.source]
             return paint(rgb, self.results.read(file))
 
-        for kind in self.results.pictures:
+        for kind in _PICTURES:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and (again or not file.exists()):
                 paint = self.results.painter(kind, entries)
                 write_video(file, path, size, partial(painted, paint), every)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
-        """Write ``summary.json``, ``summary.csv`` and the description of the predictions.
+        """Write ``summary.json``, ``summary.csv`` and, for labels, ``classes.json``.
 
         ``summary.json`` is the first file in a folder, so that a killed prediction can be
         continued.
@@ -287,7 +291,8 @@ class PredictionFolder:
         """
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
-        self.results.write_description(self.path)
+        if self.results.class_names:
+            write_text(self.path / "classes.json", _labels_by_name(self.results.class_names))
         columns, names = ("file", "rows", "columns"), dict.fromkeys(self.results.columns)
         summaries = (entry.get(self.results.summary, {}) for entry in entries)
         rows = [
@@ -298,7 +303,7 @@ class PredictionFolder:
 
     def remove_summary(self) -> None:
         """Remove the files of `write_summary`, so that the command can be repeated."""
-        for name in ("summary.csv", _CLASSES, _SUMMARY):
+        for name in ("summary.csv", "classes.json", _SUMMARY):
             (self.path / name).unlink(missing_ok=True)
         with suppress(OSError):  # the folder has other files
             self.path.rmdir()
@@ -324,3 +329,13 @@ class PredictionFolder:
             class_names=self.results.class_names,
             notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
         )
+
+
+def _labels_by_name(class_names: Sequence[str]) -> str:
+    """Return JSON of the labels by name, without classes that are called unknown."""
+    labels: dict[str, list[int]] = {}
+    for label, name in enumerate(map(composed, class_names)):
+        if name != UNKNOWN_NAME:
+            labels.setdefault(name, []).append(label)
+    lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
+    return "{\n" + ",\n".join(lines) + "\n}\n"

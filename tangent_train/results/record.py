@@ -73,13 +73,10 @@ def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
         headings: Headings of scores by pixels.
     """
     return dict(headings) | {
-        name + SOLID_ANGLE: Heading(
-            f"{heading.text} by solid angle",
-            heading.unit,
-            heading.of_class and heading.of_class + SOLID_ANGLE,
-            heading.class_text and f"{heading.class_text} by solid angle",
-            heading.better,
-            heading.is_main,
+        name + SOLID_ANGLE: heading._replace(
+            text=f"{heading.text} by solid angle",
+            of_class=heading.of_class and heading.of_class + SOLID_ANGLE,
+            class_text=heading.class_text and f"{heading.class_text} by solid angle",
         )
         for name, heading in headings.items()
     }

@@ -16,7 +16,7 @@ from torch.nn import functional
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,
@@ -27,7 +27,6 @@ from tangent_train.checkpoints.distances import (
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
-from tangent_train.inference.alignment import Align
 from tangent_train.inference.depth import combine_depth
 from tangent_train.inference.engine import view_scores
 from tangent_train.metrics.depth import (
@@ -331,8 +330,8 @@ class DepthTask(ViewsTask):
         return encode_image(
             name,
             arrays[0],
-            distance=arrays[2],
-            true_distance=arrays[1],
+            prediction=arrays[2],
+            truth=arrays[1],
             sphere=target.ndim == _PANORAMA_DIMENSIONS,
             note=f"AbsRel {scores['absrel']:.3g}",
         )

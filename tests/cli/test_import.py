@@ -189,43 +189,35 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
 
 # Depth.
 
-OF_DEPTH = ("network=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx")
+OF_DEPTH = (
+    *("network=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx"),
+    "depth=metric_z",
+)
 
 
 @pytest.mark.parametrize("squeezed", [True, False])
-def test_an_onnx_file_predicts_depth(squeezed: bool, here: Path, run: Run, capsys: Capture) -> None:
-    """Its output is ``(B, h, w)`` or ``(B, 1, h, w)``."""
+def test_an_onnx_file_predicts_depth(
+    squeezed: bool, here: Path, run: Run, predict: Predict, capsys: Capture
+) -> None:
+    """Its output is ``(B, h, w)`` or ``(B, 1, h, w)``; predictions are resumed."""
     after = [helper.make_node("Squeeze", ["linear", "axes"], ["scores"])] if squeezed else []
     axes = {"axes": np.array([1])} if squeezed else {}
     write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32), *after, **axes)
-    run("import", *OF_DEPTH, "depth=metric_z", "image_size=32")
+    run("import", *OF_DEPTH, "image_size=32")
     printed = capsys.readouterr().out
     assert "depth: metric_z\nthe network returns z-depth in meters\n" in printed
     assert "panoramas: 16 views of 32 × 32 (130° wide" in printed
     assert printed.splitlines()[-1].startswith("panoramas"), "no remarks"
     trained = load_trained(here / "ours.onnx")
-    assert (trained.depth_kind, trained.predicts, trained.class_names) == (
-        "metric_z",
-        "distance",
-        (),
-    )
+    found = trained.depth_kind, trained.predicts, trained.class_names
+    assert found == ("metric_z", "distance", ())
     images = torch.rand(2, 3, 32, 32)
     torch.testing.assert_close(trained.network(images), 1 + images.sum(1, keepdim=True))
-
-
-def test_depth_of_an_import_is_predicted_and_resumed(
-    here: Path, run: Run, predict: Predict, capsys: Capture
-) -> None:
-    write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32))
-    run("import", *OF_DEPTH, "depth=metric_z", "image_size=32")
     rgb = _write_room()
-    settings = {"checkpoint": "ours.onnx", "output": "out", "depth_format": "npy", "report": 0}
-    predict(**settings, input="room.png", write="[depth]")
-    found = np.load("out/depth/room.npy")
-    assert 1 < np.nanmin(found) < np.nanmax(found)
-    np.testing.assert_array_equal(found, tt.load("ours.onnx").depth(rgb))
-    capsys.readouterr()
-    predict(**settings, input="room.png", write="[depth]", resume="true")
+    settings = {"checkpoint": "ours.onnx", "input": "room.png", "depth_format": "npy", "report": 0}
+    predict(**settings, write="[depth]")
+    np.testing.assert_array_equal(np.load("out/depth/room.npy"), tt.load("ours.onnx").depth(rgb))
+    predict(**settings, write="[depth]", resume="true")
     assert "1 image, 1 done already" in capsys.readouterr().out
 
 
@@ -250,28 +242,17 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
 @pytest.mark.parametrize(
     ("given", "message"),
     [
+        ((*OF_DEPTH, "unknown_classes=[sky]"), r"unknown_classes: .*expected \(\) for depth"),
+        ((*OF_DEPTH, "unknown_wins=false"), "unknown_wins: .*expected True for depth networks"),
+        ((*OF_DEPTH[:-1], "depth=meters"), "depth: found meters; expected .*metric_z"),
+        ((*OF_ONNX, "output=o.onnx", "depth=metric_z"), "classes: .*expected null for depth"),
         (
-            (*OF_DEPTH, "depth=metric_z", "classes=classes.json"),
-            "classes: found classes.json; .*de",
-        ),
-        ((*OF_DEPTH, "depth=metric_z", "unknown_classes=[sky]"), "unknown_classes: found .*depth"),
-        ((*OF_DEPTH, "depth=metric_z", "unknown_wins=false"), "unknown_wins: found False; .*depth"),
-        ((*OF_DEPTH, "depth=metric_z", "scores=logits"), "scores: found logits; .*predicts depth"),
-        ((*OF_DEPTH, "depth=meters"), "depth: found meters; expected .*metric_z"),
-        ((*OF_ONNX, "output=ours.onnx", "depth=metric_z"), "classes: found classes.json"),
-        (
-            (
-                "network=onnx",
-                "file=net.onnx",
-                "normalization=unit",
-                "output=o.onnx",
-                "depth=metric_z",
-            ),
+            ("network=onnx", "file=net.onnx", *OF_DEPTH[2:]),
             "found 4 per pixel, .*Leave out depth=",
         ),
         (
             (*TORCHVISION, "model=lraspp_mobilenet_v3_large", "weights=s.pt", "depth=metric_z"),
-            "depth",
+            "depth: found metric_z; expected null for networks of classes",
         ),
     ],
 )
@@ -282,9 +263,6 @@ def test_settings_of_depth_and_of_classes_exclude_each_other(
     if "network=torchvision" in given:
         network = torchvision_models.get_model("lraspp_mobilenet_v3_large", weights_backbone=None)
         torch.save(network.state_dict(), here / "s.pt")
-        message = (
-            "depth: found metric_z; expected its default, because the network predicts classes"
-        )
     with pytest.raises(SystemExit, match=message):
         run("import", *given)
 

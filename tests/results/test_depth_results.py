@@ -26,7 +26,7 @@ RNG = np.random.default_rng(0)
 
 def _panorama(depth: NDArray[np.float32]) -> PredictedImage:
     rgb = RNG.integers(0, 256, (*depth.shape, 3), np.uint8)
-    return PredictedImage(InputImage(rgb), depth, whole_area(Path("a"), depth.shape))
+    return PredictedImage(InputImage(rgb, area=whole_area(Path("a"), depth.shape)), depth)
 
 
 def test_points_are_evenly_spread_over_the_sphere() -> None:
@@ -41,33 +41,22 @@ def test_points_are_evenly_spread_over_the_sphere() -> None:
             assert share == pytest.approx(expected, rel=0.05 if angle == 10 else 0.01)
 
 
-def test_points_are_directions_times_distance_without_unknown_pixels() -> None:
-    depth = RNG.uniform(0.5, 9, (20, 40)).astype(np.float32)
-    depth[RNG.random(depth.shape) < 0.3] = np.nan
-    image = _panorama(depth)
-    rows, columns = pixels = spread_pixels(image, 10**6)
-    assert not np.isnan(depth[rows, columns]).any()
-    assert len(set(zip(rows, columns, strict=True))) == len(rows)
-    points, colors = points_of(image, pixels)
-    expected = equirect_directions((20, 40)) * depth[..., None].astype(np.float64) * (1, -1, 1)
-    np.testing.assert_allclose(points, expected[rows, columns], atol=1e-12)
-    np.testing.assert_array_equal(colors, image.image.rgb[rows, columns])
-    (right,), _ = points_of(image._replace(pixels=np.full_like(depth, 2)), np.array([[10], [30]]))
-    np.testing.assert_allclose(right, [0, -2, 0], atol=0.2)  # ahead, left, up
-    empty = image._replace(pixels=np.full_like(depth, np.nan))
-    assert spread_pixels(empty, 100).shape == (2, 0)
-
-
-def test_points_of_a_part_and_of_a_photo() -> None:
+def test_points_are_rays_times_depth_without_unknown_pixels() -> None:
     """A part across the seam has its place on the sphere; a photo is in camera axes, z ahead."""
     rgb = RNG.integers(0, 256, (64, 128, 3), np.uint8)
-    area = area_of_angles((16, 32), [135, -135, 0, 45])
-    part = PredictedImage(InputImage(rgb), np.full((16, 32), 2, np.float32), area)
-    points, colors = points_of(part, np.array([[0, 15], [0, 31]]))
-    rows, columns = [16, 31], [112, 15]
-    expected = 2 * equirect_directions((64, 128))[rows, columns] * (1, -1, 1)
-    np.testing.assert_allclose(points, expected)
-    np.testing.assert_array_equal(colors, rgb[rows, columns])
+    depth = RNG.uniform(0.5, 9, (16, 32)).astype(np.float32)
+    depth[RNG.random(depth.shape) < 0.3] = np.nan
+    area = area_of_angles(depth.shape, [135, -135, 0, 45])
+    part = PredictedImage(InputImage(rgb, area=area), depth)
+    rows, columns = pixels = spread_pixels(part, 10**6)
+    assert np.isfinite(depth).sum() == len(rows) == len({*zip(rows, columns, strict=True)})
+    assert np.isfinite(depth[rows, columns]).all()
+    points, colors = points_of(part, pixels)
+    place = 16 + rows, (112 + columns) % 128
+    ahead_left_up = equirect_directions((64, 128))[place] * (1, -1, 1)
+    np.testing.assert_allclose(points, ahead_left_up * depth[rows, columns, None], rtol=1e-6)
+    np.testing.assert_array_equal(colors, rgb[place])
+    assert spread_pixels(part._replace(pixels=np.full_like(depth, np.nan)), 100).shape == (2, 0)
     camera = camera_matrix_from_fov(90.0, (64, 128))
     photo = PredictedImage(InputImage(rgb, camera_matrix=camera), np.full((64, 128), 3.0))
     points, _ = points_of(photo, np.array([[0], [127]]))

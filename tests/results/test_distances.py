@@ -57,7 +57,7 @@ def test_points_of_a_panorama_lie_on_the_walls_of_the_room(tmp_path: Path) -> No
     truth = np.where(directions[..., 2] > 0.9, np.nan, 1.1 * distance)
     truth[0, :3] = 0, np.inf, -1
     maps = {"prediction": distance, "truth": truth}
-    image = on_page(tmp_path, "room", rgb_of(SIZE), distance=distance, true_distance=truth)
+    image = on_page(tmp_path, "room", rgb_of(SIZE), prediction=distance, truth=truth)
     precision = (image["scale"]["far"] / image["scale"]["near"]) ** (1 / 131068) * (1 + 1e-6)
     assert precision < 1 + 2e-5
     for kind, exact in maps.items():
@@ -76,11 +76,10 @@ def test_a_photo_shows_z_depth_and_its_points_lie_on_a_wall(tmp_path: Path) -> N
     matrix = camera_matrix_from_fov(70.0, small)
     normal = np.array([0, np.sin(np.radians(30)), np.cos(np.radians(30))])
     directions = perspective_directions(matrix, small)
-    distance = 2 / (directions @ normal)
+    z_depth = 2 / (directions @ normal) * directions[..., 2]
     shown = {"camera_matrix": camera_matrix_from_fov(70.0, size), "sphere": False}
-    image = on_page(tmp_path, "photo", rgb_of(size), distance=distance, is_metric=False, **shown)
-    z_depth = unpacked(image, "prediction")
-    np.testing.assert_allclose(z_depth, distance * directions[..., 2], rtol=2e-5)
+    image = on_page(tmp_path, "photo", rgb_of(size), prediction=z_depth, is_metric=False, **shown)
+    np.testing.assert_allclose(unpacked(image, "prediction"), z_depth, rtol=2e-5)
     fx, fy, cx, cy = image["scale"]["camera"]
     u, v = np.meshgrid((np.arange(40) + 0.5) / 40, (np.arange(30) + 0.5) / 30)
     rays = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones(small)], axis=-1)
@@ -90,16 +89,9 @@ def test_a_photo_shows_z_depth_and_its_points_lie_on_a_wall(tmp_path: Path) -> N
     assert not image["scale"]["is_metric"]
 
 
-def test_without_a_camera_a_photo_shows_distances_and_no_points(tmp_path: Path) -> None:
-    distance = np.linspace(1, 2, 48).reshape(6, 8)
-    image = on_page(tmp_path, "photo", rgb_of((6, 8)), distance=distance, sphere=False)
-    np.testing.assert_allclose(unpacked(image, "prediction"), distance, rtol=1e-5)
-    assert image["scale"]["camera"] is None
-
-
 @pytest.mark.parametrize("value", [np.nan, 3.0])
 def test_maps_without_distances_and_of_one_distance_are_shown(value: float, tmp_path: Path) -> None:
-    image = on_page(tmp_path, "wall", rgb_of(SIZE), distance=np.full(SIZE, value))
+    image = on_page(tmp_path, "wall", rgb_of(SIZE), prediction=np.full(SIZE, value))
     np.testing.assert_allclose(unpacked(image, "prediction"), value)
     assert image["scale"]["radius"] > 0
     assert image["scale"]["limits"][0] < image["scale"]["limits"][1]
@@ -109,15 +101,16 @@ def test_the_sky_does_not_move_the_scene_away(tmp_path: Path) -> None:
     directions = equirect_directions(SIZE)
     distance = np.linalg.norm(exit_points(np.zeros(3), directions), axis=-1)
     distance[:30] = 5000
-    scale = on_page(tmp_path, "street", rgb_of(SIZE), distance=distance)["scale"]
+    scale = on_page(tmp_path, "street", rgb_of(SIZE), prediction=distance)["scale"]
     assert (scale["center"] > LOWEST - 0.1).all()
     assert (scale["center"] < HIGHEST + 0.1).all()
     assert scale["radius"] < 0.6 * np.linalg.norm(HIGHEST - LOWEST)
 
 
-def test_large_maps_are_shrunk(tmp_path: Path) -> None:
+def test_large_maps_without_a_camera_are_shrunk(tmp_path: Path) -> None:
     distance = np.repeat(np.linspace(1, 2, 4096)[None], 64, axis=0)
-    image = on_page(tmp_path, "large", rgb_of((64, 128)), distance=distance, sphere=False)
+    image = on_page(tmp_path, "large", rgb_of((64, 128)), prediction=distance, sphere=False)
+    assert image["scale"]["camera"] is None, "no points"
     shrunk = unpacked(image, "prediction")
     assert shrunk.shape == (32, 2048)
     np.testing.assert_allclose(shrunk, distance[::2, ::2], rtol=4e-4)

@@ -60,13 +60,13 @@ def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
 
 
 def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
-    image = InputImage(np.zeros((180, 360, 3), np.uint8))
     labels = np.full((90, 180), 2)
     labels[:30] = 1  # 60° to 90°: 2π (1 − sin 60°) of 4π
     labels[60:] = 0  # below 30°: half of it
     cap = (1 - math.sin(math.pi / 3)) / 2
     area = area_of_angles((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
-    shares = class_shares(PredictedImage(image, labels, area), NAMES)
+    image = InputImage(np.zeros((180, 360, 3), np.uint8), area=area)
+    shares = class_shares(PredictedImage(image, labels), NAMES)
     assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})
 
 

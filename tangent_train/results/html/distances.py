@@ -66,7 +66,7 @@ def pack_distances(
     """Pack maps of distances on one scale.
 
     Args:
-        distances: Maps ``(h, w)`` of distances along the rays; NaN, infinite and 0 are unknown. The
+        distances: Maps ``(h, w)``, of z-depth with a camera; NaN, infinite and 0 are unknown. The
             last one defines the middle of the scene.
         camera: Camera of a photo, see `DistanceScale`.
         sphere: True for panoramas.
@@ -81,11 +81,9 @@ def pack_distances(
     }
     center: tuple[float, ...] = (0.0, 0.0, 0.0)
     radius = 1.0
-    for key, values in maps.items():
-        if sphere or camera:
-            rays = _rays(values.shape, None if sphere else camera)
-            maps[key] = values if sphere else values / np.linalg.norm(rays, axis=-1)
-            center, radius = _scene(rays * maps[key][..., None])
+    if sphere or camera:
+        *_, last = maps.values()
+        center, radius = _scene(_rays(last.shape, camera) * last[..., None])
     known = np.concatenate([values[values > 0] for values in maps.values()])
     near = float(known.min()) if known.size else 1.0
     far = max(float(known.max(initial=near)), 1.01 * near)

@@ -74,10 +74,8 @@ def encode_image(
     rgb: NDArray[np.uint8],
     class_count: int = 0,
     *,
-    prediction: NDArray[np.integer] | None = None,
-    truth: NDArray[np.integer] | None = None,
-    distance: NDArray[np.floating] | None = None,
-    true_distance: NDArray[np.floating] | None = None,
+    prediction: NDArray[Any] | None = None,
+    truth: NDArray[Any] | None = None,
     is_metric: bool = True,
     camera_matrix: NDArray[np.float64] | None = None,
     sphere: bool = True,
@@ -86,46 +84,39 @@ def encode_image(
     """Compress an image for the report, to a few megabytes at most.
 
     Images whose longer side exceeds `MOST_PIXELS` are downsampled: colors by area averaging, labels
-    by nearest neighbor. Distances, which compress less, have at most 2048. An image has labels or
-    distances.
+    by nearest neighbor. Distances, which compress less, have at most 2048.
 
     Args:
         name: Name in the list of images.
         rgb: Image ``(H, W, 3)``.
-        class_count: Number of labels, K + 1, with the unknown class 0; at most 256.
-        prediction: Predicted labels ``(h, w)``, which may have another size than the image.
-        truth: True labels ``(h, w)``; 0 is unknown.
-        distance: Predicted distances ``(h, w)`` from the center along the rays, of photos too; NaN
-            and 0 are unknown.
-        true_distance: True distances ``(h, w)``, on the scale of the predicted ones.
+        class_count: Number of labels, K + 1, with the unknown class 0; at most 256. 0 for
+            distances.
+        prediction: Predicted labels ``(h, w)``, which may have another size than the image; or
+            distances from the center, which are z-depth with `camera_matrix`.
+        truth: True labels or distances ``(h, w)``; 0 and NaN are unknown.
         is_metric: True for distances in meters; False for distances up to a scale.
-        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for z-depth and points.
+        camera_matrix: ``(3, 3)`` K of a photo, integer pixel centers, for points.
         sphere: True for a panorama.
         note: Line below the name.
     """
-    labels = _shrunk_maps(truth, prediction, MOST_PIXELS, np.uint8)
-    shares = _shares(list(labels.values()), class_count, sphere=sphere)
-    distances = _shrunk_maps(true_distance, distance, _MOST_DISTANCES, np.float32)
-    scale, packed = None, labels
-    if distances:
+    side, dtype = (MOST_PIXELS, np.uint8) if class_count else (_MOST_DISTANCES, np.float32)
+    packed = {
+        key: _shrunk(array.astype(dtype, copy=False), side, cv2.INTER_NEAREST_EXACT)
+        for key, array in (("truth", truth), ("prediction", prediction))
+        if array is not None
+    }
+    scale = None
+    shares: tuple[tuple[float, ...], ...] = ()
+    if class_count:
+        shares = _shares(list(packed.values()), class_count, sphere=sphere)
+    elif packed:
         camera = None if camera_matrix is None else camera_in_sides(camera_matrix, rgb.shape)
-        scale, packed = pack_distances(distances, camera, sphere=sphere, is_metric=is_metric)
+        scale, packed = pack_distances(packed, camera, sphere=sphere, is_metric=is_metric)
     pngs = {key: cv2.imencode(".png", array, _PNG)[1].tobytes() for key, array in packed.items()}
     jpeg, thumbnail = _jpeg(rgb, MOST_PIXELS), _jpeg(rgb, _THUMBNAIL_PIXELS)
     height, width = rgb.shape[:2]
     both = pngs.get("prediction"), pngs.get("truth")
     return EncodedImage(name, note, sphere, width, height, jpeg, thumbnail, *both, shares, scale)
-
-
-def _shrunk_maps(
-    truth: NDArray[Any] | None, prediction: NDArray[Any] | None, side: int, dtype: type[np.generic]
-) -> dict[str, NDArray[Any]]:
-    maps = {"truth": truth, "prediction": prediction}
-    return {
-        key: _shrunk(array.astype(dtype, copy=False), side, cv2.INTER_NEAREST_EXACT)
-        for key, array in maps.items()
-        if array is not None
-    }
 
 
 def _shrunk(pixels: NDArray[Any], side: int, interpolation: int) -> NDArray[Any]:

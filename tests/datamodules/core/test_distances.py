@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -27,19 +26,16 @@ from datamodules import (
     Structured3DPerspective,
     SynPASS,
     SynthiaPerspective,
-    SynthRooms,
-    SynthRoomsPerspective,
     Zind,
 )
 from datamodules.core.image_module import ImageDataModule
-from datamodules.core.labels import DISTANCE
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.images.pixel_files import write_depth_m
 from datamodules.synthia.omnisynthia import SEQUENCES
-from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import equirect_directions, perspective_directions
+from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
-from tests.datamodules.conftest import TINY_ROOMS
 from tests.datamodules.data_files import nearest_valid, read_png, write_png
 from tests.datamodules.folder.folder_format import save, write_data_set
 from tests.datamodules.folder.photo_format import write_cameras, write_photos
@@ -47,6 +43,7 @@ from tests.datamodules.matterport360.matterport_format import write_matterport
 from tests.datamodules.structured3d.structured3d_format import HALF_ANGLES, write_structured3d
 from tests.datamodules.synthia.synthia_format import CENTER_X, CENTER_Y, FOCAL, write_views
 
+_AREAS = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), ("office_1",))
 Depth = NDArray[np.float64]
 UNEVEN = EquirectRepresentation(3, crop_deg=90, erp_height=16)
 CROPS = PerspectiveRepresentation(5, fov_deg=25)
@@ -76,7 +73,7 @@ class Source(NamedTuple):
 
 
 def _stanford_photos(root: Path) -> None:
-    fabricate(root, dict.fromkeys("123456", ("office_1",)) | _BOTH, photos=1)
+    fabricate(root, _AREAS, photos=1)
     for path in root.glob("*/data/pose/*.json"):
         path.write_text(json.dumps({"camera_k_matrix": SHIFTED, "camera_rt_matrix": _POSE}))
 
@@ -97,15 +94,12 @@ def _folder(root: Path) -> None:
         path.unlink()
 
 
-_BOTH = dict.fromkeys(("5a", "5b"), ("office_1",))
 _SCENES = (0, 1, 2, 3000, 3250)
 _HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
 SOURCES = {
     "stanford2d3ds": Source(
-        Stanford2D3DS,
-        lambda root: fabricate(root, dict.fromkeys("12346", ("office_1",)) | _BOTH, height=40),
-        "area_*/pano/depth/*.png",
-        512,
+        *(Stanford2D3DS, lambda root: fabricate(root, _AREAS, height=40)),
+        *("area_*/pano/depth/*.png", 512),
     ),
     "structured3d": Source(
         *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
@@ -127,10 +121,8 @@ SOURCES = {
         (41, 52, 13, 17.75),
     ),
     "structured3d_perspective": Source(
-        Structured3DPerspective,
-        lambda root: write_structured3d(root, _SCENES, photos=True),
-        "*/*/*/perspective/full/*/depth.png",
-        1000,
+        *(Structured3DPerspective, lambda root: write_structured3d(root, _SCENES, photos=True)),
+        *("*/*/*/perspective/full/*/depth.png", 1000),
         (*_HALF, 15.5, 15.5),
     ),
     "synthia_perspective": Source(
@@ -198,7 +190,6 @@ def test_labels_are_the_distances_of_the_files(made: tuple[Source, Path]) -> Non
         tolerance = 1.3 / 512 if source.camera else 0.501 / 512
         np.testing.assert_allclose(image.labels / 512, expected, rtol=0, atol=tolerance)
         assert 0.2 < (image.labels == 0).mean() < 0.95 or rows
-        np.testing.assert_array_equal(np.isnan(image.distance_m), image.labels == 0)
         np.testing.assert_allclose(np.nan_to_num(image.distance_m) * 512, image.labels)
 
 
@@ -215,15 +206,15 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
     for others in batches[1:]:
         for one, other in zip(batches[0], others, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
-    classes = {"labels": "pixel_classes"}
-    if source.module not in (FolderPanoramas, FolderPhotos):  # they have no classes here
-        data = _data(source, root, store=tmp_path, in_memory=True, **classes)
-        data.prepare_data()
-        target = data.dataset("test")[0].target
-        assert 0 < target.max() < 50
-        target.zero_()
-        assert data.dataset("test")[0].target.max() > 0, "a copy of what is in memory"
-    assert len(list(tmp_path.iterdir())) == 1 + (source.module.__name__[:6] != "Folder")
+    if source.module in (FolderPanoramas, FolderPhotos):
+        return  # they have no classes here
+    data = _data(source, root, store=tmp_path, in_memory=True, labels=PIXEL_CLASSES)
+    data.prepare_data()
+    target = data.dataset("test")[0].target
+    assert 0 < target.max() < 50
+    target.zero_()
+    assert data.dataset("test")[0].target.max() > 0, "a copy of what is in memory"
+    assert len(list(tmp_path.iterdir())) == 2
 
 
 def test_missing_and_broken_depth_is_named(tmp_path: Path, made: tuple[Source, Path]) -> None:
@@ -245,22 +236,6 @@ def test_missing_and_broken_depth_is_named(tmp_path: Path, made: tuple[Source, P
     assert len(left.index().of()) == len(data.index().of()) - 2
 
 
-def test_synthetic_photos_see_the_distances_of_the_panorama(tiny_rooms: Path) -> None:
-    given: Any = {"rooms": TINY_ROOMS, "labels": DISTANCE, "inputs": ["rgb"]}
-    data = SynthRoomsPerspective(tiny_rooms, PerspectiveRepresentation(2), **given)
-    panoramas = SynthRooms(tiny_rooms, EquirectRepresentation(3), **given).panoramas("test")
-    pairs: Any = zip(panoramas, data.photos("test"), strict=True)
-    shares = []
-    for panorama, photo in pairs:
-        assert photo.name.startswith(panorama.name)
-        rays = perspective_directions(photo.camera_matrix, photo.labels.shape) @ CAMERA_FROM_SPHERE
-        world = rays @ photo.pose.world_from_panorama.T
-        rows, columns = _pixels(world @ panorama.pose.world_from_panorama, 16)
-        ratio = photo.distance_m / panorama.distance_m[rows, columns]
-        shares.append((np.abs(np.log(ratio)) < 0.1)[np.isfinite(ratio)].mean())
-    assert min(shares) > 0.75, "but for edges: the panorama has 16 rows"
-
-
 def _pixels(directions: Depth, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of a panorama at directions ``(…, 3)``."""
     x, y, z = np.moveaxis(directions, -1, 0)
@@ -275,25 +250,17 @@ def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> No
     meters = np.random.default_rng(0).uniform(0.01, 9, (32, 64)).astype(np.float32)
     special = [np.nan, np.inf, -1, 0, 1e-4, 127.99, 128, 5000, 1e10]
     meters[0, : len(special)] = special
-    for name in ("a", "b", "c"):
+    for name in "abc":
         save(tmp_path / "images" / f"{name}.png", np.zeros((32, 64, 3), np.uint8))
-        path = tmp_path / "depth" / f"{name}{suffix}"
-        path.parent.mkdir(exist_ok=True)
-        if suffix == ".npy":
-            np.save(path, meters)
-        else:
-            header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
-            OpenEXR.File(header, {"Y": meters}).write(str(path))
-    data = FolderPanoramas(
-        tmp_path, EquirectRepresentation(4), labels=DISTANCE, inputs=["rgb"], validation_fraction=0
-    )
-    sample: Any = data.dataset("test")[0]
-    labels = sample.target.numpy()
+        write_depth_m(tmp_path / "depth" / f"{name}{suffix}", meters, 1)
+    representation: Any = EquirectRepresentation(4)
+    data = _data(SOURCES["folder"], tmp_path, representation, validation_fraction=0)
+    labels = data.dataset("test")[0].target.numpy()
     assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
     np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
 
 
-# --- masks, rotation, areas, crops ---------------------------------------------------------------
+# --- masks, rotation ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rotation", [None, "so3"])
@@ -301,7 +268,7 @@ def test_masked_and_rotated_distances_keep_their_values(
     tmp_path: Path, rotation: str | None
 ) -> None:
     source = SOURCES["stanford2d3ds"]
-    fabricate(tmp_path, dict.fromkeys("12346", ("office_1",)) | _BOTH)
+    fabricate(tmp_path, _AREAS)
     _overwrite(source, tmp_path)
     erp = EquirectRepresentation(4)
     changes: dict[str, Any] = {"mask": -30, "unknown": "any_black", "test_rotation": rotation}
@@ -316,26 +283,6 @@ def test_masked_and_rotated_distances_keep_their_values(
     target = data.dataset("test")[0].target.numpy()
     assert (target == expected).mean() > 0.99, "but for rounding at the borders of pixels"
     assert 0.2 < (target > 0).mean() < 0.5
-
-
-def test_crops_of_a_photo_have_the_distances_of_its_pixels(tmp_path: Path) -> None:
-    """Every pixel of the photo is in one crop; its distance is along its ray in the photo."""
-    source = SOURCES["stanford2d3ds_perspective"]
-    source.write(tmp_path)
-    data = _data(source, tmp_path)
-    files = data.index().splits["test"][0]
-    matrix = np.array(SHIFTED) - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
-    # A plane across the optical axis at 3 m: distances grow with the angle to the axis.
-    write_png(files.parts["depth"], np.full((32, 32), 3 * 512, np.uint16))
-    photo, target = data.source("test").read(0), data.dataset("test")[0].target.numpy()
-    (crops,) = photo.sampler(CROPS).view_sets()
-    v, u = np.indices((32, 32)).astype(np.float32)
-    x, y = ((c - matrix[i, 2]) / matrix[i, i] for c, i in ((u, 0), (v, 1)))
-    place = [crops.render(a.astype(np.float32), "nearest") for a in (x, y)]
-    expected = 3 * np.sqrt(1 + place[0].astype(np.float64) ** 2 + place[1] ** 2)
-    owned = target > 0
-    np.testing.assert_allclose(target[owned] / 512, expected[owned], atol=0.51 / 512)
-    np.testing.assert_array_equal(owned, crops.owned())
 
 
 # --- what cannot be used -------------------------------------------------------------------------

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
+from models.huggingface import HuggingFaceDepthNetwork, architecture
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import depth_of_output
 from tangent_train.checkpoints.trained import describe_network
@@ -22,6 +23,7 @@ from tangent_train.inference.photo_networks import PhotoNetwork, huggingface, im
 from tangent_train.inference.photo_networks.depth_kinds import declared_kind, try_depth
 from tests.inference.photo_networks import depth_networks as depth
 from tests.inference.photo_networks.huggingface_networks import change_json, imported, saved
+from tests.security.attacks import undeclared_settings
 
 CONFIG = Path("config.json")
 METRIC = {"model_type": "depth_anything", "depth_estimation_type": "metric"}
@@ -115,6 +117,13 @@ def test_configs_that_do_not_fit_are_refused(changed: Any, expected: str, tmp_pa
     change_json(tmp_path / "config.json", **changed)
     with pytest.raises(DataError, match=expected):
         imported(tmp_path, depth="relative_disparity")
+
+
+def test_undeclared_settings_are_refused(tmp_path: Path) -> None:
+    config = architecture(depth.depth_anything()[0].config.to_dict())
+    for attack in undeclared_settings(tmp_path):
+        with pytest.raises(SettingError, match=r"network\.config"):
+            HuggingFaceDepthNetwork(config | attack)
 
 
 def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:

@@ -60,14 +60,16 @@ WITH_NUMBERS = """
 def room(directions: NDArray[np.float64], **kwargs: Any) -> EncodedImage:
     points = exit_points(CENTER, directions)
     rgb = colors_at(points).round().astype(np.uint8)
-    return encode_image("room", rgb, distance=np.linalg.norm(points, axis=-1), **kwargs)
+    is_photo = "camera_matrix" in kwargs
+    depth = points[..., 0] if is_photo else np.linalg.norm(points, axis=-1)
+    return encode_image("room", rgb, prediction=depth, sphere=not is_photo, **kwargs)
 
 
 def photo() -> EncodedImage:
     """Camera axes are right, down, ahead; the room's are ahead, right, up."""
     matrix = camera_matrix_from_fov(FOV_DEG, PHOTO)
     rays = perspective_directions(matrix, PHOTO) @ [[0, 1, 0], [0, 0, -1], [1, 0, 0]]
-    return room(rays, camera_matrix=matrix, sphere=False, is_metric=False)
+    return room(rays, camera_matrix=matrix, is_metric=False)
 
 
 def truth_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -81,7 +83,7 @@ def truth_of(directions: NDArray[np.float64]) -> NDArray[np.float64]:
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("html") / "report.html"
     directions = equirect_directions(SIZE)
-    images = [room(directions), photo(), room(directions, true_distance=truth_of(directions))]
+    images = [room(directions), photo(), room(directions, truth=truth_of(directions))]
     write_report(path, "Distances", images=images)
     return path
 
@@ -204,7 +206,7 @@ def test_points_are_as_dense_at_the_pole_as_elsewhere(browser: Browser, tmp_path
     directions = equirect_directions((rows, columns))
     rgb = np.full((rows, columns, 3), 90, np.uint8)
     path = tmp_path / "report.html"
-    image = encode_image("sphere", rgb, distance=np.ones((rows, columns)))
+    image = encode_image("sphere", rgb, prediction=np.ones((rows, columns)))
     write_report(path, "Sphere", images=[image])
     with opened(browser, path, before=WITH_NUMBERS) as report:
         report.press("p")
