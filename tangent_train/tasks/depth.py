@@ -19,11 +19,11 @@ from datamodules.core.panoramas import STEPS_PER_M
 from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
+    depth_of_output,
     distance_of,
     from_distance,
     is_disparity,
     is_metric,
-    uncanonical,
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
@@ -240,7 +240,7 @@ class DepthTask(ViewsTask):
             if truth is not None:
                 self._add_loss(depth, truth, ray_lengths)
             lengths = ray_lengths[:, None]
-            values, kind = uncanonical(depth, kind, lengths)
+            values, kind = depth_of_output(depth, kind, lengths)
             return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
         outputs = []
         for views, of_set, rays in self.view_sets(images, rotation, area):

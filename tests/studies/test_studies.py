@@ -12,6 +12,7 @@ from scipy.optimize import brentq
 
 from studies.angular_resolution import angular_resolution
 from studies.constant_depth import constants
+from studies.depth_alignment import depth_alignment
 from studies.distorted_digits import BODY, distort, enlarge, mean_enlargement, pixel_centers
 from studies.fov import fov
 from studies.methods import picture, table
@@ -20,7 +21,7 @@ from studies.point_views import SIDE, drawn
 from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.surface_area import surface_area
-from tangent_train.geometry import random_rotation
+from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 from tangent_train.rendering import IcosphereRepresentation
 
@@ -151,3 +152,12 @@ def test_points_are_drawn_from_three_sides() -> None:
     assert left == pytest.approx([SIDE / 2, SIDE * (1 + 2 / 5) / 2], abs=1)
     assert not green[:, 1].any()
     assert green[:, 2].any()
+
+
+def test_scales_of_a_box_are_recovered_and_smooth_errors_reduced_by_a_grid() -> None:
+    distance_m = 2 / np.abs(equirect_directions((64, 128)) / (1, 1.5, 0.7)).max(axis=-1)
+    exact, smooth = (depth_alignment(distance_m, "metric_z", error, dim=64) for error in (0, 0.1))
+    assert exact["step before"] > 50
+    assert exact["view"] < 0.5
+    assert smooth["error"] > 5
+    assert smooth["error, grid"] < smooth["error"] / 2

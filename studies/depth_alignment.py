@@ -1,0 +1,114 @@
+"""Alignment of the views of panoramas with known distances (``docs/results/depth.md``).
+
+``python -m studies.depth_alignment depth.exr layout.npy`` takes files of distances. Each view
+becomes the output of an imaginary network: it gets a random scale, a random shift (for disparity),
+and a smooth error.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from datamodules.images.pixel_files import read_depth_m
+from studies.output import COLORS, Row, save
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.distances import distance_of, from_distance
+from tangent_train.inference.alignment import Align, align, sample_views, sphere_points
+from tangent_train.rendering import RingRepresentation
+
+_RINGS = (
+    {"pitch": 0, "views": 6, "fov": 130},
+    {"pitch": 40, "views": 5},
+    {"pitch": -40, "views": 5},
+)
+"""Those of ``representation=ring_wide``."""
+
+_KINDS: tuple[DepthKind, ...] = ("metric_z", "relative_disparity")
+_MODES: tuple[Align | None, ...] = (None, "grid")
+
+
+def depth_alignment(
+    distance_m: NDArray[np.floating], kind: DepthKind, smooth_error: float, dim: int = 256
+) -> Row:
+    """Return steps between views, and errors of aligned views, in percent.
+
+    Args:
+        distance_m: ``(H, W)`` distances of a panorama; NaN or 0 where unknown.
+        kind: Kind of the output of the imaginary network.
+        smooth_error: Standard deviation of the smooth error of a view's logarithms.
+        dim: Rows and columns of a view.
+    """
+    known = torch.from_numpy(np.where(distance_m > 0, distance_m, np.nan)).float()
+    shape, rng = (known.shape[0], known.shape[1]), np.random.default_rng(0)
+    views = RingRepresentation(9, dim=dim, rings=_RINGS, fov=100).view_sets()
+    y, x = np.meshgrid(*[np.linspace(-1, 1, dim)] * 2, indexing="ij")
+    truths, outputs = [], []
+    for part in views:
+        truth, column = part.render(known[None], "nearest").double(), (len(part), 1, 1, 1)
+        angle, (tilt, radial) = rng.uniform(0, 2 * np.pi, column), rng.normal(size=(2, *column))
+        error = tilt * (np.cos(angle) * x + np.sin(angle) * y) + radial * (x**2 + y**2)
+        error -= error.mean(axis=(2, 3), keepdims=True)
+        error *= smooth_error / error.std(axis=(2, 3), keepdims=True)
+        lengths = torch.from_numpy(part.ray_lengths()).double()[:, None]
+        exact = from_distance(truth * torch.from_numpy(np.exp(error)), kind, lengths)
+        scale = np.exp(rng.normal(0, np.log(5) / 2, column)).clip(1 / 5, 5)
+        shift = np.zeros(1) if kind == "metric_z" else rng.uniform(-0.3, 0.3, column)
+        outputs.append(torch.from_numpy(scale) * exact + torch.from_numpy(shift))
+        truths.append(truth)
+    points = sphere_points(shape)
+    samples = [
+        sample_views(output[:, 0].numpy(), part, shape, points)
+        for output, part in zip(outputs, views, strict=True)
+    ]
+    row: Row = {"output": kind, "smooth error %": 100 * smooth_error}
+    for mode in _MODES:
+        alignment, errors, first = align(samples, kind, mode), [], 0
+        for output, truth, part in zip(outputs, truths, views, strict=True):
+            numbers, lengths = slice(first, first + len(part)), torch.from_numpy(part.ray_lengths())
+            distance = distance_of(alignment.applied(output, numbers, lengths), kind)
+            errors.append((distance / truth).log().flatten(1).numpy())
+            first += len(part)
+        of_views = np.concatenate(errors) - np.nanmedian(np.concatenate(errors))
+        name, report = "" if mode is None else f", {mode}", alignment.report
+        row.setdefault("step before", 100 * (report.step_before or 0))
+        row[f"step{name}"] = 100 * (report.step_after or 0)
+        row[f"error{name}"] = 100 * float(np.nanmedian(np.abs(of_views)))
+        row[f"view{name}"] = 100 * float(np.abs(np.nanmedian(of_views, axis=1)).max())
+    return row
+
+
+def picture(rows: list[Row]) -> Figure:
+    """Plot the errors of aligned views over the smooth errors."""
+    figure = Figure((6, 4), layout="constrained")
+    axes = figure.subplots()
+    for kind, color in zip(_KINDS, COLORS, strict=False):
+        for column, style in (("error", "o"), ("error, grid", "x")):
+            of_kind = [row for row in rows if row["output"] == kind]
+            points = [[row["smooth error %"], row[column]] for row in of_kind]
+            axes.plot(*zip(*points, strict=True), style, color=color, label=f"{kind}: {column}")
+    axes.set(xlabel="smooth error of a view %", ylabel="median error after the alignment %")
+    axes.legend(frameon=False)
+    return figure
+
+
+def main() -> None:
+    """Measure all files and write the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("files", nargs="+", type=Path, help="distances in meters: .exr or .npy")
+    rows = [
+        {"panorama": path.stem, **depth_alignment(read_depth_m(path, 1000), kind, error)}
+        for path in parser.parse_args().files
+        for kind in _KINDS
+        for error in (0.0, 0.05, 0.1, 0.2)
+    ]
+    save("depth_alignment", rows, picture(rows), digits=2)
+
+
+if __name__ == "__main__":
+    main()
