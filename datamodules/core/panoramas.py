@@ -24,7 +24,7 @@ from datamodules.core.store import Declared, Layout
 from datamodules.images.pixel_files import read_rgb
 from datamodules.images.png import check_png
 from tangent_train.errors import DataError, width_height
-from tangent_train.geometry import PanoramaPose, SphereArea
+from tangent_train.geometry import PanoramaPose, SphereArea, ray_lengths
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.upright.gravity import upright_rotation
 
@@ -329,17 +329,6 @@ def distance_from_z_depth(
     """
     lengths = ray_lengths(camera_matrix, z_depth.shape)
     return np.minimum(z_depth * lengths + 0.5, _MOST_STEPS).astype(np.uint16)
-
-
-def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the ratio of distance to z-depth for every pixel of an image, ``(H, W)``."""
-    # A ray (x, y, 1) is √(1 + x² + y²) long.
-    y_squared, x_squared = (
-        ((np.arange(count) - camera_matrix[axis, 2]) / camera_matrix[axis, axis]) ** 2
-        for axis, count in ((1, size[0]), (0, size[1]))
-    )
-    lengths: NDArray[np.float64] = np.sqrt(1 + np.add.outer(y_squared, x_squared))
-    return lengths
 
 
 @dataclass(frozen=True)

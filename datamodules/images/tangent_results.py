@@ -12,10 +12,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import ray_lengths
 from datamodules.images import pixel_files
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PinholeGrid
+from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.rendering import Blend, tangent_to_equirect
 from tangent_train.rendering.camera_files import CameraFile
 from tangent_train.threads import in_threads

@@ -78,39 +78,49 @@ def _resized(images: Tensor, size: Any) -> Tensor:
     return functional.interpolate(images, size, mode="bilinear", antialias=True)
 
 
+RAY_POWERS: dict[str, int] = {
+    "metric_distance": 0,
+    "metric_z": 1,
+    "relative_depth": 1,
+    "relative_disparity": -1,
+}
+"""Powers of the ray length that convert depth, or disparity, to that along the ray."""
+
+
 def is_disparity(kind: DepthKind) -> bool:
     """Return True if views are blended in disparity, False if in the logarithm of distance."""
     return kind == "relative_disparity"
 
 
 def is_metric(kind: DepthKind) -> bool:
-    """Return True if distances are in meters, False if only their ratios are known.
-
-    `canonical_inverse` counts as meters: `uncanonical` converts it before anything else.
-    """
+    """Return True if distances are in meters, False if only their ratios are known."""
     return not kind.startswith("relative")
 
 
-def uncanonical(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> tuple[Tensor, DepthKind]:
-    """Convert `canonical_inverse` to `metric_z`; other kinds are returned unchanged.
+def depth_of_output(
+    output: Tensor, kind: DepthKind, ray_lengths: Tensor
+) -> tuple[Tensor, DepthKind]:
+    """Convert `log_distance` and `canonical_inverse` to meters; others are returned unchanged.
 
-    The inverse depth C is divided by the focal length in image widths (Bochkovskii et al. 2024,
-    section 3.2). That follows from the rays: at columns of distance d, the second difference of
-    1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as in
-    the authors' code.
+    The canonical inverse depth C is divided by the focal length in image widths (Bochkovskii et al.
+    2024, section 3.2). That follows from the rays: at columns of distance d, the second difference
+    of 1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as
+    in the authors' code.
 
     Args:
-        depth: Values of whole images, ``(n, 1, h, w)``.
-        kind: Kind of the values.
+        output: Output of a network for whole images, ``(n, 1, h, w)``.
+        kind: Kind of the output.
         ray_lengths: ``(1 or n, 1, h, w)``, see `Views.ray_lengths`.
 
     Returns:
-        Values, and their kind.
+        Depth, and its kind, which is in `RAY_POWERS`.
     """
-    if kind != "canonical_inverse":
-        return depth, kind
-    span = _span(ray_lengths)
-    return 1 / (depth * span).clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+    if kind == "log_distance":
+        return output.exp(), "metric_distance"
+    if kind == "canonical_inverse":
+        inverse = output * _span(ray_lengths)
+        return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+    return output, kind
 
 
 def _span(ray_lengths: Tensor) -> Any:
@@ -125,11 +135,11 @@ def _span(ray_lengths: Tensor) -> Any:
 
 
 def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
-    """Convert depth of a network to the quantity in which views are blended.
+    """Convert depth to the quantity in which views are blended.
 
     Args:
         depth: Values of the kind.
-        kind: Kind of the values.
+        kind: Kind of the values, see `depth_of_output`.
         ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
 
     Returns:
@@ -137,33 +147,25 @@ def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
         logarithm of the distance. NaN where the depth is not finite, or not positive where its
         logarithm is taken.
     """
-    if kind == "canonical_inverse":
-        raise ValueError("canonical_inverse depends on the focal length: call uncanonical first")
-    if kind == "log_distance":
-        values = depth
-    elif is_disparity(kind):
-        values = depth / ray_lengths
-    else:
-        distance = depth if kind == "metric_distance" else depth * ray_lengths
-        values = distance.log()
+    values = depth * ray_lengths ** RAY_POWERS[kind]
+    values = values if is_disparity(kind) else values.log()
     return values.where(values.isfinite(), torch.nan)
 
 
 def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
-    """Convert distances along the rays to depth of a kind: the inverse of `distance_of`.
+    """Convert distances along the rays to the output of a network: the inverse of `distance_of`.
 
     Args:
         distance: Distances ``(n, …, h, w)``.
         kind: Kind of the result.
         ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
     """
-    if kind == "canonical_inverse":
-        return ray_lengths / (distance * _span(ray_lengths))
     if kind == "log_distance":
         return distance.log()
-    if kind == "metric_distance":
-        return distance
-    return ray_lengths / distance if is_disparity(kind) else distance / ray_lengths
+    if kind == "canonical_inverse":
+        return ray_lengths / (distance * _span(ray_lengths))
+    values = 1 / distance if is_disparity(kind) else distance
+    return values * ray_lengths ** -RAY_POWERS[kind]
 
 
 def distance_of(values: Tensor, kind: DepthKind) -> Tensor:

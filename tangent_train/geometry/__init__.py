@@ -18,7 +18,9 @@ from tangent_train.geometry.area import SphereArea
 from tangent_train.geometry.camera import (
     camera_matrix_from_fov,
     is_camera_matrix,
+    lengths_of_rays,
     perspective_directions,
+    ray_lengths,
     shift_range,
 )
 from tangent_train.geometry.cube import CubeGrid
@@ -67,11 +69,13 @@ __all__ = [
     "equirect_to_lonlat",
     "icosphere",
     "is_camera_matrix",
+    "lengths_of_rays",
     "lonlat_to_equirect",
     "lonlat_to_xyz",
     "nearest_level",
     "perspective_directions",
     "random_rotation",
+    "ray_lengths",
     "rotation_about",
     "shift_range",
     "vertex_resolution",

@@ -56,6 +56,28 @@ def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> N
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
+def ray_lengths(camera_matrix: NDArray[np.float64], size: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the ratio of distance to z-depth for every pixel of an image, ``(height, width)``.
+
+    Args:
+        camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
+        size: ``(height, width)``.
+    """
+    x, y = (
+        (np.arange(size[1 - axis]) - camera_matrix[axis, 2]) / camera_matrix[axis, axis]
+        for axis in (0, 1)
+    )
+    return lengths_of_rays(x, y)
+
+
+def lengths_of_rays(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return √(1 + x² + y²) ``(…, h, w)`` for columns ``(…, w)`` and rows ``(…, h)``.
+
+    They are positions on the image plane at distance 1, whose rays are (x, y, 1).
+    """
+    return np.asarray(np.sqrt(1 + x[..., None, :] ** 2 + y[..., :, None] ** 2))
+
+
 def shift_range(
     camera_matrix: ArrayLike, size: tuple[int, int], fov_deg: float, crop: tuple[int, int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

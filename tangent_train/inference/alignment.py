@@ -32,7 +32,7 @@ from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from tangent_train.checkpoints.content import Align, DepthKind
-from tangent_train.checkpoints.distances import along_rays, is_disparity
+from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
 from tangent_train.rendering.accumulate import NO_OWNERS
@@ -42,9 +42,6 @@ from tangent_train.rendering.sampling import image_taps, sample
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
-
-_RAY_POWERS = {"metric_z": 1, "relative_depth": 1, "relative_disparity": -1}
-"""Powers of the ray length that convert output to distance or disparity along the ray."""
 
 _LEVEL = 5
 _PHOTO_POINTS = 2**13
@@ -113,9 +110,9 @@ def sphere_points(shape: tuple[int, int]) -> Indices:
     return np.stack(np.divmod(pixels, shape[1]), axis=-1)
 
 
-def photo_points(shape: tuple[int, int]) -> Indices:
-    """Return ``(P, 2)`` rows and columns of a lattice on a photo."""
-    step = max(1.0, (shape[0] * shape[1] / _PHOTO_POINTS) ** 0.5)
+def lattice(shape: tuple[int, int], count: int = _PHOTO_POINTS) -> Indices:
+    """Return ``(P, 2)`` rows and columns of a square lattice of about some number of pixels."""
+    step = max(1.0, (shape[0] * shape[1] / count) ** 0.5)
     lines = (np.arange(step / 2, side, step).astype(np.int64) for side in shape)
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -195,7 +192,7 @@ class Alignment:
     """Corrections of the depth of N views.
 
     Attributes:
-        kind: Kind of the network's output.
+        kind: Kind of the depth, see `depth_of_output`.
         scale: ``(N,)`` factors, larger than 0.
         shift: ``(N,)`` shifts, added after multiplication with the scale.
         grid: ``(N, k, k)`` corrections of the logarithm, added bilinearly; rows from top to bottom.
@@ -215,22 +212,17 @@ class Alignment:
         Sky (disparity 0) and negative disparities become 0.
 
         Args:
-            outputs: ``(n, 1, h, w)`` output of the network.
+            outputs: ``(n, 1, h, w)`` depth of the kind.
             part: The views.
             ray_lengths: ``(1 or n, h, w)``, see `Views.ray_lengths`.
         """
-        lengths = ray_lengths.to(outputs)[:, None]
         scale, shift = (
             torch.from_numpy(numbers[part]).to(outputs)[:, None, None, None]
             for numbers in (self.scale, self.shift)
         )
-        if self.kind == "log_distance":
-            depth = (outputs.exp() * scale + shift).log() if shift.any() else outputs + scale.log()
-        else:
-            depth = outputs * scale + shift
-        values = along_rays(depth, self.kind, lengths)
+        values = along_rays(outputs * scale + shift, self.kind, ray_lengths.to(outputs)[:, None])
         if is_disparity(self.kind):
-            values = torch.where(outputs == 0, 0 * values, values).clamp(min=0)
+            values = values.where(outputs != 0, 0).clamp(min=0)
         if self.grid is None:
             return values
         rows, columns = (
@@ -248,7 +240,7 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
 
     Args:
         parts: Samples of all sets of views.
-        kind: Kind of the values, after `uncanonical`.
+        kind: Kind of the values, see `depth_of_output`.
         mode: The correction; None for `scale` of metric and `affine` of relative kinds, and for
             `none` of a single view. `grid` adds a grid of corrections to it.
 
@@ -264,9 +256,7 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
         expected = "none, scale or affine, for views that are not pinhole images"
         raise SettingError("align", found="grid", expected=expected)
     base = usual if mode == "grid" else mode
-    if kind == "log_distance":
-        value = np.exp(value)
-    factor = samples.ray_length ** _RAY_POWERS.get(kind, 0)
+    factor = samples.ray_length ** RAY_POWERS[kind]
     is_valid = np.isfinite(value) & (value != 0 if base == "affine" else value > 0)
     pairs = _pairs(samples, np.flatnonzero(is_valid))
     scale, shift, grid = np.ones(count), np.zeros(count), None

@@ -8,16 +8,19 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import torch
 
-from datamodules.core.labels import DISTANCE
-from datamodules.core.panoramas import ray_lengths
 from tangent_train.checkpoints.content import Align
-from tangent_train.checkpoints.distances import distance_of, is_metric, uncanonical
+from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
+from tangent_train.geometry import (
+    equirect_solid_angles,
+    equirect_to_lonlat,
+    lonlat_to_xyz,
+    ray_lengths,
+)
 from tangent_train.inference.alignment import align as align_views
-from tangent_train.inference.alignment import photo_points, sample_views, sphere_points
+from tangent_train.inference.alignment import lattice, sample_views, sphere_points
 from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic
-from tangent_train.rendering.sampling import sphere_rays
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -34,8 +37,8 @@ if TYPE_CHECKING:
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
 
-_MEDIAN_ROWS = 256
-"""Rows, and columns, from which the median distance is computed, at least."""
+_MEDIAN_POINTS = 2**16
+"""Number of pixels, about, from which the median distance is computed."""
 
 
 @dataclass(frozen=True)
@@ -91,18 +94,16 @@ def combine_depth(
     Raises:
         SettingError: The views cannot be aligned in this way.
     """
-    points = sphere_points(shape) if camera_matrix is None else photo_points(shape)
-    if area is not None and not area.is_whole:
-        points = points[area.contains(_directions(shape, *points.T))]
+    points = sphere_points(shape) if camera_matrix is None else lattice(shape)
+    points = points[_inside(area, points, shape)]
     sets, samples, count = [], [], 0
     for views, raw in outputs:
         lengths = torch.from_numpy(views.ray_lengths()).to(raw)
-        depth, found_kind = uncanonical(raw, kind, lengths[:, None])
+        depth, depth_kind = depth_of_output(raw, kind, lengths[:, None])
         samples.append(sample_views(depth[:, 0].cpu().numpy(), views, shape, points))
         sets.append((views, depth, lengths, count))
         count += len(views)
-    kind = found_kind
-    alignment = align_views(samples, kind, align if count > 1 else "none")
+    alignment = align_views(samples, depth_kind, align if count > 1 else "none")
     mosaic = DepthMosaic(shape, blend, device=outputs[0][1].device)
     for views, depth, lengths, start in sets:
         step = views_per_forward((depth.shape[-2], depth.shape[-1]))
@@ -111,7 +112,7 @@ def combine_depth(
             numbers = slice(start + part.start, start + part.stop)
             of_part = lengths[part] if len(lengths) > 1 else lengths
             mosaic.add(alignment.applied(depth[part], numbers, of_part), views[part])
-    distance = distance_of(mosaic.values(), kind)
+    distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
         distance = distance / _median(distance, area, camera_matrix)
     return DistanceMap(distance, is_metric(kind), alignment.report)
@@ -128,7 +129,7 @@ class DepthPredictor(ViewPredictor):
         align: See `combine_depth`.
 
     Raises:
-        SettingError: See `ViewPredictor`; or the network predicts classes.
+        SettingError: See `ViewPredictor`; or the alignment is unknown.
     """
 
     def __init__(
@@ -139,7 +140,6 @@ class DepthPredictor(ViewPredictor):
         images_per_forward: int | None = None,
         align: Align | None = None,
     ) -> None:
-        trained.check_predicts(DISTANCE)
         check_choice("align", align or "none", get_args(Align))
         super().__init__(trained, view_sets, device, images_per_forward)
         self._kind: Any = trained.depth_kind
@@ -183,27 +183,24 @@ def _median(
     distance: Tensor, area: SphereArea | None, camera_matrix: NDArray[np.float64] | None
 ) -> float:
     """Return the median of known distances, weighted by solid angle; 1 if all are unknown."""
-    rows, columns = (np.arange(0, side, max(1, side // _MEDIAN_ROWS)) for side in distance.shape)
-    values = distance[torch.from_numpy(rows)][:, torch.from_numpy(columns)].cpu().numpy()
+    shape = distance.shape[0], distance.shape[1]
+    points = lattice(shape, _MEDIAN_POINTS)
+    rows, columns = points.T
     if camera_matrix is None:
-        directions = _directions(distance.shape, rows[:, None], columns)
-        weight = np.hypot(directions[..., 0], directions[..., 1])
-        if area is not None:
-            weight *= area.contains(directions)
+        weight = equirect_solid_angles(shape)[rows]
     else:
-        weight = ray_lengths(camera_matrix, distance.shape)[rows][:, columns] ** -3.0
-    known = np.isfinite(values) & (weight > 0)
-    order = np.argsort(values[known])
-    total = weight[known][order].cumsum()
-    if not len(total):
+        weight = ray_lengths(camera_matrix, shape)[rows, columns] ** -3.0
+    values = distance.cpu().numpy()[rows, columns]
+    known = np.isfinite(values) & _inside(area, points, shape)
+    if not known.any():
         return 1.0
-    return float(values[known][order][np.searchsorted(total, total[-1] / 2)])
+    return float(np.quantile(values[known], 0.5, weights=weight[known], method="inverted_cdf"))
 
 
-def _directions(
-    shape: Sequence[int], rows: NDArray[np.int64], columns: NDArray[np.int64]
-) -> NDArray[np.float64]:
-    """Return the directions ``(..., 3)`` of pixels of a panorama."""
-    of_columns, of_rows = sphere_rays((shape[0], shape[1]))
-    (x, y), (across, z) = of_columns[:, columns], np.moveaxis(of_rows[rows], -1, 0)
-    return np.stack(np.broadcast_arrays(across * x, across * y, z), axis=-1)
+def _inside(
+    area: SphereArea | None, points: NDArray[np.int64], shape: tuple[int, int]
+) -> NDArray[np.bool_]:
+    """Return a mask of points ``(P, 2)`` in the area of a panorama; all True without an area."""
+    if area is None:
+        return np.ones(len(points), bool)
+    return area.contains(lonlat_to_xyz(equirect_to_lonlat(points[:, ::-1], shape)))

@@ -19,11 +19,11 @@ from datamodules.core.samples import EvaluationSample
 from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
+    depth_of_output,
     distance_of,
     from_distance,
     is_disparity,
     is_metric,
-    uncanonical,
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
@@ -240,7 +240,7 @@ class DepthTask(ViewsTask):
         if not self.is_tested:
             self._add_loss(depth, truth, sample.ray_lengths)
         lengths = sample.ray_lengths[:, None]
-        values, kind = uncanonical(depth, self.depth_kind, lengths)
+        values, kind = depth_of_output(depth, self.depth_kind, lengths)
         return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
 
     def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:

@@ -15,72 +15,67 @@ from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import (
     DistanceNetwork,
     along_rays,
+    depth_of_output,
     distance_of,
     from_distance,
     is_disparity,
-    uncanonical,
 )
-from tangent_train.checkpoints.scores import network_for_views, size_multiple_of
+from tangent_train.checkpoints.scores import size_multiple_of
 from tangent_train.checkpoints.trained import describe_network, load_trained
 from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
 from tangent_train.inference.class_maps import load_class_map, map_classes
 from tests.inference.trained import write_checkpoint
 
 
 @pytest.mark.parametrize("kind", get_args(DepthKind))
 def test_outputs_of_every_kind_are_distances_along_the_rays(kind: DepthKind) -> None:
-    """A plane 2 m in front of the camera: its z-depth is 2 m, its distance 2 m · ray length."""
-    lengths = torch.linspace(1, 3, 12, dtype=torch.float64).reshape(1, 3, 4)
+    """A plane 2 m in front of a camera of 90°: its z-depth is 2 m everywhere."""
+    lengths = torch.from_numpy(ray_lengths(camera_matrix_from_fov(90, (6, 8)), (6, 8)))[None, None]
     distance = 2 * lengths
-    if kind == "canonical_inverse":
-        with pytest.raises(ValueError, match="uncanonical first"):
-            along_rays(distance, kind, lengths)
-        return
     output = from_distance(distance, kind, lengths)
     expected: Any = {
         "log_distance": distance.log(),
         "metric_distance": distance,
-        "metric_z": 2.0 * torch.ones(1, 3, 4),
-        "relative_depth": 2.0 * torch.ones(1, 3, 4),
-        "relative_disparity": 0.5 * torch.ones(1, 3, 4),
+        "metric_z": 2,
+        "canonical_inverse": 1 / (2 * 2),  # the image is 2 m wide at 1 m
+        "relative_depth": 2,
+        "relative_disparity": 1 / 2,
     }
-    torch.testing.assert_close(output, expected[kind].double())
-    values = along_rays(output, kind, lengths)
-    blended = 1 / distance if is_disparity(kind) else distance.log()
+    torch.testing.assert_close(output, 0 * distance + expected[kind])
+    depth, depth_kind = depth_of_output(output, kind, lengths)
+    values = along_rays(depth, depth_kind, lengths)
+    blended = 1 / distance if is_disparity(depth_kind) else distance.log()
     torch.testing.assert_close(values, blended)
-    torch.testing.assert_close(distance_of(values, kind), distance)
+    torch.testing.assert_close(distance_of(values, depth_kind), distance)
 
 
 def test_canonical_depth_is_multiplied_by_the_focal_length_in_widths() -> None:
-    """For views of 90°, 10°, mirrored crops beside the axis, and equirectangular images."""
-    depth = torch.linspace(0.1, 2, 96, dtype=torch.float64).reshape(2, 1, 6, 8)
+    """For wide views, narrow mirrored crops beside the axis, and equirectangular images."""
+    inverse = torch.linspace(0.1, 2, 96, dtype=torch.float64).reshape(2, 1, 6, 8)
     for fov_deg, shift, columns in ((90, 0.0, 8), (10, 0.4, 8), (10, 0.4, 7)):
-        pitch = 2 * math.tan(math.radians(fov_deg) / 2) / columns
+        pitch, of_part = 2 * math.tan(math.radians(fov_deg) / 2) / columns, inverse[..., :columns]
         x = (torch.arange(columns) - (columns - 1) / 2) * pitch + shift
         y = (torch.arange(6) - 2.5) * pitch
-        lengths = (1 + x**2 + y[:, None] ** 2).sqrt()[None, None].float()
-        found, kind = uncanonical(depth[..., :columns], "canonical_inverse", lengths.flip(-1))
+        lengths = (1 + x**2 + y[:, None] ** 2).sqrt()[None, None].float().flip(-1)
+        found, kind = depth_of_output(of_part, "canonical_inverse", lengths)
         assert kind == "metric_z"
+        torch.testing.assert_close(found, 1 / (of_part * columns * pitch), rtol=1e-4, atol=0)
         torch.testing.assert_close(
-            found, 1 / (depth[..., :columns] * columns * pitch), rtol=1e-4, atol=0
+            from_distance(found * lengths, "canonical_inverse", lengths), of_part
         )
-        distance = found * lengths.flip(-1)
-        torch.testing.assert_close(
-            from_distance(distance, "canonical_inverse", lengths.flip(-1)), depth[..., :columns]
-        )
-    whole, kind = uncanonical(depth, "canonical_inverse", torch.ones(1, 1, 1, 1))
-    torch.testing.assert_close(whole, 1 / (depth * 2 * math.pi))
-    assert uncanonical(depth, "relative_depth", lengths) == (depth, "relative_depth")
+    whole, _ = depth_of_output(inverse, "canonical_inverse", torch.ones(1, 1, 1, 1))
+    torch.testing.assert_close(whole, 1 / (inverse * 2 * math.pi))
 
 
 def test_values_without_a_distance_are_unknown() -> None:
-    odd = torch.tensor([torch.nan, torch.inf, -torch.inf, 0.0, -1.0])
-    one = torch.ones(1)
-    for kind in ("metric_distance", "metric_z", "relative_depth"):
-        assert along_rays(odd, kind, one).isnan().all()
-    assert along_rays(odd, "log_distance", one).isnan().tolist() == [True] * 3 + [False] * 2
-    disparity = along_rays(odd, "relative_disparity", one)
-    assert distance_of(disparity, "relative_disparity").isnan().all(), "the sky has disparity 0"
+    """Not finite or not positive; the sky has disparity 0. Depth Pro's is limited."""
+    odd, one = torch.tensor([torch.nan, torch.inf, -torch.inf, 0.0, -1.0]), torch.ones(1)
+    known = {"log_distance": [0, 0, 0, 1, 1], "canonical_inverse": [0, 1, 1, 1, 1]}
+    for kind in get_args(DepthKind):
+        depth, depth_kind = depth_of_output(odd, kind, one)
+        found = distance_of(along_rays(depth, depth_kind, one), depth_kind)
+        assert found.isfinite().tolist() == known.get(kind, [0] * 5)
 
 
 class _MeanColor(nn.Module):
@@ -94,24 +89,22 @@ class _MeanColor(nn.Module):
         if self.size not in (None, tuple(images.shape[-2:])):
             raise ValueError(self.size)
         depth = images.mean(dim=1)
-        return {"map": depth, "channel": depth[:, None], "dict": {"out": depth[:, None]}}.get(
-            self.output, images
-        )
+        channel = depth[:, None]
+        return {"map": depth, "channel": channel, "dict": {"out": channel}}.get(self.output, images)
 
 
-@pytest.mark.parametrize("output", ["map", "channel", "dict"])
+@pytest.mark.parametrize("output", ["map", "channel", "dict", "colors"])
 def test_outputs_of_several_forms_have_one_channel(output: str) -> None:
-    images = torch.randn(2, 3, 4, 6)
-    network = DistanceNetwork(_MeanColor(output=output), "metric_z")
+    images, network = (
+        torch.randn(2, 3, 4, 6),
+        DistanceNetwork(_MeanColor(output=output), "metric_z"),
+    )
+    if output == "colors":
+        with pytest.raises(SettingError, match=r"depth network: found output \(2, 3, .*one value"):
+            network(images)
+        return
     torch.testing.assert_close(network(images), images.mean(dim=1, keepdim=True))
     assert size_multiple_of(network, 3) == 1
-    assert network_for_views(network, distortion_aware=False) is network
-
-
-def test_other_outputs_are_refused() -> None:
-    for network in (_MeanColor(output="colors"), nn.AvgPool2d(2)):
-        with pytest.raises(SettingError, match=r"depth network: found output \(2, 3, .*one value"):
-            DistanceNetwork(network, "metric_z")(torch.zeros(2, 3, 4, 6))
 
 
 def test_images_are_resized_for_networks_of_one_size() -> None:
@@ -148,11 +141,6 @@ def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path:
     assert trained.network(torch.zeros(2, 3, 16, 16)).shape == (2, 1, 16, 16)
     with pytest.raises(SettingError, match=r"found a network that predicts distance.*class_map"):
         map_classes(trained, load_class_map("ade20k_to_stanford2d3ds"), "unknown")
-
-
-def test_other_kinds_of_depth_are_refused(tmp_path: Path) -> None:
-    path = write_depth_checkpoint(tmp_path / "net.ckpt", depth_kind="inverse")
+    path = write_depth_checkpoint(tmp_path / "wrong.ckpt", depth_kind="inverse")
     with pytest.raises(DataError, match="depth_kind='inverse'"):
         load_trained(path)
-    path = write_checkpoint(tmp_path / "classes.ckpt")
-    assert load_trained(path).depth_kind is None

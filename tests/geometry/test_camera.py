@@ -19,6 +19,7 @@ from tangent_train.geometry import (
     camera_matrix_from_fov,
     is_camera_matrix,
     perspective_directions,
+    ray_lengths,
     shift_range,
 )
 from tests.geometry.paper_camera import normalizing_homography
@@ -119,6 +120,7 @@ def test_perspective_directions_project_to_their_pixel() -> None:
     rows, columns = np.mgrid[: SIZE[0], : SIZE[1]]
     np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=1e-9)
     assert (directions[-1, -1] > 0).all()  # x right, y down, z forward
+    np.testing.assert_allclose(ray_lengths(K, SIZE), 1 / directions[..., 2])
 
 
 @pytest.mark.parametrize(

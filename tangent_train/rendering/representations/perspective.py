@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import shift_range
+from tangent_train.geometry import lengths_of_rays, shift_range
 from tangent_train.registry import registered
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.representations.views import Views, lengths_of_rays
+from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.resampling import crop
 from tangent_train.rendering.sampling import plane_rays
 
@@ -88,7 +88,7 @@ class PhotoCrops(Views):
             / self.camera_matrix[axis, axis]
             for axis in (0, 1)
         )
-        return lengths_of_rays(x[:, ::-1] if self.mirrored else x, y)
+        return lengths_of_rays(x[:, ::-1] if self.mirrored else x, y).astype(np.float32)
 
     def owned(self) -> NDArray[np.bool_]:
         """Return a mask of the pixels nearer to the crop's center than to any other, ``(n, h, w)``.

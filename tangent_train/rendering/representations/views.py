@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.geometry import PinholeGrid, SphereArea
+from tangent_train.geometry import PinholeGrid, SphereArea, ray_lengths
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
@@ -105,12 +105,6 @@ class Views:
     def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """Return ``(n, H, 2)`` spans of the canvas that contain the owned pixels of each image."""
         raise NotImplementedError
-
-
-def lengths_of_rays(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float32]:
-    """Return √(1 + x² + y²) ``(n, h, w)`` of columns ``(n, w)`` and rows ``(n, h)``."""
-    squares = 1 + x[:, None, :] ** 2 + y[:, :, None] ** 2
-    return np.asarray(np.sqrt(squares), np.float32)
 
 
 class Sampler(Protocol):
@@ -206,8 +200,7 @@ class PinholeViews(Views):
 
     def ray_lengths(self) -> NDArray[np.float32]:
         """See `Views`; equal for all images, mirrored or not."""
-        down, across = self.grid.plane_positions
-        return lengths_of_rays(across[None], down[None])
+        return ray_lengths(self.grid.camera_matrix, self.grid.size)[None].astype(np.float32)
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.integer]:
         """See `Views`."""

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor, nn
+from torch import Tensor
 
-from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.inference.photo_networks import PhotoNetwork
@@ -188,21 +187,12 @@ def own_depth(folder: Path, image: Any, fov_deg: float | None = None) -> Tensor:
 
 
 @torch.no_grad()
-def imported_depth(network: PhotoNetwork, image: Any) -> Tensor:
-    """``(h, w)`` depth of a network before its import."""
-    return _depth(network.network.eval(), network.normalization, image)
-
-
-@torch.no_grad()
-def trained_depth(trained: TrainedNetwork, image: Any) -> Tensor:
-    """``(h, w)`` depth of a network from a checkpoint."""
-    return _depth(trained.network, trained.normalization, image)
-
-
-def _depth(network: nn.Module, normalization: Normalization, image: Any) -> Tensor:
+def depth_of(network: PhotoNetwork | TrainedNetwork, image: Any) -> Tensor:
+    """``(h, w)`` depth of an imported network, before or after it is saved."""
     rgb = torch.from_numpy(image.copy()).permute(2, 0, 1) / 255
     mean, std = (
-        torch.tensor(values)[:, None, None] for values in (normalization.mean, normalization.std)
+        torch.tensor(values)[:, None, None]
+        for values in (network.normalization.mean, network.normalization.std)
     )
-    depth: Tensor = network(((rgb - mean) / std)[None])[0, 0]
+    depth: Tensor = network.network.eval()(((rgb - mean) / std)[None])[0, 0]
     return depth
