@@ -119,7 +119,11 @@ def _mean(record: Record, name: str) -> str:
 
 
 def _over_all(record: Record) -> Table:
-    rows = [[h.column, _mean(record, name)] for name, h in record.headings.items()]
+    rows = [
+        [heading.column, _mean(record, name)]
+        for name, heading in record.headings.items()
+        if record.latitude_bands or not name.endswith(SOLID_ANGLE)
+    ]
     return Table("Scores", ("score", f"over all {record.noun}"), rows)
 
 

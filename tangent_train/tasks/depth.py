@@ -288,7 +288,7 @@ class DepthTask(ViewsTask):
     ) -> EncodedImage:
         """Return the image with its true and predicted distances, aligned as for the scores."""
         truth = self.meters(target)
-        scores = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())
+        absrel = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())["absrel"]
         arrays = shown_arrays(image, truth, prediction, self.representation, cut=False)
         return encode_image(
             name,
@@ -296,7 +296,7 @@ class DepthTask(ViewsTask):
             prediction=arrays[2],
             truth=arrays[1],
             sphere=target.ndim == 2,
-            note=f"AbsRel {scores['absrel']:.3g}",
+            note="" if np.isnan(absrel) else f"AbsRel {absrel:.3g}",
         )
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:

@@ -62,7 +62,8 @@ def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
     read = json.loads((tmp_path / "results.json").read_text())
     assert (read["images"], read["noun"]) == (7, "panoramas")
     assert read["headings"]["miou"] == {
-        "text": "mIoU", "unit": "%", "of_class": "iou", "class_text": "IoU"
+        "text": "mIoU", "unit": "%", "of_class": "iou", "class_text": "IoU",
+        "better": "higher", "is_main": True,
     }  # fmt: skip
     assert read["macc"] == read["macc_solid_angle"] == (0.9 + 0.5) / 2
     assert read["miou"] == (90 / 150 + 50 / 110) / 2
@@ -114,7 +115,7 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
     )
     record = _record(matrices, "zero", "photos")
     assert record.means["miou_solid_angle"] is None
-    assert record.latitude_bands == []
+    assert not record.latitude_bands
     (table,) = result_tables(record)
     assert not [name for name in table.header if "solid angle" in name]
     assert set(record.intervals) == {"macc", "miou"}

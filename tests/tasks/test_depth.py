@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -18,6 +19,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
+from tangent_train.results.evaluation import result_tables
 from tangent_train.tasks import DepthTask
 from tests.tasks.shapes import Gradients, Spheres, quiet_trainer
 from tests.tasks.test_segmentation import WHOLE
@@ -134,9 +136,10 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     batch = EvaluationSample(images[None], target[None], rotation, lengths[None], area, index)
     task = _task(Right(kind, lengths), representation)
     torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
-    scores = task.logged_scores(task.metric.compute())
-    assert scores["absrel"] < 1e-3
-    assert "absrel_solid_angle" not in scores
+    result, task.evaluated = task.metric.compute(), 1
+    assert task.logged_scores(result)["absrel"] < 1e-3
+    (table,) = result_tables(task.record(result, "photos"))
+    assert not any("solid angle" in name for name, _ in table.rows)
 
 
 def test_views_are_aligned_with_each_other_as_set() -> None:
@@ -153,6 +156,14 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
         )
         errors[align] = scores["test/absrel"]
     assert errors[None] == errors["scale"] < 0.1 < 0.2 < errors["none"]
+
+
+def test_the_report_has_no_score_of_an_image_without_true_distances() -> None:
+    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), area=None)
+    steps = torch.zeros(8, 16, dtype=torch.int32)
+    for target, note in ((steps, ""), (steps + 1024, "AbsRel 0.5")):
+        found = _task(nn.Identity()).report_image("a", image, target, torch.ones(8, 16))
+        assert found.note == note
 
 
 def _network() -> nn.Module:
