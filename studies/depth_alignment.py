@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 
 from datamodules.images.pixel_files import read_depth_m
 from studies.output import COLORS, Row, save
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import distance_of, from_distance
-from tangent_train.inference.alignment import Align, align, sample_views, sphere_points
+from tangent_train.inference.alignment import align, sample_views, sphere_points
 from tangent_train.rendering import RingRepresentation
 
 _RINGS = (
