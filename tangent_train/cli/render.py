@@ -31,7 +31,7 @@ from datamodules.images.tangent_results import TangentResults, result_files
 from tangent_train.cli.command_settings import RenderSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, run_jobs
-from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.cli.settings import check_new, check_unread, parse_settings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
@@ -73,10 +73,10 @@ def render(config: Mapping[str, Any]) -> None:
     if settings.output is None and (modes != ["input"] or not settings.figure):
         raise SettingError("output", found="null", expected="a folder, or with back= a file")
     colmap = settings.colmap and settings.input is not None
-    for name in ("figure",) if colmap else ("mask", "mask_classes"):
-        if getattr(settings, name) is not None:
-            expected = f"null with{'' if colmap else 'out'} colmap=true"
-            raise SettingError(name, found=getattr(settings, name), expected=expected)
+    if colmap:
+        check_unread(settings, "with colmap=true", figure=None)
+    else:
+        check_unread(settings, "without colmap=true", mask=None, mask_classes=None)
     if settings.poses is not None:
         _write_panorama_poses(settings, settings.poses)
     elif colmap:

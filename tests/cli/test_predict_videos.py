@@ -235,41 +235,24 @@ def test_a_shard_has_whole_videos(tmp_path: Path, predict: Predict) -> None:
     assert {entry["name"].partition("/")[0] for entry in of_shard} == {"a", "c"}
 
 
-def test_depth_of_an_interrupted_video(
-    tmp_path: Path, predict: Predict, monkeypatch: Patch, capsys: Capture
-) -> None:
-    """It is the same as without interruption; the video has one range of colors."""
+def test_depth_of_a_video(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
+    """The video has one range of colors; missing frames are predicted again."""
     video = _write_video(tmp_path / "in" / "walk.mp4")
-    checkpoint = write_depth_checkpoint(tmp_path / "net.ckpt")
-    settings: dict[str, Any] = {"checkpoint": checkpoint, "input": video}
-    settings |= {"write": "[depth,color,points]", "points": 100, "align": "none"}
-    predict(**settings, output="whole")
-
-    def interrupted(path: Path, *arguments: int) -> Any:
-        for number, frame in enumerate(read_frames(path, *arguments)):
-            if number == 4:
-                raise KeyboardInterrupt
-            yield frame
-
-    with monkeypatch.context() as patch:
-        patch.setattr("tangent_train.cli.input_files.read_frames", interrupted)
-        with pytest.raises(SystemExit):
-            predict(**settings)
-    assert "4 of 7 images are done. Continue with resume=true" in capsys.readouterr().out
+    settings: dict[str, Any] = {"write": "[depth,color,points]", "points": 100, "align": "none"}
+    settings |= {"checkpoint": write_depth_checkpoint(tmp_path / "net.ckpt"), "input": video}
+    predict(**settings)
+    files = sorted((tmp_path / "out" / "depth" / "walk").iterdir())
+    depth = np.stack([read_png(path) for path in files]) / 1000
+    files[3].unlink()
     with pytest.raises(SystemExit, match="resume: found align=scale, which differs"):
         predict(**(settings | {"align": "scale"}), resume="true")
-    kept = tmp_path / "out" / "depth" / "walk" / "000003.png"
-    before = kept.stat().st_mtime_ns
     entries = predict(**settings, resume="true")
-    assert kept.stat().st_mtime_ns == before
-    assert [entry["frame"] for entry in entries.values()] == list(range(7))
-    for name in ("summary.csv", *(f"depth/walk/{n:06d}.png" for n in range(7))):
-        found, expected = (tmp_path / folder / name for folder in ("out", "whole"))
-        assert found.read_bytes() == expected.read_bytes(), name
+    assert "7 images, 6 done already" in capsys.readouterr().out
+    np.testing.assert_array_equal(read_png(files[3]), np.rint(1000 * depth[3]))
+    assert sorted(entry["frame"] for entry in entries.values()) == list(range(7))
     assert len(list((tmp_path / "out" / "points" / "walk").glob("*.ply"))) == 7
     near = min(entry["depth"]["colors"][0] for entry in entries.values())
     far = max(entry["depth"]["colors"][1] for entry in entries.values())
-    depth = np.stack([read_png(path) for path in sorted(kept.parent.glob("*.png"))]) / 1000
     colors = np.stack([colorize_distance(frame, (near, far)) for frame in depth])
     made, _ = _decoded(tmp_path / "out" / "color" / "walk.mp4")
     assert np.abs(made - colors.astype(float)).mean() < 8

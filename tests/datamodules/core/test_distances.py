@@ -1,9 +1,7 @@
-"""Distances as labels: those of every data set with depth, as its files hold them."""
+"""Distances as labels, of every data set with depth."""
 
 from __future__ import annotations
 
-import json
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -28,7 +26,7 @@ from datamodules import (
     SynthiaPerspective,
     Zind,
 )
-from datamodules.core.image_module import ImageDataModule
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.images.pixel_files import write_depth_m
 from datamodules.synthia.omnisynthia import SEQUENCES
@@ -36,20 +34,16 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
-from tests.datamodules.data_files import nearest_valid, read_png, write_png
+from tests.datamodules.data_files import read_png, write_png
 from tests.datamodules.folder.folder_format import save, write_data_set
 from tests.datamodules.folder.photo_format import write_cameras, write_photos
 from tests.datamodules.matterport360.matterport_format import write_matterport
-from tests.datamodules.structured3d.structured3d_format import HALF_ANGLES, write_structured3d
-from tests.datamodules.synthia.synthia_format import CENTER_X, CENTER_Y, FOCAL, write_views
+from tests.datamodules.structured3d.structured3d_format import write_structured3d
+from tests.datamodules.synthia.synthia_format import write_views
 
 _AREAS = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), ("office_1",))
-Depth = NDArray[np.float64]
 UNEVEN = EquirectRepresentation(3, crop_deg=90, erp_height=16)
 CROPS = PerspectiveRepresentation(5, fov_deg=25)
-_POSE = np.eye(3, 4).tolist()
-SHIFTED = [[41.0, 0, 13.5], [0, 52.0, 18.25], [0, 0, 1]]
-"""K that counts from the corners of pixels, with different focal lengths."""
 
 
 class Source(NamedTuple):
@@ -59,23 +53,13 @@ class Source(NamedTuple):
         module: Class of the data set.
         write: Function that writes its files.
         pattern: Depth files.
-        units_per_m: Units of the files.
-        camera: Focal lengths and center (from centers of pixels) of a photo; None for panoramas.
         settings: Further settings.
     """
 
     module: type[ImageDataModule]
     write: Callable[[Path], object]
     pattern: str
-    units_per_m: float
-    camera: tuple[float, float, float, float] | None = None
     settings: Mapping[str, Any] = {}
-
-
-def _stanford_photos(root: Path) -> None:
-    fabricate(root, _AREAS, photos=1)
-    for path in root.glob("*/data/pose/*.json"):
-        path.write_text(json.dumps({"camera_k_matrix": SHIFTED, "camera_rt_matrix": _POSE}))
 
 
 def _folder_photos(root: Path) -> None:
@@ -84,55 +68,44 @@ def _folder_photos(root: Path) -> None:
     for path in (root / "images").rglob("*.*"):
         values = read_png(root / "labels" / path.relative_to(root / "images").with_suffix(".png"))
         write_png(root / "depth" / path.parent.name / f"{path.stem}.png", values.astype(np.uint16))
-    (root / "classes.json").unlink()
-
-
-def _folder(root: Path) -> None:
-    write_data_set(root, scenes=5, height=40, depth=True)
-    (root / "classes.json").unlink()
-    for path in root.glob("labels/*/*"):
-        path.unlink()
 
 
 _SCENES = (0, 1, 2, 3000, 3250)
-_HALF = 16 / math.tan(HALF_ANGLES[0]), 16 / math.tan(HALF_ANGLES[1])
 SOURCES = {
     "stanford2d3ds": Source(
         *(Stanford2D3DS, lambda root: fabricate(root, _AREAS, height=40)),
-        *("area_*/pano/depth/*.png", 512),
+        "area_*/pano/depth/*.png",
     ),
     "structured3d": Source(
         *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
-        *("*/*/*/panorama/full/depth.png", 1000),
+        "*/*/*/panorama/full/depth.png",
     ),
     "matterport360": Source(
-        Matterport360, lambda root: write_matterport(root, height=40), "*/depth/*.png", 4000
+        Matterport360, lambda root: write_matterport(root, height=40), "*/depth/*.png"
     ),
     "sfss": Source(
         *(Matterport360, lambda root: write_matterport(root, height=40)),
-        *("*/panorama/undistorted_depth_images/*.png", 4000),
-        settings={"release": "sfss"},
+        "*/panorama/undistorted_depth_images/*.png",
+        {"release": "sfss"},
     ),
     "folder": Source(
-        FolderPanoramas, _folder, "depth/*/*.png", 250, settings={"depth_units_per_m": 250}
+        *(FolderPanoramas, lambda root: write_data_set(root, scenes=5, height=40, depth=True)),
+        "depth/*/*.png",
+        {"depth_units_per_m": 250},
     ),
     "stanford2d3ds_perspective": Source(
-        *(Stanford2D3DSPerspective, _stanford_photos, "area_*/data/depth/*.png", 512),
-        (41, 52, 13, 17.75),
+        *(Stanford2D3DSPerspective, lambda root: fabricate(root, _AREAS, photos=1)),
+        "area_*/data/depth/*.png",
     ),
     "structured3d_perspective": Source(
         *(Structured3DPerspective, lambda root: write_structured3d(root, _SCENES, photos=True)),
-        *("*/*/*/perspective/full/*/depth.png", 1000),
-        (*_HALF, 15.5, 15.5),
+        "*/*/*/perspective/full/*/depth.png",
     ),
     "synthia_perspective": Source(
         *(SynthiaPerspective, lambda root: write_views(root, dict.fromkeys(SEQUENCES, 2))),
-        *("*/Depth/Stereo_Left/*/*.png", 100),
-        (FOCAL, FOCAL, CENTER_X - 0.5, CENTER_Y - 0.5),
+        "*/Depth/Stereo_Left/*/*.png",
     ),
-    "folder_photos": Source(
-        FolderPhotos, _folder_photos, "depth/*/*.png", 1000, (60, 50, 20, 30.5)
-    ),
+    "folder_photos": Source(FolderPhotos, _folder_photos, "depth/*/*.png"),
 }
 
 
@@ -141,8 +114,7 @@ def _overwrite(source: Source, root: Path) -> None:
     for seed, path in enumerate(sorted(root.glob(source.pattern))):
         rng = np.random.default_rng(seed)
         stored = rng.integers(1, 65000, read_png(path).shape[:2], np.uint16)
-        missing = 65535 if source.units_per_m == 512 else 0
-        stored[rng.random(stored.shape) < 1 / 3] = missing
+        stored[rng.random(stored.shape) < 1 / 3] = 65535 if "Stanford" in str(source.module) else 0
         write_png(path, stored)
 
 
@@ -157,40 +129,24 @@ def made(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def _data(source: Source, root: Path, representation: Any = None, **changes: Any) -> Any:
-    representation = representation or (UNEVEN if source.camera is None else CROPS)
+    is_photos = issubclass(source.module, PhotoDataModule)
     given = {"labels": DISTANCE, "inputs": ["rgb"], **source.settings, **changes}
-    return source.module(root, representation, **given)
+    return source.module(root, representation or (CROPS if is_photos else UNEVEN), **given)
 
 
-def _distance_m(source: Source, path: Path, rows: int | None) -> Depth:
-    """Read a depth file in float64, 0 where unknown."""
-    stored = read_png(path)
-    stored[stored == 65535] = 0
-    if rows is not None:
-        stored = nearest_valid(stored, (rows, 2 * rows))
-    meters = stored / source.units_per_m
-    if source.camera is not None:
-        fx, fy, cx, cy = source.camera
-        v, u = np.indices(stored.shape)
-        meters = meters * np.sqrt(1 + ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2)
-    return np.where(meters < 65534.5 / 512, meters, 0)  # more than 16 bits hold
-
-
-def test_labels_are_the_distances_of_the_files(made: tuple[Source, Path]) -> None:
+def test_labels_are_the_depth_that_is_an_input_elsewhere(made: tuple[Source, Path]) -> None:
+    """But for distances from 128 m, which 16 bits cannot hold; the tests of inputs have others."""
     source, root = made
     data = _data(source, root)
     assert (data.class_names, data.num_classes, "classes" in data.facts) == ((), 0, False)
-    rows = None if source.camera else 16
-    images = data.images("test")
-    assert len(images)
-    for files, image in zip(data.index().splits["test"], images, strict=True):
-        expected = _distance_m(source, files.parts["depth"], rows)
-        assert image.labels.dtype == np.uint16
-        # z-depth is rounded before it is lengthened.
-        tolerance = 1.3 / 512 if source.camera else 0.501 / 512
-        np.testing.assert_allclose(image.labels / 512, expected, rtol=0, atol=tolerance)
-        assert 0.2 < (image.labels == 0).mean() < 0.95 or rows
-        np.testing.assert_allclose(np.nan_to_num(image.distance_m) * 512, image.labels)
+    inputs = _data(source, root, labels=PIXEL_CLASSES, inputs=["rgb", "depth"]).source("test")
+    distances = data.source("test")
+    assert len(distances) == len(inputs) > 0
+    for number in range(len(distances)):
+        labels, depth = distances.read(number).labels, inputs.read(number).depth
+        np.testing.assert_array_equal(labels, np.where(depth < 65535, depth, 0))
+        assert labels.dtype == np.uint16
+        assert (labels > 2**11).any(), "labels are not classes"
 
 
 def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: Path) -> None:
@@ -202,12 +158,9 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
         training, test = data.dataset("train")[1, 0], data.dataset("test")[0]
         assert {training.labels.dtype, test.target.dtype} == {torch.int32}
         batches.append((*training.images, training.labels, *test.images, test.target))
-        assert int(test.target.max()) > 2**11, "labels are not classes"
     for others in batches[1:]:
         for one, other in zip(batches[0], others, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
-    if source.module in (FolderPanoramas, FolderPhotos):
-        return  # they have no classes here
     data = _data(source, root, store=tmp_path, in_memory=True, labels=PIXEL_CLASSES)
     data.prepare_data()
     target = data.dataset("test")[0].target
@@ -236,7 +189,9 @@ def test_missing_and_broken_depth_is_named(tmp_path: Path, made: tuple[Source, P
     assert len(left.index().of()) == len(data.index().of()) - 2
 
 
-def _pixels(directions: Depth, height: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _pixels(
+    directions: NDArray[np.float64], height: int
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of a panorama at directions ``(…, 3)``."""
     x, y, z = np.moveaxis(directions, -1, 0)
     columns = np.floor((np.arctan2(y, x) / np.pi + 1) * height).astype(int) % (2 * height)
@@ -274,13 +229,16 @@ def test_masked_and_rotated_distances_keep_their_values(
     changes: dict[str, Any] = {"mask": -30, "unknown": "any_black", "test_rotation": rotation}
     data = _data(source, tmp_path, erp, **changes)
     files = data.index().splits["test"][0]
-    expected = (_distance_m(source, files.parts["depth"], None) * 512).round()
+    expected = read_png(files.parts["depth"])  # in steps of 1/512 m
+    expected[expected == 65535] = 0
     expected[np.deg2rad(90 - (np.arange(32) + 0.5) * 180 / 32) < np.deg2rad(-30)] = 0
     expected[(read_png(files.rgb)[..., :3] == 0).any(-1)] = 0
     if rotation:
         R = data.source("test").transforms[-1].rotation(0)
         expected = expected[_pixels(equirect_directions((32, 64)) @ R, 32)]
     target = data.dataset("test")[0].target.numpy()
+    distance_m = data.images("test")[0].distance_m
+    np.testing.assert_array_equal(distance_m, np.where(target, target / 512, np.nan))
     assert (target == expected).mean() > 0.99, "but for rounding at the borders of pixels"
     assert 0.2 < (target > 0).mean() < 0.5
 
