@@ -24,14 +24,13 @@ from tangent_train.results.evaluation import headline
 
 def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
     """Return distances in meters ``(H or 1, 1)`` by name, from those of training ``(n, H, W)``."""
-    known = np.sort(steps[steps > 0]).astype(np.float64)
+    meters = np.where(steps > 0, steps / STEPS_PER_M, np.nan)
+    known = np.sort(meters[steps > 0])
     share = np.cumsum(1 / known)  # the absolute relative error weights an error by 1 / distance
     constant = known[np.searchsorted(share, share[-1] / 2)]
-    by_row = np.ma.masked_equal(steps.swapaxes(0, 1).reshape(steps.shape[1], -1), 0)
-    rows: Any = np.ma.median(by_row, 1)  # type: ignore[no-untyped-call]
-    filled = rows.filled(np.median(known))[:, None]
-    found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": filled}
-    return {name: np.atleast_2d(value) / STEPS_PER_M for name, value in found.items()}
+    rows = np.nanmedian(meters, axis=(0, 2))[:, None]
+    found = {"median": np.median(known), "smallest AbsRel": constant, "median of the row": rows}
+    return {name: np.atleast_2d(value) for name, value in found.items()}
 
 
 def main() -> None:

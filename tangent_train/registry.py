@@ -262,11 +262,15 @@ def _check_taken(
 ) -> None:
     """Refuse arguments that a class or function does not have, e.g. those of another one."""
     try:
-        known = inspect.signature(maker).parameters
+        known: Any = inspect.signature(maker).parameters
     except (TypeError, ValueError):  # not written in Python
         return
+    if any(one.kind is one.VAR_KEYWORD for one in known.values()):
+        if maker not in _registered:
+            return
+        known = _kinds(maker)
     unknown = [name for name in arguments if name not in known]
-    if not unknown or any(one.kind is one.VAR_KEYWORD for one in known.values()):
+    if not unknown:
         return
     name = f"{place}.{unknown[0]}"
     found, expected = f"{', '.join(unknown)} for {target}", f"settings of {', '.join(known)}"

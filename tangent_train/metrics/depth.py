@@ -24,18 +24,19 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torchmetrics import Metric
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.metrics.segmentation import (
     BAND_EDGES_DEG,
+    ImagesMetric,
     Interval,
     band_of_rows,
     bootstrap,
     defined_mean,
 )
+from tangent_train.rendering.checks import check_choice
 
 Alignment = Literal["none", "median", "scale", "affine"]
 """Alignment of a prediction with the true distances of the image: ``median`` and ``scale`` multiply
@@ -49,7 +50,6 @@ _ERRORS = ("absrel", "sqrel", "rmse", "rmse_log", "mae")
 _SHARES = ("delta1", "delta2", "delta3")
 _SUMS = 2 + len(_ERRORS) + len(_SHARES)
 _THRESHOLD = 1.25
-_PANORAMA_DIMENSIONS = 2
 
 
 @dataclass(frozen=True)
@@ -74,10 +74,8 @@ class DepthProtocol:
     clip: bool = False
 
     def __post_init__(self) -> None:
-        for name, kinds in (("alignment", Alignment), ("alignment_in", Quantity)):
-            value, options = getattr(self, name), get_args(kinds)
-            if value not in options:
-                raise SettingError(f"task.{name}", found=value, expected=" or ".join(options))
+        check_choice("task.alignment", self.alignment, get_args(Alignment))
+        check_choice("task.alignment_in", self.alignment_in, get_args(Quantity))
         if self.min_distance < 0:
             raise SettingError("task.min_distance", found=self.min_distance, expected="0 or more")
         if self.max_distance is not None and self.max_distance <= self.min_distance:
@@ -172,7 +170,7 @@ def error_sums(
     away, ratio = (d - g).abs(), torch.maximum(d / g, g / d)
     values = [known, predicted, away / g, away**2 / g, away**2, (d / g).log() ** 2, away]
     values += [predicted & (ratio < _THRESHOLD**n) for n in (1, 2, 3)]
-    if truth.ndim != _PANORAMA_DIMENSIONS:
+    if truth.ndim != 2:  # a photo
         sums = torch.stack([value.double().sum() for value in values])
         return torch.cat([sums[None], sums.new_zeros(len(BAND_EDGES_DEG), _SUMS)])
     rows = torch.stack([value.double().sum(dim=1) for value in values], dim=1)
@@ -229,23 +227,11 @@ def depth_intervals(sums: Float[np.ndarray, "images sums"]) -> dict[str, Interva
     return bootstrap(np.stack([np.where(defined, columns, 0), defined], axis=1), means)
 
 
-class DepthMetric(Metric):
+class DepthMetric(ImagesMetric):
     """Collects the errors of all images of a data set, see `error_sums`."""
 
-    full_state_update = False
-    of_images: list[Tensor]
-
     def __init__(self) -> None:
-        super().__init__()
-        self.add_state("of_images", [], dist_reduce_fx="cat")
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all images."""
-        super().reset()
-        # Processes without images contribute an empty part of the same dtype and shape.
-        shape = (0, 1 + len(BAND_EDGES_DEG), _SUMS)
-        self.of_images = [torch.zeros(shape, dtype=torch.float64, device=self.device)]
+        super().__init__(1 + len(BAND_EDGES_DEG), _SUMS)
 
     def update(self, prediction: Tensor, truth: Tensor) -> None:
         """Add the errors of one image, see `error_sums`."""

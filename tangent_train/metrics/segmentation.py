@@ -30,7 +30,6 @@ northern band."""
 Interval = tuple[float, float]
 """Lower and upper end of a score, shares of 1."""
 
-_PANORAMA_DIMENSIONS = 2
 _DRAWS_AT_ONCE = 100
 
 
@@ -215,7 +214,7 @@ def count_image(
     known, k = truth != UNKNOWN, num_classes
     pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
     bands = pairs.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
-    if truth.ndim == _PANORAMA_DIMENSIONS:
+    if truth.ndim == 2:
         height, width = truth.shape
         rows = known.nonzero()[:, 0]
         # Integer counts first, so that results do not depend on the order or the device.
@@ -238,7 +237,31 @@ def band_of_rows(height: int) -> NDArray[np.intp]:
     return np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
 
 
-class SegmentationMetric(Metric):
+class ImagesMetric(Metric):
+    """Collects numbers of each image of a data set, on all processes.
+
+    Args:
+        *shape: Shape of the numbers of an image.
+    """
+
+    full_state_update = False
+    of_images: list[Tensor]
+
+    def __init__(self, *shape: int) -> None:
+        super().__init__()
+        self._shape = shape
+        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        # Processes without images contribute an empty part of the same dtype and shape.
+        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
+        self.of_images = [empty]
+
+
+class SegmentationMetric(ImagesMetric):
     """Counts the pixels of all images of a data set, see `SegmentationCounts`.
 
     Pixels are integer counts. Equirectangular pixels over-count the poles; in the matrix of solid
@@ -248,29 +271,18 @@ class SegmentationMetric(Metric):
         num_classes: K + 1, the unknown class 0 included.
     """
 
-    full_state_update = False
     pixels: Tensor
     solid_angle: Tensor
     bands: Tensor
-    of_images: list[Tensor]
 
     def __init__(self, num_classes: int) -> None:
-        super().__init__()
+        super().__init__(2, 3, num_classes - 1)
         self.num_classes = k = num_classes
         integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
         for name, shape in integers.items():
             self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
         zeros = torch.zeros((k, k), dtype=torch.float64)
         self.add_state("solid_angle", zeros, dist_reduce_fx="sum")
-        self.add_state("of_images", [], dist_reduce_fx="cat")
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all images."""
-        super().reset()
-        # Processes without images contribute an empty part of the same dtype and shape.
-        shape = (0, 2, 3, self.num_classes - 1)
-        self.of_images = [torch.zeros(shape, dtype=torch.float64, device=self.device)]
 
     def update(
         self, prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"]

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
+from tangent_train.metrics.segmentation import BAND_EDGES_DEG
 from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Record
 from tangent_train.results.tables import Table, score_text
 
@@ -52,6 +54,18 @@ def _taken_for(row: NDArray[np.int64], label: int, class_names: Sequence[str]) -
     if not missed[other]:
         return {"taken_for": None, "taken_for_share": None}
     return {"taken_for": class_names[other], "taken_for_share": float(missed[other] / row.sum())}
+
+
+def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, Any]]:
+    """Return edges and scores of latitude bands, see `Record.latitude_bands`.
+
+    Args:
+        scores: Scores of the bands, from north to south.
+    """
+    return [
+        {"latitude_deg": [south, north]} | plain_scores(of_band)
+        for (north, south), of_band in zip(itertools.pairwise(BAND_EDGES_DEG), scores, strict=True)
+    ]
 
 
 def plain_scores(scores: Mapping[str, Any]) -> dict[str, Any]:

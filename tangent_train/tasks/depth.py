@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, get_args
@@ -16,6 +15,7 @@ from torch.nn import functional
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.samples import EvaluationSample
 from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
@@ -39,9 +39,9 @@ from tangent_train.metrics.depth import (
     error_sums,
     mean_depth_scores,
 )
-from tangent_train.metrics.segmentation import BAND_EDGES_DEG
 from tangent_train.registry import registered
-from tangent_train.results.evaluation import plain_scores
+from tangent_train.rendering.checks import check_choice
+from tangent_train.results.evaluation import latitude_entries
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import distance_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
@@ -49,7 +49,6 @@ from tangent_train.tasks.base import RGB
 from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
 from tangent_train.tasks.views import ViewsTask, labels_of_views
 
-_PANORAMA_DIMENSIONS = 2
 _LEAST = 1e-3
 """Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
 
@@ -123,19 +122,17 @@ class DepthTask(ViewsTask):
     ) -> None:
         super().__init__(network, representation, class_names, *arguments, **settings)
         of_file = getattr(network, "kind", None)
-        kinds, losses, aligns = map(get_args, (DepthKind, DepthLoss, Align))
-        if of_file is not None:
-            kinds = (of_file,)
-        for name, value, fits, expected in (
-            ("depth_kind", depth_kind, depth_kind in (None, *kinds), " or ".join(kinds)),
-            ("align", align, align in (None, *aligns), f"null, {' or '.join(aligns)}"),
-            ("loss", loss, loss in losses, " or ".join(losses)),
-            ("scale_invariance", scale_invariance, 0 <= scale_invariance <= 1, "0 to 1"),
-            ("label_smoothing", self.label_smoothing, self.label_smoothing == 0, "0 for distances"),
-        ):
-            if not fits:
-                raise SettingError(f"task.{name}", found=value, expected=expected)
         self.depth_kind: DepthKind = depth_kind or of_file or "log_distance"
+        check_choice(
+            "task.depth_kind", self.depth_kind, (of_file,) if of_file else get_args(DepthKind)
+        )
+        check_choice("task.align", align or "none", get_args(Align))
+        check_choice("task.loss", loss, get_args(DepthLoss))
+        if not 0 <= scale_invariance <= 1:
+            raise SettingError("task.scale_invariance", found=scale_invariance, expected="0 to 1")
+        if self.label_smoothing:
+            found = self.label_smoothing
+            raise SettingError("task.label_smoothing", found=found, expected="0 for distances")
         if alignment == "none" and not is_metric(self.depth_kind):
             raise SettingError(
                 "task.alignment",
@@ -147,7 +144,7 @@ class DepthTask(ViewsTask):
             alignment_in = "disparity" if is_disparity(self.depth_kind) else "distance"
         self.protocol = DepthProtocol(alignment, alignment_in, min_distance, max_distance, clip)
         self.loss: DepthLoss = loss
-        self.scale_invariance = float(scale_invariance)
+        self.scale_invariance = scale_invariance
         self.align = align
 
     @staticmethod
@@ -210,77 +207,46 @@ class DepthTask(ViewsTask):
         labels = from_distance(truth, self.depth_kind, ray_lengths)
         self.add_validation_loss(self._loss(outputs, labels), labels)
 
-    @torch.no_grad()
-    def predict_distances(
-        self,
-        images: Float[Tensor, "images channels height width"],
-        shape: tuple[int, ...],
-        ray_lengths: Float[Tensor, "some height width"],
-        rotation: NDArray[np.float64] | None = None,
-        truth: Tensor | None = None,
-        area: SphereArea | None = None,
-    ) -> Float[Tensor, "*shape"]:
-        """Predict the distances of one panorama, or of the crops of a photo.
+    def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the aligned and the true distances, see `ViewsTask`; NaN where unknown."""
+        truth = self.meters(sample.target)
+        if truth.ndim == 2:
+            return self.protocol.aligned(self._of_panorama(sample, truth), truth), truth
+        # The crops of a photo have separate scales.
+        crops = zip(self._of_crops(sample, truth), truth, sample.ray_lengths, strict=True)
+        return torch.stack([self.protocol.aligned(*crop) for crop in crops]), truth
 
-        Args:
-            images: Images of all view sets of the representation, in this order.
-            shape: Shape of the ground truth: ``(H, W)`` of the panorama, or ``(n, h, w)`` of the
-                crops.
-            ray_lengths: Ray lengths of each view set, or of each crop.
-            rotation: Rotation of the representation ``(3, 3)``.
-            truth: True distances in meters, to add to the validation loss; None to compute no loss.
-            area: Area of a partial panorama; None for the whole sphere.
-
-        Returns:
-            Distances of that shape; NaN where unknown.
-        """
-        kind = self.depth_kind
-        if len(shape) != _PANORAMA_DIMENSIONS:  # crops, each separately
-            depth = self._depth_of(images.__getitem__, len(images))
-            if truth is not None:
-                self._add_loss(depth, truth, ray_lengths)
-            lengths = ray_lengths[:, None]
-            values, kind = depth_of_output(depth, kind, lengths)
-            return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
-        outputs = []
-        for views, of_set, rays in self.view_sets(images, rotation, area):
-            depth = self._depth_of(of_set, len(views), rays)
-            if truth is not None:
+    def _of_panorama(
+        self, sample: EvaluationSample[Tensor], truth: Tensor
+    ) -> Float[Tensor, "height width"]:
+        """Predict the distances of a panorama from its views, which are aligned with each other."""
+        area = SphereArea.of_numbers(sample.area.cpu().numpy())
+        sets, outputs = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area), []
+        for views, images, rays in sets:
+            depth = self._depth_of(images, len(views), rays)
+            if not self.is_tested:
                 lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
                 self._add_loss(depth, labels_of_views(truth, views), lengths)
             outputs.append((views, depth))
-        size, blend = (shape[0], shape[1]), self.representation.blend
-        combined = combine_depth(outputs, size, kind, blend, self.align, area=area)
-        return combined.distance.to(images.device)
+        shape, blend = (truth.shape[0], truth.shape[1]), self.representation.blend
+        combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, area=area)
+        return combined.distance.to(truth.device)
+
+    def _of_crops(
+        self, sample: EvaluationSample[Tensor], truth: Tensor
+    ) -> Float[Tensor, "crops height width"]:
+        """Predict the distances of the crops of a photo, each separately."""
+        depth = self._depth_of(sample.images.__getitem__, len(truth))
+        if not self.is_tested:
+            self._add_loss(depth, truth, sample.ray_lengths)
+        lengths = sample.ray_lengths[:, None]
+        values, kind = depth_of_output(depth, self.depth_kind, lengths)
+        return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
 
     def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
         """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
         parts = view_scores(self, images, count, self.images_per_forward, rays)
         return torch.cat([depth for _, depth in parts])
-
-    def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of panoramas or photos to `metric`; return the aligned distances."""
-        predictions = []
-        for images, target, lengths, rotation, numbers in zip(
-            batch.images, batch.target, batch.ray_lengths, batch.rotation, batch.area, strict=True
-        ):
-            truth = self.meters(target)
-            distances = self.predict_distances(
-                images,
-                tuple(target.shape),
-                lengths,
-                rotation.cpu().numpy(),
-                None if self.is_tested else truth,
-                SphereArea.of_numbers(numbers.cpu().numpy()),
-            )
-            if target.ndim != _PANORAMA_DIMENSIONS:  # the crops of a photo have separate scales
-                crops = zip(distances, truth, lengths, strict=True)
-                aligned = torch.stack([self.protocol.aligned(*crop) for crop in crops])
-            else:
-                aligned = self.protocol.aligned(distances, truth)
-            self.metric.update(aligned, truth)
-            predictions.append(aligned)
-        return torch.stack(predictions)
 
     def build_metric(self) -> DepthMetric:
         """Build the metric, which keeps the sums of the errors of each image."""
@@ -295,14 +261,11 @@ class DepthTask(ViewsTask):
 
     def record(self, result: NDArray[np.float64], noun: str) -> Record:
         """Return the record with scores of latitude bands, and confidence intervals."""
-        bands = zip(itertools.pairwise(BAND_EDGES_DEG), result[:, 2:].swapaxes(0, 1), strict=True)
         return replace(
             super().record(result, noun),
-            latitude_bands=[
-                {"latitude_deg": [south, north]} | plain_scores(mean_depth_scores(band))
-                for (north, south), band in bands
-                if result[:, 1].any()
-            ],
+            latitude_bands=latitude_entries(map(mean_depth_scores, result[:, 2:].swapaxes(0, 1)))
+            if result[:, 1].any()
+            else (),
             intervals=depth_intervals(result[:, 0]) | by_solid_angle(depth_intervals(result[:, 1])),
         )
 
@@ -332,7 +295,7 @@ class DepthTask(ViewsTask):
             arrays[0],
             prediction=arrays[2],
             truth=arrays[1],
-            sphere=target.ndim == _PANORAMA_DIMENSIONS,
+            sphere=target.ndim == 2,
             note=f"AbsRel {scores['absrel']:.3g}",
         )
 

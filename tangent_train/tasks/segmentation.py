@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, get_args
@@ -15,11 +14,11 @@ from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import fill, view_scores
 from tangent_train.metrics.segmentation import (
-    BAND_EDGES_DEG,
     AbsentClass,
     SegmentationCounts,
     SegmentationMetric,
@@ -31,7 +30,7 @@ from tangent_train.metrics.segmentation import (
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.mosaic import ScoreMosaic
-from tangent_train.results.evaluation import class_entries, plain_scores
+from tangent_train.results.evaluation import class_entries, latitude_entries
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
@@ -187,22 +186,16 @@ class SegmentationTask(ViewsTask):
         loss = cross_entropy_sum(scores, labels, self.class_weights, self.label_smoothing)
         self.add_validation_loss(loss, labels)
 
-    def evaluate(self, batch: Any) -> Tensor:
-        """Add a batch of panoramas or photos to `metric`; return the predicted labels."""
-        predictions = []
-        for images, target, rotation, numbers in zip(
-            batch.images, batch.target, batch.rotation, batch.area, strict=True
-        ):
-            labels = self.predict_labels(
-                images,
-                tuple(target.shape),
-                rotation.cpu().numpy(),
-                None if self.is_tested else target,
-                SphereArea.of_numbers(numbers.cpu().numpy()),
-            )
-            predictions.append(labels)
-            self.metric.update(labels, target)
-        return torch.stack(predictions)
+    def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
+        """Return the predicted and the true labels, see `ViewsTask`."""
+        labels = self.predict_labels(
+            sample.images,
+            tuple(sample.target.shape),
+            sample.rotation.cpu().numpy(),
+            None if self.is_tested else sample.target,
+            SphereArea.of_numbers(sample.area.cpu().numpy()),
+        )
+        return labels, sample.target
 
     def build_metric(self) -> SegmentationMetric:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
@@ -221,7 +214,6 @@ class SegmentationTask(ViewsTask):
     def record(self, result: SegmentationCounts, noun: str) -> Record:
         """Return the record with scores of classes and latitude bands, and confidence intervals."""
         pixels, angles = self._scores(result)
-        bands = zip(itertools.pairwise(BAND_EDGES_DEG), result.bands, strict=True)
         intervals = [
             bootstrap_intervals(images, absent)
             for images, absent in zip(
@@ -232,14 +224,12 @@ class SegmentationTask(ViewsTask):
         return replace(
             super().record(result, noun),
             classes=class_entries(columns, result.pixels, self.class_names),
-            latitude_bands=[
-                {"latitude_deg": [south, north]}
-                | plain_scores(
-                    segmentation_scores(band, self.absent_class if band.any() else "skip").means
-                )
-                for (north, south), band in bands
-                if result.solid_angle.any()
-            ],
+            latitude_bands=latitude_entries(
+                segmentation_scores(band, self.absent_class if band.any() else "skip").means
+                for band in result.bands
+            )
+            if result.solid_angle.any()
+            else (),
             confusion=result.pixels.tolist(),
             intervals=intervals[0] | by_solid_angle(intervals[1]),
         )

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import sees_rays, upright_rays
@@ -124,6 +125,24 @@ class ViewsTask(Task):
             images, labels = self.training_pairs(batch)
             return [((images, batch.rays), labels)]
         return super().training_parts(batch)
+
+    @abstractmethod
+    def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
+        """Predict a panorama or the crops of a photo; add to the validation loss, except in a test.
+
+        Returns:
+            Prediction and truth for `metric`.
+        """
+
+    @torch.no_grad()
+    def evaluate(self, batch: Any) -> Tensor:
+        """Add a batch of panoramas or photos to `metric`; return the predictions."""
+        predictions = []
+        for fields in zip(*batch, strict=True):
+            prediction, truth = self.predict_sample(EvaluationSample(*fields))
+            self.metric.update(prediction, truth)
+            predictions.append(prediction)
+        return torch.stack(predictions)
 
     def view_sets(
         self, images: Tensor, rotation: NDArray[np.float64] | None, area: SphereArea | None

@@ -48,6 +48,24 @@ class Shapes(lightning.LightningDataModule):
     test_dataloader = val_dataloader
 
 
+class Spheres(lightning.LightningDataModule):
+    """Samples of panoramas in the lists `train` and `test`."""
+
+    def __init__(self, batch_size: int) -> None:
+        super().__init__()
+        self.batch_size = batch_size
+        self.train: Any = []
+        self.test: Any = []
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.train, self.batch_size)
+
+    def val_dataloader(self) -> DataLoader[Any]:
+        return DataLoader(self.test, batch_size=2)
+
+    test_dataloader = val_dataloader
+
+
 class SmallNetwork(nn.Module):
     """Without batch statistics, a gradient does not depend on what is computed together."""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import lightning
 import numpy as np
 import pytest
 import torch
@@ -19,7 +18,7 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import SegmentationTask
-from tests.tasks.shapes import quiet_trainer
+from tests.tasks.shapes import Spheres, quiet_trainer
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 
@@ -34,20 +33,17 @@ def _sample(images: Tensor, target: Tensor) -> Any:
     return EvaluationSample(images, target, torch.eye(3).double(), ONE, WHOLE, 0)
 
 
-class Data(lightning.LightningDataModule):
+class Data(Spheres):
     """Panoramas whose class is the sign of the first channel.
 
     In training the second one is unknown, and of the first images of the others nearly all.
     """
 
     def __init__(self, count: int = 3, batch_size: int = 2) -> None:
-        super().__init__()
-        self.batch_size = batch_size
+        super().__init__(batch_size)
         rng = np.random.default_rng(0)
         coarse = rng.normal(size=(count, 2, 4, 8, 1)).astype(np.float32)
         panoramas = coarse.repeat(8, axis=2).repeat(8, axis=3)
-        self.train: Any = []
-        self.test: Any = []
         for signal, other in panoramas:
             truth = np.where(signal > 0, 2, 1).astype(np.uint8)[..., 0]
             truth[:2] = 0
@@ -59,14 +55,6 @@ class Data(lightning.LightningDataModule):
             labels *= len(self.train) != 1
             self.train.append(TrainingSample(tensor, labels, torch.tensor(whole.rays()), ONE, 0))
             self.test.append(_sample(tensor, torch.from_numpy(truth)))
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.train, self.batch_size)
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.test, batch_size=2)
-
-    test_dataloader = val_dataloader
 
     def class_weights(self, kind: str) -> Tensor:
         return {"none": torch.ones(2), "log": WEIGHTS}[kind]
