@@ -32,7 +32,7 @@ from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
 from tangent_train.checkpoints.content import Align, DepthKind
-from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity
+from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity, is_metric
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
 from tangent_train.rendering.accumulate import NO_OWNERS
@@ -241,8 +241,8 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     Args:
         parts: Samples of all sets of views.
         kind: Kind of the values, see `depth_of_output`.
-        mode: The correction; None for `scale` of metric and `affine` of relative kinds, and for
-            `none` of a single view. `grid` adds a grid of corrections to it.
+        mode: The correction; None for `scale` of metric and `affine` of relative kinds, to which
+            `grid` adds a grid of corrections. A single view is not corrected.
 
     Raises:
         SettingError: The mode is unknown, or `grid` is given for views without positions.
@@ -250,8 +250,8 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     check_choice("align", mode or "none", get_args(Align))
     samples = ViewSamples.joined(parts)
     view, count, value = samples.view, samples.num_views, samples.value
-    usual: Align = "affine" if kind.startswith("relative") else "scale"
-    mode = mode or (usual if count > 1 else "none")
+    usual: Align = "scale" if is_metric(kind) else "affine"
+    mode = (mode or usual) if count > 1 else "none"
     if mode == "grid" and np.isnan(samples.position).any():
         expected = "none, scale or affine, for views that are not pinhole images"
         raise SettingError("align", found="grid", expected=expected)

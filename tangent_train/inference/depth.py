@@ -87,7 +87,7 @@ def combine_depth(
         shape: ``(H, W)`` of the panorama or photo.
         kind: Kind of the output.
         blend: Blend of the views.
-        align: See `Align`; None for that of the kind, and `none` for a single view.
+        align: See `alignment.align`.
         area: Area of a partial panorama: views are compared inside it. None for the whole sphere.
         camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
 
@@ -101,17 +101,17 @@ def combine_depth(
         lengths = torch.from_numpy(views.ray_lengths()).to(raw)
         depth, depth_kind = depth_of_output(raw, kind, lengths[:, None])
         samples.append(sample_views(depth[:, 0].cpu().numpy(), views, shape, points))
-        sets.append((views, depth, lengths, count))
+        sets.append((views, depth, count))
         count += len(views)
-    alignment = align_views(samples, depth_kind, align if count > 1 else "none")
+    alignment = align_views(samples, depth_kind, align)
     mosaic = DepthMosaic(shape, blend, device=outputs[0][1].device)
-    for views, depth, lengths, start in sets:
+    for views, depth, start in sets:
         step = views_per_forward((depth.shape[-2], depth.shape[-1]))
         for first in range(0, len(views), step):
             part = slice(first, min(first + step, len(views)))
             numbers = slice(start + part.start, start + part.stop)
-            of_part = lengths[part] if len(lengths) > 1 else lengths
-            mosaic.add(alignment.applied(depth[part], numbers, of_part), views[part])
+            lengths = torch.from_numpy(views[part].ray_lengths())
+            mosaic.add(alignment.applied(depth[part], numbers, lengths), views[part])
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
         distance = distance / _median(distance, area, camera_matrix)

@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tangent_train.geometry import equirect_latitudes, equirect_longitudes
 from tangent_train.rendering.compiled import njit_exact, over_rows
 
 Array = NDArray[Any]
@@ -39,9 +40,7 @@ _COPIED = 36
 
 def sphere_rays(shape: tuple[int, int]) -> Rays:
     """Return the rays of a panorama, unit directions: cos λ, sin λ and cos φ, sin φ."""
-    height, width = shape
-    lon = (np.arange(width) + 0.5) / width * 2 * np.pi - np.pi
-    lat = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    lat, lon = equirect_latitudes(shape[0]), equirect_longitudes(shape[1])
     return np.stack([np.cos(lon), np.sin(lon)]), np.stack([np.cos(lat), np.sin(lat)], -1)
 
 

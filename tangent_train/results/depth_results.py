@@ -53,9 +53,11 @@ def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
     Returns:
         ``(2, n)`` rows and columns of the depth map.
     """
-    grown = np.cumsum(np.where(np.isfinite(predicted.pixels), solid_angles(predicted), 0))
-    steps = np.floor(grown * (count / (grown[-1] or 1)))
-    chosen = np.flatnonzero(np.diff(steps, prepend=0) > 0)
+    grown = np.where(np.isfinite(predicted.pixels), solid_angles(predicted), 0).ravel()
+    np.cumsum(grown, out=grown)  # in place, which saves memory
+    grown *= count / (grown[-1] or 1)
+    np.floor(grown, out=grown)
+    chosen = np.flatnonzero(np.concatenate([grown[:1] > 0, grown[1:] > grown[:-1]]))
     return np.stack(np.unravel_index(chosen, predicted.pixels.shape))
 
 

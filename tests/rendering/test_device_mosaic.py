@@ -69,10 +69,7 @@ SETS: dict[str, tuple[Callable[[Blend], Any], tuple[int, int]]] = {
 }
 
 
-def _filled(
-    sets: Any, shape: tuple[int, int], classes: int, scores: Any, **settings: Any
-) -> ScoreMosaic:
-    mosaic = ScoreMosaic(shape, classes, **settings)
+def _filled(mosaic: Any, sets: Any, scores: Any) -> Any:
     for views, of_set in zip(sets, scores, strict=True):
         for start in range(0, len(views), 7):
             mosaic.add(of_set[start : start + 7], views[start : start + 7])
@@ -94,15 +91,12 @@ def _scores(sets: Any, classes: int) -> list[torch.Tensor]:
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
 def test_torch_blends_depth_as_the_compiled_kernels_do(name: str, blend: Blend) -> None:
     make, shape = SETS[name]
-    sets, found = make(blend), []
+    sets = make(blend)
     depth = [scores.where(scores > -2, torch.nan) for scores in _scores(sets, 1)]
-    for backend in ("numba", "torch"):
-        mosaic = DepthMosaic(shape, blend, backend=backend)
-        for views, of_set in zip(sets, depth, strict=True):
-            for start in range(0, len(views), 7):
-                mosaic.add(of_set[start : start + 7], views[start : start + 7])
-        found.append(mosaic.values())
-    expected, values = found
+    expected, values = (
+        _filled(DepthMosaic(shape, blend, backend=backend), sets, depth).values()
+        for backend in ("numba", "torch")
+    )
     unknown = expected.isnan()
     # Weights at the limit differ by rounding.
     assert (values.isnan() == unknown).double().mean() > 0.9999
@@ -123,7 +117,7 @@ def test_torch_agrees_with_the_compiled_kernels(
     settings = settings | {"blend": blend, "averaged": len(sets) > 1 or "averaged" in settings}
     scores = _scores(sets, classes)
     compiled, of_torch = (
-        _filled(sets, shape, classes, scores, backend=backend, **settings)
+        _filled(ScoreMosaic(shape, classes, backend=backend, **settings), sets, scores)
         for backend in ("numba", "torch")
     )
     expected, found = compiled.labels(), of_torch.labels()
@@ -151,7 +145,7 @@ def test_nothing_leaves_the_device(name: str, blend: Blend) -> None:
             on_device = [torch.empty(of_set.shape) for of_set in scores]
             how: Any = {"blend": blend, "averaged": averaged, "device": "cuda"}
             how["min_confidence"] = 0.1 * averaged
-            labels = _filled(sets, shape, 4, on_device, **how).labels()
+            labels = _filled(ScoreMosaic(shape, 4, **how), sets, on_device).labels()
         assert labels.device.type == "cuda"
         assert set(transfers) <= {"from {'cpu'} to {'cuda'}"}
 
