@@ -111,3 +111,14 @@ def quiet_trainer(**settings: Any) -> lightning.Trainer:
         "use_distributed_sampler": False,
     }
     return lightning.Trainer(**(quiet | settings))
+
+
+def gradients_of(
+    task: lightning.LightningModule, data: lightning.LightningDataModule, **trainer: Any
+) -> Gradients:
+    """The gradients and the loss of the last step of an epoch."""
+    kept = Gradients()
+    callbacks = [kept, *trainer.pop("callbacks", [])]
+    trainer = {"max_epochs": 1, "limit_val_batches": 0, "callbacks": callbacks} | trainer
+    quiet_trainer(**trainer).fit(task, datamodule=data)
+    return kept

@@ -21,7 +21,7 @@ from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.results.evaluation import result_tables
 from tangent_train.tasks import DepthTask
-from tests.tasks.shapes import Gradients, Spheres, quiet_trainer
+from tests.tasks.shapes import Spheres, gradients_of, quiet_trainer
 from tests.tasks.test_segmentation import WHOLE
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
@@ -173,20 +173,6 @@ def _network() -> nn.Module:
     return nn.Sequential(nn.Conv2d(2, 8, 3, padding=1), nn.ReLU(), last)
 
 
-def _gradients(images_per_chunk: int | None, batch_size: int = 3, **settings: Any) -> list[Tensor]:
-    """Return the gradients of a step of three panoramas."""
-    found = Gradients()
-    trainer = quiet_trainer(
-        max_epochs=1,
-        limit_val_batches=0,
-        accumulate_grad_batches=3 // batch_size,
-        callbacks=[found],
-    )
-    task = _task(_network(), images_per_chunk=images_per_chunk, **settings)
-    trainer.fit(task, datamodule=Data(batch_size))
-    return found.found
-
-
 @pytest.mark.parametrize("kind", ["log_distance", "metric_z", "relative_disparity"])
 @pytest.mark.parametrize("loss", ["log_l1", "scale_invariant"])
 def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
@@ -206,7 +192,9 @@ def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
     expected = torch.autograd.grad(mean, list(network.parameters()))
     whole = torch.cat([part.flatten() for part in expected])
     for size, batch_size in ((None, 3), (7, 3), (7, 1)):
-        found = torch.cat([g.flatten() for g in _gradients(size, batch_size, **settings)])
+        trained = _task(_network(), images_per_chunk=size, **settings)
+        kept = gradients_of(trained, Data(batch_size), accumulate_grad_batches=3 // batch_size)
+        found = torch.cat([gradient.flatten() for gradient in kept.found])
         assert float((found - whole).norm() / whole.norm()) < 1e-4
 
 
@@ -232,7 +220,6 @@ def test_the_auxiliary_head_adds_its_loss() -> None:
         (nn.Identity(), {"align": "median"}, "task.align"),
         (nn.Identity(), {"scale_invariance": 1.5}, "task.scale_invariance"),
         (nn.Identity(), {"label_smoothing": 0.1}, "task.label_smoothing"),
-        (nn.Identity(), {"max_distance": -1.0}, "task.max_distance"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(

@@ -16,7 +16,7 @@ from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
 
 from tangent_train.tasks import SegmentationTask
-from tests.tasks.shapes import Gradients, quiet_trainer
+from tests.tasks.shapes import gradients_of
 from tests.tasks.test_segmentation import NAMES, TANGENT, WEIGHTS, Data
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
@@ -46,13 +46,9 @@ def _gradients(
     images_per_chunk: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
     """Return the gradients of the last step of an epoch of three spheres, and its last loss."""
-    gradients = Gradients()
-    given = {"max_epochs": 1, "accumulate_grad_batches": 3 // batch_size} | (trainer or {})
-    callbacks = {"callbacks": [gradients, *given.get("callbacks", [])]}
-    quiet_trainer(limit_val_batches=0, **given | callbacks).fit(
-        _task(images_per_chunk, **settings), datamodule=Data(batch_size=batch_size)
-    )
-    return gradients.found, gradients.loss
+    given = {"accumulate_grad_batches": 3 // batch_size} | (trainer or {})
+    kept = gradients_of(_task(images_per_chunk, **settings), Data(batch_size=batch_size), **given)
+    return kept.found, kept.loss
 
 
 def _expected(batch_size: int, batches: int | None = None) -> tuple[list[Tensor], Tensor]:
