@@ -45,7 +45,7 @@ meanings of the settings are on the page [Settings](settings.md).
 _PROTOCOLS = """# Protocols
 
 A protocol is the set of facts that decide which scores can be compared. Every run derives its facts
-from its data set, its settings and its task and stores them in
+from its data set, its settings and its task, prints them below the scores and stores them in
 [results.json](file_formats.md#resultsjson). `tangent-report` and `results.md` show a published
 score beside a result if all facts are the same, and name the facts in which the nearest other
 protocols differ. Different data sets are not compared.
@@ -62,6 +62,7 @@ protocols differ. Different data sets are not compared.
 | `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
 | `alignment` | of depth: alignment with the true distances, in distance or disparity |
 | `range` | of depth: true distances that count, and whether predictions are clipped to them |
+| `views_aligned` | of depth of panoramas: alignment of the views with each other |
 | `images` | number of test images, if some are missing or were left out as broken: `2 of 100` |
 | `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
 | | `pixels, then images`: the mean over the pixels of each image, then over the images |

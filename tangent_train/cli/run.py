@@ -38,9 +38,9 @@ from tangent_train.inference.representations import check_size
 from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
-    headline,
     plain_scores,
     result_tables,
+    summary_lines,
     write_results,
 )
 from tangent_train.results.html import write_report
@@ -200,7 +200,7 @@ class Run:
             settings=dict(flat_settings(self.settings)),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
-        published = Comparison.of([record])
+        summary, published = summary_lines(record), Comparison.of([record])
         write_results(record, self.folder, [*notes, *published.notes], published.tables(record))
         write_report(
             self.folder / "report.html",
@@ -208,9 +208,9 @@ class Run:
             tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
             class_names=self.task.class_names,
-            notes=[headline(record), *notes],
+            notes=[*summary, *notes],
         )
-        for line in (*self.notes, headline(record)):
+        for line in (*self.notes, *summary):
             print_text(line)
         tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")

@@ -87,6 +87,12 @@ def headline(record: Record) -> str:
     return f"{', '.join(means)} over {over}".strip() + legend
 
 
+def summary_lines(record: Record) -> list[str]:
+    """Return the headline and, below it, the facts of the protocol, if there are any."""
+    facts = (f"{name.replace('_', ' ')}: {fact}" for name, fact in record.protocol.items())
+    return list(filter(None, (headline(record), "; ".join(facts))))
+
+
 def result_tables(record: Record) -> list[Table]:
     """Return a table of scores per class, or over all images, by latitude, and by group.
 
@@ -187,5 +193,5 @@ def write_results(
     lines = [{**entry, **network} for entry in record.classes or [record.means]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in (*result_tables(record), *published))
-    text = "\n\n".join(["# Results", headline(record), *notes, tables])
+    text = "\n\n".join(["# Results", *summary_lines(record), *notes, tables])
     write_text(folder / "results.md", text)

@@ -82,6 +82,8 @@ class DepthTask(ViewsTask):
 
     Attributes:
         result: Sums ``(images, 8, 10)`` of the last evaluation, see `error_sums`.
+        views_aligned: Alignment of the views of the last panorama with each other; None before the
+            first panorama, and for photos.
     """
 
     labels: ClassVar[str] = DISTANCE
@@ -146,6 +148,7 @@ class DepthTask(ViewsTask):
         self.loss: DepthLoss = loss
         self.scale_invariance = scale_invariance
         self.align = align
+        self.views_aligned: Align | None = None
 
     @staticmethod
     def num_outputs(num_classes: int) -> int:
@@ -230,6 +233,7 @@ class DepthTask(ViewsTask):
             outputs.append((views, depth))
         shape, blend = (truth.shape[0], truth.shape[1]), self.representation.blend
         combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, area=area)
+        self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
 
     def _of_crops(
@@ -271,8 +275,12 @@ class DepthTask(ViewsTask):
 
     @property
     def facts(self) -> dict[str, str]:
-        """See `Task`: errors are those of the pixels of an image, averaged over the images."""
-        return {"weighting": "pixels, then images", **self.protocol.facts}
+        """See `Task`: errors are those of the pixels of an image, averaged over the images.
+
+        The alignment of views is known after an evaluation on panoramas.
+        """
+        views = {} if self.views_aligned is None else {"views_aligned": self.views_aligned}
+        return {"weighting": "pixels, then images", **self.protocol.facts, **views}
 
     def picture(
         self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None

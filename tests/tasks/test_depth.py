@@ -138,6 +138,7 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
     result, task.evaluated = task.metric.compute(), 1
     assert task.logged_scores(result)["absrel"] < 1e-3
+    assert "views_aligned" not in task.facts
     (table,) = result_tables(task.record(result, "photos"))
     assert not any("solid angle" in name for name, _ in table.rows)
 
@@ -151,10 +152,11 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
 
     errors = {}
     for align in (None, "scale", "none"):
-        (scores,) = quiet_trainer().test(
-            _task(Scaled(), align=align, alignment="median"), datamodule=Data(), verbose=False
-        )
+        task = _task(Scaled(), align=align, alignment="median")
+        assert "views_aligned" not in task.facts
+        (scores,) = quiet_trainer().test(task, datamodule=Data(), verbose=False)
         errors[align] = scores["test/absrel"]
+        assert task.facts["views_aligned"] == (align or "scale")
     assert errors[None] == errors["scale"] < 0.1 < 0.2 < errors["none"]
 
 

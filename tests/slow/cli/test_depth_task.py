@@ -77,7 +77,9 @@ def test_the_best_epoch_has_the_smallest_error_and_is_reported(folder: Path, run
     assert means.keys() >= {"absrel", "delta1", "mae", "absrel_solid_angle"}
 
 
-def test_evaluation_takes_other_alignments_and_limits(run: Run) -> None:
+def test_evaluation_takes_other_alignments_and_limits(
+    run: Run, capsys: pytest.CaptureFixture[str]
+) -> None:
     checkpoint = "checkpoint=whole/checkpoints/best.ckpt"
     run("evaluate", checkpoint, "hydra.run.dir=again")
     assert results(Path("again")) == results(Path("whole"))
@@ -87,6 +89,12 @@ def test_evaluation_takes_other_alignments_and_limits(run: Run) -> None:
     assert content["protocol"]["alignment"] == "affine in distance"
     assert content["protocol"]["range"] == "0 to 3 m, predictions clipped"
     assert content["rmse"] < results(Path("whole"))["rmse"]
+    facts = (
+        "alignment: affine in distance; range: 0 to 3 m, predictions clipped; views aligned: none"
+    )
+    printed = capsys.readouterr().out
+    pages = [Path("aligned", name).read_text() for name in ("results.md", "report.html")]
+    assert all(facts in " ".join(text.split()) for text in (printed, *pages))
 
 
 def test_a_resumed_run_is_the_same(run: Run) -> None:
