@@ -125,7 +125,7 @@ class DepthResults(ImageResults):
         if "depth" in files:
             write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
         if "color" in files:
-            picture = distance_picture(predicted.pixels, "m" if self.is_metric else "")
+            picture = distance_picture(predicted.pixels, "m" if self.is_metric else "relative")
             write_pixels(files["color"], picture)
         if "points" in files:
             from trimesh import PointCloud  # half a second

@@ -208,7 +208,7 @@ def distance_picture(distance: NDArray[np.floating], unit: str) -> _Image:
 
     Args:
         distance: Distances ``(H, W)``, see `colorize_distance`.
-        unit: Unit that is printed after the distances.
+        unit: Unit, e.g. m, or relative; it is printed after the last distance.
 
     Returns:
         RGB image of the same width, higher by the bar, whose text grows with the width.
@@ -217,7 +217,7 @@ def distance_picture(distance: NDArray[np.floating], unit: str) -> _Image:
     width = distance.shape[1]
     scale = max(1, round(width / _LEGEND_WIDTH))
     bar = np.full((22 * scale, width, 3), 255, np.uint8)
-    near, far = (f"{limit:.3g} {unit}" for limit in limits)
+    near, far = f"{limits[0]:.3g}", f"{limits[1]:.3g} {unit}"
     left, right = ((16 + 9 * len(text)) * scale for text in (near, far))
     ramp = np.linspace(0, 255, max(0, width - left - right)).astype(np.uint8)
     bar[4 * scale : 18 * scale, left : left + len(ramp)] = distance_colors()[ramp]

@@ -85,6 +85,9 @@ def test_pictures_have_a_bar_of_their_colors() -> None:
     ramp = np.flatnonzero((bar == distance_colors()[0]).all(axis=-1))[0]
     assert (bar[ramp:][:100].astype(int).sum(axis=-1)[::10] > bar[-80].min()).all()
     assert picture[40:, : ramp - 2].min() < 100, "text"
+    named = distance_picture(distance, "relative")
+    assert not np.ptp(named[40:, -110:], axis=-1).any(), "gray text on white"
+    assert named[40:, -75:].min() < 100
     assert distance_picture(np.full((8, 20), np.nan), "m").shape == (30, 20, 3)
 
 
