@@ -19,6 +19,8 @@ from tangent_train.registry import nearest
 _COMPLETED = "fine_tuning.optimizer"
 """A section that is completed with the settings of ``optimizer`` and may have any of these."""
 
+_MOST_OPTIONS = 3
+
 
 @cache
 def declared_settings(command: str) -> Mapping[str, Any]:
@@ -88,12 +90,21 @@ def probable_name(command: str, message: str) -> str:
         for file in sorted((config_folder() / section.rpartition(".")[2]).glob("*.yaml"))
         for key, value in (yaml.safe_load(file.read_text("utf-8")) or {}).items()
     }
-    if name in inner:  # a setting of another option
-        return ""
+    if name in inner:
+        return f"It is a setting of {_options_with(name)}. "
     for one, value in inner.items():  # but not one that copies the missing setting
         if one.endswith(f".{name}") and value != f"${{{name}}}":
             return f"Is {one} meant? "
     return _other_command(command, name) or nearest(name, [*declared, *inner])
+
+
+def _options_with(name: str) -> str:
+    """Return the options of a group whose files have a setting, e.g. task=depth."""
+    section, _, key = name.rpartition(".")
+    files = sorted((config_folder() / section.rpartition(".")[2]).glob("*.yaml"))
+    stems = [file.stem for file in files if key in (yaml.safe_load(file.read_text("utf-8")) or {})]
+    more = " or others" if len(stems) > _MOST_OPTIONS else ""
+    return " or ".join(f"{section}={stem}" for stem in stems[:_MOST_OPTIONS]) + more
 
 
 def _other_command(command: str, name: str) -> str:
