@@ -495,6 +495,7 @@ def test_labels_without_settings_are_those_of_wide_rings(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
+        (("classes=null",), "classes: found none; .*For a depth network, set depth= to one of log"),
         (("classes=three.json",), "^tangent-import: class names .*: found 3, for 4 scores; exp"),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("classes=escapes.json",), r"escapes\.json: found .*; expected a JSON list"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from torch import nn
 
@@ -62,7 +62,12 @@ def class_names_in(path: Path | None) -> tuple[str, ...]:
     """
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
     if path is None:
-        raise SettingError("classes", found="none", expected=f"a file with {expected}")
+        raise SettingError(
+            "classes",
+            found="none",
+            expected=f"a file with {expected}",
+            remedy=f"For a depth network, set depth= to one of {', '.join(get_args(DepthKind))}.",
+        )
     return names_of(read_json(path, expected), path, expected)
 
 

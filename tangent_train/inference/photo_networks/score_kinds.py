@@ -157,11 +157,12 @@ def trial_output(network: PhotoNetwork, image: Tensor) -> Tensor:
         if isinstance(error, SettingError) and str(error.subject).startswith("output of"):
             raise
         raise SettingError(
-            "image_size",
-            found=f"{width_height(image.shape[2:])}, which the network does not take "
-            f"({type(error).__name__}: {first_line(error)})",
-            expected="the size of its RGB images",
-            remedy="Set image_size=[rows,columns]. Networks for other images cannot be imported.",
+            "network",
+            found=f"{type(error).__name__} ({first_line(error)}) for an RGB image of "
+            f"{width_height(image.shape[2:])}",
+            expected="scores, labels or depth",
+            remedy="If it needs another size, set image_size=[rows,columns]. "
+            "Networks for other images than RGB cannot be imported.",
         ) from error
     scores = scores[:, None] if scores.ndim == image.ndim - 1 else scores
     if scores.shape[0] != 1 or scores.shape[2:] != image.shape[2:]:

@@ -133,7 +133,7 @@ def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:
     assert "fov_model" not in json.dumps([*trained.inner.state_dict()])
     change_json(tmp_path / "preprocessor_config.json", size={"height": 128, "width": 128})
     with pytest.raises(
-        SettingError, match=r"image_size: found 128 × 128 .*SettingError: .*expected 64 × 64"
+        SettingError, match=r"network: found SettingError \(.*expected 64 × 64.*image of 128 × 128"
     ):
         imported(tmp_path)
 

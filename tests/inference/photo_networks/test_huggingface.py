@@ -84,7 +84,7 @@ def test_a_network_for_images_of_one_size_is_imported(tmp_path: Path) -> None:
     trained = networks.imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
     network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
-    with pytest.raises(SettingError, match=r"image_size: found 64 × 65 .*, which the network"):
+    with pytest.raises(SettingError, match=r"^network: found .* image of 64 × 65 "):
         import_network(network, tmp_path / "large.ckpt", image_size=(65, 64))
 
 

@@ -385,6 +385,10 @@ class Wrong(nn.Module):
         (5, lambda x: x, NAMES[:4], "found 4, for 5 scores"),
         (5, lambda x: x.sigmoid(), NAMES[:4], "found 4, for 5 scores"),
         (5, lambda x: x.argmax(1), NAMES[:4], "found 4, for labels 0, 1, 2, 3, 4"),
+        (
+            *(2, lambda x: x + None, NAMES[:2]),
+            r"network: found TypeError \(unsupp.* of 24 × 16 .*If .* another size, set image_size",
+        ),
         (2, lambda x: x[:, :, 1:], NAMES[:2], r"output of the network: found \(1, 2, 15, 24\)"),
     ],
 )

@@ -120,7 +120,7 @@ def test_a_network_of_one_size_gets_images_of_this_size(tmp_path: Path) -> None:
     original.eval().save_pretrained(tmp_path / "net")
     (tmp_path / "classes.json").write_text(json.dumps(NAMES))
     network = _load(tmp_path / "net", "unit")
-    with pytest.raises(SettingError, match=r"found 512 × 512 .*, which .* Set image_size=\[rows"):
+    with pytest.raises(SettingError, match=r"image of 512 × 512 .* set image_size=\[rows"):
         import_network(network, tmp_path / "net.ckpt")
     import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), levels=9, base_level=0)
     trained = load_trained(tmp_path / "net.ckpt")
