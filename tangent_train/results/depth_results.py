@@ -172,5 +172,5 @@ class DepthResults(ImageResults):
             if any(values):
                 mean = np.mean(values) * (100 if "%" in title else 1)
                 rows.append([title.format(unit=unit), f"{mean:.3g}"])
-        kind = "depth in meters" if self.is_metric else "relative depth: the median is 1"
+        kind = "depth in meters" if self.is_metric else "relative depth: the median distance is 1"
         return Table(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
