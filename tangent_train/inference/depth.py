@@ -10,6 +10,7 @@ import torch
 
 from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
+from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_solid_angles,
     equirect_to_lonlat,
