@@ -236,7 +236,8 @@ class Alignment:
 def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = None) -> Alignment:
     """Fit corrections of views to each other.
 
-    The median scale of each group of overlapping views is 1, so that metric depth remains metric.
+    Distances in the median view of each group of overlapping views keep their median, so that
+    metric depth remains metric.
 
     Args:
         parts: Samples of all sets of views.
@@ -267,10 +268,14 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     elif base == "affine" and len(outliers):
         scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
     groups = pairs.groups(count)
-    unit = np.exp(_medians(np.log(scale), groups))
-    scale, shift = scale / unit, shift / unit
     before = _logarithm(value * factor)
     after = _logarithm((scale[view] * value + shift[view]) * factor)
+    changes = np.log(scale)
+    if is_metric(kind) and shift.any():  # distances change by other factors than the scales
+        for number in np.unique(view[np.isfinite(after - before)]):
+            changes[number] = np.nanmedian((after - before)[view == number])
+    unit = np.exp(_medians(changes, groups))
+    scale, shift, after = scale / unit, shift / unit, after - np.log(unit)[view]
     if mode == "grid" and len(outliers):
         grid, added, outliers = _fit_grid(pairs, after, samples)
         grid -= _medians(grid.mean(axis=(1, 2)), groups)[:, None, None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.inference.depth import combine_depth
 from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
 from tangent_train.rendering.backward import tangent_to_equirect
-from tangent_train.rendering.checks import Blend, blend_of, check_panorama
+from tangent_train.rendering.checks import Blend, blend_of, check_choice, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.tables import owners
@@ -41,7 +41,7 @@ def apply(
     *,
     images_per_call: int | None = None,
     align: Align | None = None,
-    kind: DepthKind = "metric_z",
+    kind: DepthKind | None = None,
 ) -> Pixels:
     """Apply a function of images to a panorama: scores, depth, features, masks.
 
@@ -65,7 +65,8 @@ def apply(
         align: Correction of the depth of each image: ``scale``, ``affine`` (a scale and a shift),
             ``grid`` (also a coarse grid of scales) or ``none``. None for results that are not
             depth.
-        kind: Kind of depth that the function returns, see `DepthKind`; used with `align`.
+        kind: Kind of depth that the function returns, see `DepthKind`; only with `align`, which
+            takes ``metric_z`` by default.
 
     Returns:
         An array ``(H, W[, K])``, or a tensor ``(H, W)`` or ``(K, H, W)`` on the panorama's device:
@@ -90,13 +91,19 @@ def apply(
             expected="(C, H, W)",
             remedy="Call apply for each panorama of a batch.",
         )
+    check_choice("kind", kind or "metric_z", get_args(DepthKind))
+    if kind is not None and align is None:
+        expected = "None without align="
+        raise SettingError("kind", found=kind, expected=expected, remedy="For depth: align='scale'")
     step = max(1, _PIXELS_PER_CALL // math.prod(grid.size))
     if images_per_call is not None:
         step = at_least("images_per_call", images_per_call, 1)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     parts: Iterator[_Part] = _results(function, panorama, grid, step)
     if align is not None:
-        return _like(panorama, _distance(parts, grid, (rows, columns), blend, kind, align))
+        return _like(
+            panorama, _distance(parts, grid, (rows, columns), blend, kind or "metric_z", align)
+        )
     start = next(parts)
     first: NDArray[Any] = start[1]
     parts = chain([start], parts)
@@ -181,6 +188,12 @@ def _distance(
         )
     depth = depth.reshape(-1, 1, *grid.size)
     found = combine_depth([(PinholeViews(grid), depth)], shape, kind, blend, align)
+    if not found.distance.isfinite().any():
+        raise SettingError(
+            "result of the function",
+            found=f"no depth that {kind} with align={align} can use",
+            expected="finite depth, larger than 0",
+        )
     return found.distance.numpy()
 
 

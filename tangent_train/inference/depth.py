@@ -10,6 +10,7 @@ import torch
 
 from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
+from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_solid_angles,
     equirect_to_lonlat,
@@ -21,6 +22,7 @@ from tangent_train.inference.alignment import lattice, sample_views, sphere_poin
 from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic
+from tangent_train.rendering.representations.views import Representation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -41,12 +43,18 @@ _MEDIAN_POINTS = 2**16
 """Number of pixels, about, from which the median distance is computed."""
 
 
+_FARTHEST = 100.0
+"""Multiples of the median beyond which relative depth is unknown, like sky: small errors of the
+disparity change it without limit."""
+
+
 @dataclass(frozen=True)
 class DistanceMap:
     """Distances from the center along the rays of a panorama or photo.
 
     Attributes:
-        distance: ``(H, W)`` float32, NaN where unknown: meters, or multiples of the median.
+        distance: ``(H, W)`` float32, NaN where unknown: meters, or multiples of the median, up to
+            100.
         is_metric: True for meters. False for a median distance of 1, by solid angle.
         report: Facts about the alignment of the views.
     """
@@ -115,7 +123,26 @@ def combine_depth(
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
         distance = distance / _median(distance, area, camera_matrix)
+        distance = distance.where(distance <= _FARTHEST, torch.nan)
     return DistanceMap(distance, is_metric(kind), alignment.report)
+
+
+def check_align(setting: str, align: Align | None, representation: Any) -> None:
+    """Refuse to align a panorama's only view, such as the whole equirectangular image.
+
+    Args:
+        setting: Name of the setting, for the message.
+        align: Its value.
+        representation: Views of panoramas; None or others for photos, which may have one crop.
+
+    Raises:
+        SettingError: There is only one view, and a correction is given.
+    """
+    if align in (None, "none") or not isinstance(representation, Representation):
+        return
+    if sum(map(len, representation.view_sets())) == 1:
+        expected = "null or none: the panorama is one view, with nothing to align it to"
+        raise SettingError(setting, found=align, expected=expected)
 
 
 class DepthPredictor(ViewPredictor):
@@ -129,7 +156,7 @@ class DepthPredictor(ViewPredictor):
         align: See `combine_depth`.
 
     Raises:
-        SettingError: See `ViewPredictor`; or the alignment is unknown.
+        SettingError: See `ViewPredictor`; or the views cannot be aligned in this way.
     """
 
     def __init__(
@@ -141,6 +168,7 @@ class DepthPredictor(ViewPredictor):
         align: Align | None = None,
     ) -> None:
         check_choice("align", align or "none", get_args(Align))
+        check_align("align", align, getattr(view_sets, "representation", None))
         super().__init__(trained, view_sets, device, images_per_forward)
         self._kind: Any = trained.depth_kind
         self._align = align

@@ -172,5 +172,10 @@ class DepthResults(ImageResults):
             if any(values):
                 mean = np.mean(values) * (100 if "%" in title else 1)
                 rows.append([title.format(unit=unit), f"{mean:.3g}"])
-        kind = "depth in meters" if self.is_metric else "relative depth: the median is 1"
+        steps = [(e["depth"].get("step_before"), e["depth"].get("step_after")) for e in entries]
+        if worse := sum(None not in step and step[1] > step[0] for step in steps):
+            rows.append(
+                ["images whose views agree less than before: try another align", str(worse)]
+            )
+        kind = "depth in meters" if self.is_metric else "relative: median distance 1"
         return Table(f"Mean over the images ({kind})", ["quantity", "mean"], rows)

@@ -27,7 +27,7 @@ from tangent_train.checkpoints.distances import (
 )
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
-from tangent_train.inference.depth import combine_depth
+from tangent_train.inference.depth import check_align, combine_depth
 from tangent_train.inference.engine import view_scores
 from tangent_train.metrics.depth import (
     Alignment,
@@ -129,6 +129,7 @@ class DepthTask(ViewsTask):
             "task.depth_kind", self.depth_kind, (of_file,) if of_file else get_args(DepthKind)
         )
         check_choice("task.align", align or "none", get_args(Align))
+        check_align("task.align", align, representation)
         check_choice("task.loss", loss, get_args(DepthLoss))
         if not 0 <= scale_invariance <= 1:
             raise SettingError("task.scale_invariance", found=scale_invariance, expected="0 to 1")

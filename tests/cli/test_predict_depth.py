@@ -151,7 +151,7 @@ def test_relative_depth_is_marked(
     entry = predict(checkpoint=tmp_path / "relative.ckpt", align="none")["a"]["depth"]
     assert entry["unit"] == "relative"
     assert entry["median"] == pytest.approx(1, rel=0.05)
-    title = "relative depth: the median is 1"
+    title = "relative: median distance 1"
     assert title in capsys.readouterr().out
     assert title in (tmp_path / "out" / "report.html").read_text()
 

@@ -119,6 +119,17 @@ def _errors(found: Alignment, samples: ViewSamples, distance: NDArray[np.float64
 CASES = [*((kind, "ring") for kind in KINDS), ("relative_disparity", "levels")]
 
 
+def test_meters_remain_meters_with_a_shift_of_each_view() -> None:
+    """Depth without any relation between views: the shifts of an affine fit cancel its scale."""
+    samples = _truth("tangent").samples
+    random = np.random.default_rng(0).uniform(1, 3, len(samples.value))
+    found = align([samples._replace(value=random)], "metric_z", "affine")
+    after = found.scale[samples.view] * random + found.shift[samples.view]
+    known = after > 0  # else unknown
+    factors = [np.median((after / random)[known & (samples.view == n)]) for n in range(20)]
+    assert np.median(factors) == pytest.approx(1, rel=0.01)
+
+
 @pytest.mark.parametrize(("kind", "views"), CASES)
 def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> None:
     truth, rng = _truth(views), np.random.default_rng(5)

@@ -131,6 +131,7 @@ def test_the_sky_and_unknown_pixels_are_unknown() -> None:
     inside = (heights < 0.45) & (heights > -0.7)
     ratio = found[inside] / _truth()[inside]
     np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02)
+    assert np.nanmax(found) <= 100  # between the sky and a wall, disparity falls to 0
 
 
 # Networks.
@@ -292,6 +293,8 @@ def test_networks_name_the_method_that_suits_them(
         loaded(trained, monkeypatch, align="median")
     with pytest.raises(SettingError, match="align: found scale; expected None for networks of cl"):
         loaded(trained_network(TANGENT), monkeypatch, align="scale")
+    with pytest.raises(SettingError, match="align: found scale; expected null or none"):
+        loaded(trained, monkeypatch, align="scale", views="erp")
 
 
 # Functions.
@@ -321,3 +324,10 @@ def test_functions_that_return_depth_are_aligned(as_tensor: bool) -> None:
     assert np.ptp(np.log(np.asarray(plain) / distance)) > 0.3
     with pytest.raises(SettingError, match="K = 2 of float32; expected one float per pixel"):
         apply(lambda images: images.repeat(2, axis=-1), distance[..., None], grid, align="scale")
+    with pytest.raises(SettingError, match="no depth that metric_z with align=scale can use"):
+        apply(lambda images: -images[..., 0], distance[..., None], grid, align="scale")
+    unknown: Any = "relative_dispartiy"
+    with pytest.raises(SettingError, match="kind: found 'relative_dispartiy'; expected"):
+        apply(z_depth, panorama, grid, align="scale", kind=unknown)
+    with pytest.raises(SettingError, match="kind: found metric_z; expected None without align"):
+        apply(z_depth, panorama, grid, kind="metric_z")

@@ -113,3 +113,12 @@ def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> Non
         DepthResults(**how, depth_format="exr", depth_scale=1000)
     with pytest.raises(SettingError, match="depth_scale: found inf; expected more than 0"):
         DepthResults(**how, depth_format=None, depth_scale=math.inf)
+
+
+def test_the_table_counts_images_whose_views_agree_less_than_before() -> None:
+    results = DepthResults(is_metric=True, depth_format=None, depth_scale=1000, points=None)
+    steps = [{"step_before": 0.2, "step_after": after} for after in (0.1, 0.3, 0.4)]
+    rows = results.table([{"depth": step} for step in (*steps, {"step_before": None})]).rows
+    assert [row for row in rows if "agree less" in row[0]] == [
+        ["images whose views agree less than before: try another align", "2"]
+    ]

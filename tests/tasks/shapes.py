@@ -19,37 +19,8 @@ NAMES = ("bottle", "chair", "mug")
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
-class Shapes(lightning.LightningDataModule):
-    """Shapes whose class is the brightest channel of one of their views, under noise.
-
-    Args:
-        count: Number of shapes; shape k is of class k % 3.
-        batch_size: Number of shapes in a training batch; evaluation takes two at a time.
-    """
-
-    labels = "image_class"
-
-    def __init__(self, count: int = 9, batch_size: int = 3) -> None:
-        super().__init__()
-        generator = torch.Generator().manual_seed(0)
-        self.shapes: list[ShapeSample] = []
-        for index in range(count):
-            images = 0.3 * torch.randn(5, 3, 16, 16, generator=generator)
-            images[index % 5, index % 3] += 2
-            self.shapes.append(ShapeSample(images, torch.tensor(index % 3), torch.tensor(index)))
-        self.batch_size = batch_size
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.shapes, batch_size=self.batch_size)  # type: ignore[arg-type]
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        return DataLoader(self.shapes, batch_size=2)  # type: ignore[arg-type]
-
-    test_dataloader = val_dataloader
-
-
 class Spheres(lightning.LightningDataModule):
-    """Samples of panoramas in the lists `train` and `test`."""
+    """Samples in the lists `train` and `test`; evaluation takes two at a time."""
 
     def __init__(self, batch_size: int) -> None:
         super().__init__()
@@ -64,6 +35,27 @@ class Spheres(lightning.LightningDataModule):
         return DataLoader(self.test, batch_size=2)
 
     test_dataloader = val_dataloader
+
+
+class Shapes(Spheres):
+    """Shapes whose class is the brightest channel of one of their views, under noise.
+
+    Args:
+        count: Number of shapes; shape k is of class k % 3.
+        batch_size: Number of shapes in a training batch; evaluation takes two at a time.
+    """
+
+    labels = "image_class"
+
+    def __init__(self, count: int = 9, batch_size: int = 3) -> None:
+        super().__init__(batch_size)
+        generator = torch.Generator().manual_seed(0)
+        self.shapes: list[ShapeSample] = []
+        for index in range(count):
+            images = 0.3 * torch.randn(5, 3, 16, 16, generator=generator)
+            images[index % 5, index % 3] += 2
+            self.shapes.append(ShapeSample(images, torch.tensor(index % 3), torch.tensor(index)))
+        self.train = self.test = self.shapes
 
 
 class SmallNetwork(nn.Module):

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import SettingError
-from tests.tasks.shapes import Gradients, Shapes, quiet_trainer, shape_task
+from tests.tasks.shapes import Shapes, gradients_of, quiet_trainer, shape_task
 
 
 def _expected(count: int, smoothing: float = 0.1) -> tuple[list[Tensor], Tensor]:
@@ -29,9 +29,7 @@ def test_chunks_of_whole_shapes_give_the_gradient_of_the_batch(
     seen: list[int] = []
     task = shape_task(images_per_chunk=images_per_chunk, label_smoothing=0.1)
     task.network.register_forward_pre_hook(lambda _, images: seen.append(len(images[0])))
-    gradients = Gradients()
-    trainer = quiet_trainer(max_steps=1, limit_val_batches=0, callbacks=[gradients])
-    trainer.fit(task, datamodule=Shapes(4, 4))
+    gradients = gradients_of(task, Shapes(4, 4))
     assert seen == chunks
     expected, loss = _expected(4)
     for one, other in zip(gradients.found, expected, strict=True):
