@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from datamodules.core.panoramas import STEPS_PER_M
 from tangent_train.cli.run import build_data
 from tangent_train.files import config_folder
 from tangent_train.registry import build_from_config
-from tangent_train.results.evaluation import headline
+from tangent_train.results.evaluation import summary_lines
 
 
 def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
@@ -53,7 +54,8 @@ def main() -> None:
             task.metric.update(task.protocol.aligned(guess, truth), truth)
         task.evaluated = len(test)
         record = task.record(task.metric.compute(), data.noun)
-        print(f"{name}, {np.median(meters):.2f} m: {headline(record)}")
+        record = replace(record, protocol={**data.facts, **task.facts})
+        print(f"{name}, {np.median(meters):.2f} m:", *summary_lines(record), sep="\n  ")
 
 
 if __name__ == "__main__":
