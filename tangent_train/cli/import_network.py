@@ -29,15 +29,12 @@ _LIBRARIES = ("torchvision", "huggingface", "smp")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
 
 
-_OUTPUTS: dict[ScoreKind, str] = {
+_OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "logits": "scores before a softmax",
     "probabilities": "probabilities after a softmax",
     "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
     "sigmoid": "probabilities after a sigmoid, with ½ as the threshold",
     "labels": "label maps, of which other values are unknown",
-}
-
-_DEPTHS: dict[DepthKind, str] = {
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
     "metric_z": "z-depth in meters",
@@ -142,7 +139,7 @@ def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -
     lines = [
         f"{path}: {path.stat().st_size / 1e6:.1f} MB",
         f"{len(names)} classes: {', '.join(names)}" if kind is None else f"depth: {kind}",
-        f"the network returns {_OUTPUTS[trained.score_kind] if kind is None else _DEPTHS[kind]}",
+        f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
         f"panoramas: {PanoramaViews(trained).description()}",

@@ -19,10 +19,7 @@ from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
-from tangent_train.cli.predict_kinds import (
-    PREDICTIONS,
-    Prediction,
-)
+from tangent_train.cli.predict_kinds import PREDICTIONS, Prediction
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import check_unread, parse_settings
 from tangent_train.console import print_text
