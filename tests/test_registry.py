@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 
 from tangent_train.errors import DataError, SettingError
 from tangent_train.registry import SettingsFile, build_from_config, named_arguments
-from tests.security.watch import CANARY
+from tests.security.attacks import CANARY
 
 ME = __name__
 UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}

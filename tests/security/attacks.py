@@ -13,7 +13,9 @@ from typing import Any
 import torch
 
 from tangent_train import registry
-from tests.security.watch import CANARY
+
+CANARY = "attack_canary"
+"""A module that only attacks name; it does not exist, and asking for it is seen."""
 
 _NAMES = (
     f"{CANARY}.fire",

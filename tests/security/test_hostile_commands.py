@@ -19,8 +19,9 @@ from tangent_train.checkpoints.trained import METADATA_KEY
 from tangent_train.rendering import TangentRepresentation
 from tests.cli.tiny_runs import run_command
 from tests.models.onnx_files import write_linear
+from tests.security.attacks import CANARY
 from tests.security.honest import SETTINGS
-from tests.security.watch import CANARY, watched
+from tests.security.watch import watched
 
 _COMMAND = {"_target_": f"{CANARY}.fire"}
 _GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}

@@ -23,8 +23,9 @@ from tangent_train.files import config_folder
 from tangent_train.registry import SettingsFile, build_from_config
 from tests.cli.tiny_runs import results, run_command
 from tests.running import Patch
+from tests.security.attacks import CANARY
 from tests.security.honest import SETTINGS, settled, with_config
-from tests.security.watch import CANARY, watched
+from tests.security.watch import watched
 
 _FIRE = f"{CANARY}.fire"
 _UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}

@@ -9,8 +9,9 @@ from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
 
-CANARY = "attack_canary"
-"""A module that only attacks name; it does not exist, and asking for it is seen."""
+from coverage import Coverage
+
+from tests.security.attacks import CANARY
 
 _MODULES = (CANARY, "antigravity", "collect_env")
 _PROCESSES = ("os.exec", "os.posix_spawn", "os.spawn", "os.system", "subprocess.Popen")
@@ -55,5 +56,8 @@ def _hook(event: str, arguments: tuple[Any, ...]) -> None:
             happened.append(f"{event} {str(arguments)[:200]}")
 
 
+if sys.version_info < (3, 12) and Coverage.current() is not None:
+    # Two threads that start at once would fail: "Cannot install a trace function …".
+    raise RuntimeError("found coverage and an audit hook; run tests of `security` folders apart")
 sys.meta_path.insert(0, _Finder())
 sys.addaudithook(_hook)

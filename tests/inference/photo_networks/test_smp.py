@@ -15,7 +15,6 @@ from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.photo_networks import PhotoNetwork, import_network, smp
 from tests.inference.photo_networks.huggingface_networks import change_json, imported_scores, photo
-from tests.security.watch import watched
 
 NAMES = ["wall", "floor", "sky"]
 
@@ -72,17 +71,6 @@ def test_the_normalization_is_that_of_the_encoder(
     given["input_space"] = "BGR"
     with pytest.raises(SettingError, match="takes BGR; expected imagenet, unit"):
         _load(folder)
-
-
-def test_a_file_names_an_encoder_and_nothing_is_fetched(folder: Path, tmp_path: Path) -> None:
-    small = {"encoder_depth": 3, "decoder_channels": (8, 8, 8), "classes": len(NAMES)}
-    network = segmentation_models_pytorch.Unet("resnet18", encoder_weights=None, **small)
-    network.save_pretrained(folder)
-    with watched(tmp_path / "forbidden") as happened:
-        with pytest.raises(SettingError, match=r"no default for resnet18 .*expected imagenet"):
-            _load(folder)
-        assert tuple(_load(folder, "imagenet").score_names) == tuple(NAMES)
-    assert happened == []
 
 
 @torch.no_grad()

@@ -9,8 +9,9 @@ import pytest
 
 from tests.cli.tiny_runs import run_command
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
+from tests.security.attacks import CANARY
 from tests.security.honest import SECRET, SETTINGS
-from tests.security.watch import CANARY, watched
+from tests.security.watch import watched
 
 
 def test_names_of_classes_are_names(

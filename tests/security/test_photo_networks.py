@@ -1,0 +1,138 @@
+"""Photo networks: an import runs, fetches and reads nothing that a folder names."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import huggingface_hub
+import pytest
+import segmentation_models_pytorch  # type: ignore[import-untyped]
+import torch
+from transformers import quantizers
+
+from tangent_train.checkpoints.trained import load_trained
+from tangent_train.errors import DataError, SettingError
+from tangent_train.inference.photo_networks import smp
+from tangent_train.registry import SettingsFile, build_from_config
+from tests.inference.photo_networks import huggingface_networks as networks
+from tests.security.attacks import CANARY, undeclared_settings
+from tests.security.watch import watched
+
+_GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a SegFormer, saved by transformers."""
+    networks.saved(networks.segformer, tmp_path / "net")
+    return tmp_path / "net"
+
+
+def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Path) -> None:
+    networks.change_json(
+        folder / "preprocessor_config.json",
+        auto_map={"AutoImageProcessor": f"{CANARY}.Processor"},
+        image_processor_type=f"{CANARY}Processor",
+    )
+    (folder / f"{CANARY}.py").write_text("raise SystemExit")
+    with watched(tmp_path / "forbidden") as happened:
+        networks.imported(folder)
+    assert happened == []
+
+
+def test_undeclared_settings_are_left_out_or_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Undeclared settings are left out when a folder is imported, and refused in a checkpoint."""
+
+    def load_quantizer(*_: Any, **__: Any) -> None:
+        raise AssertionError("a quantizer")
+
+    monkeypatch.setattr(quantizers.auto.AutoHfQuantizer, "from_config", load_quantizer)
+    networks.saved(networks.mask2former, tmp_path / "net")
+    path = tmp_path / "net" / "config.json"
+    honest = json.loads(path.read_text())
+    networks.imported(tmp_path / "net")
+    content = torch.load(tmp_path / "net" / "imported.ckpt", weights_only=True)
+    hostile = tmp_path / "hostile.ckpt"
+    places: Any = ((), ("backbone_config",))
+    for attack in undeclared_settings(tmp_path / "forbidden"):
+        with watched(tmp_path / "forbidden") as happened:
+            path.write_text(json.dumps(_with(_with(honest, places[1], attack), (), attack)))
+            networks.imported(tmp_path / "net")
+            for place in places:
+                torch.save(_with(content, ("config", "network", "config", *place), attack), hostile)
+                with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
+                    load_trained(hostile)
+        assert happened == [], attack
+
+
+def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:
+    """Return a copy with additional keys in a section."""
+    if not place:
+        return content | more
+    return content | {place[0]: _with(content[place[0]], place[1:], more)}
+
+
+@pytest.mark.parametrize(
+    "backbone",
+    [
+        _GPT2,
+        {"model_type": "timm_backbone", "backbone": f"hf-hub:{CANARY}/x"},
+        {"model_type": "timm_backbone", "backbone": f"local-dir:{CANARY}"},
+        # A class whose own network inside is of another kind than it declares.
+        {"model_type": "sam3", "vision_config": _GPT2},
+        {"model_type": "dpt", "backbone": "gpt2", "use_timm_backbone": False},
+        {"model_type": CANARY, "auto_map": {"AutoConfig": f"{CANARY}--x.Config"}},
+        {"backbone": "gpt2"},
+        "gpt2",
+    ],
+)
+def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path) -> None:
+    path = folder / "config.json"
+    networks.change_json(path, model_type="upernet", backbone_config=backbone)
+    config = {"model_type": "upernet", "backbone_config": backbone}
+    network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 2}
+    uses: tuple[Callable[[], Any], ...] = (
+        lambda: networks.imported(folder),
+        lambda: build_from_config(network, "network", SettingsFile(path)),
+    )
+    for use in uses:
+        refused = pytest.raises((DataError, SettingError), match="network")
+        with watched(tmp_path / "forbidden") as happened, torch.device("meta"), refused:
+            use()
+        assert happened == []
+
+
+def fetching() -> None:
+    """Build a network that needs a file from the hub, whose address has no server."""
+    huggingface_hub.hf_hub_download("someone/net", "config.json", endpoint="http://127.0.0.1:9")
+
+
+def test_the_hub_is_offline_for_files_alone(tmp_path: Path) -> None:
+    section = {"_target_": f"{__name__}.fetching"}
+    file = SettingsFile(tmp_path / "x.ckpt", trust=[f"{__name__}.fetching"])
+    with watched(tmp_path / "forbidden") as happened:
+        with pytest.raises(DataError, match=r"x\.ckpt: found .*fetching cannot be made"):
+            build_from_config(section, "network", file)
+        assert happened == []
+        with pytest.raises(OSError):  # noqa: PT011 - any error of the connection
+            build_from_config(section, "network")
+        assert happened
+
+
+def test_a_file_names_an_encoder_and_nothing_is_fetched(tmp_path: Path) -> None:
+    folder, classes = tmp_path / "net", tmp_path / "classes.json"
+    classes.write_text('["sky"]')
+    small = {"encoder_depth": 3, "decoder_channels": (8, 8, 8)}
+    network = segmentation_models_pytorch.Unet("resnet18", encoder_weights=None, **small)
+    network.save_pretrained(folder)
+    with watched(tmp_path / "forbidden") as happened:
+        with pytest.raises(SettingError, match=r"no default for resnet18 .*expected imagenet"):
+            smp.load(model=str(folder), classes=classes, normalization=None)
+        loaded = smp.load(model=str(folder), classes=classes, normalization="imagenet")
+        assert tuple(loaded.score_names) == ("sky",)
+    assert happened == []
