@@ -60,7 +60,7 @@ def predict(config: Mapping[str, Any]) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     settings = parse_settings(PredictSettings, config)
-    _check_projection(settings)
+    _check_unread(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_trained(settings.checkpoint, settings.trust)
@@ -294,12 +294,17 @@ def _views(settings: PredictSettings, trained: TrainedNetwork) -> PanoramaViews 
     return PanoramaViews(trained, *how, settings.views, settings.fill)
 
 
-def _check_projection(settings: PredictSettings) -> None:
-    """Refuse settings of photos for panoramas, and of panoramas for photos."""
+def _check_unread(settings: PredictSettings) -> None:
+    """Refuse settings that nothing reads beside the others."""
     if settings.projection == "perspective":
-        check_unread(settings, "for photos", area=None, upright=None, mask=None, views=None)
+        of_panoramas = dict.fromkeys(("area", "fill", "mask", "upright", "views"))
+        check_unread(settings, "for photos", **of_panoramas)
     else:
         check_unread(settings, "without projection=perspective", fov=None)
+    if settings.upright != "auto":
+        check_unread(settings, "without upright=auto", max_tilt_deg=60)
+    if settings.class_map is None:
+        check_unread(settings, "without class_map", unmapped="unknown")
 
 
 def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

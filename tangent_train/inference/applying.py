@@ -177,17 +177,17 @@ def _distance(
     align: Align,
 ) -> NDArray[np.float32]:
     """Return the distances ``(H, W)`` of aligned and blended depth."""
-    images = [results for _, results in parts]
-    depth = torch.from_numpy(np.concatenate(images).astype(np.float32))
-    channels = depth.shape[3:]
-    if math.prod(channels) != 1 or images[0].dtype.kind != "f":
-        raise SettingError(
-            "result of the function",
-            found=f"K = {math.prod(channels)} of {images[0].dtype}",
-            expected="one float per pixel, which is depth, with align=",
-        )
-    depth = depth.reshape(-1, 1, *grid.size)
-    found = combine_depth([(PinholeViews(grid), depth)], shape, kind, blend, align)
+    views, outputs = PinholeViews(grid), []
+    for faces, results in parts:
+        if (channels := math.prod(results.shape[3:])) != 1 or results.dtype.kind != "f":
+            raise SettingError(
+                "result of the function",
+                found=f"K = {channels} of {results.dtype}",
+                expected="one float per pixel, which is depth, with align=",
+            )
+        depth = torch.from_numpy(results.astype(np.float32)).reshape(-1, 1, *grid.size)
+        outputs.append((views[faces[0] : faces[-1] + 1], depth))
+    found = combine_depth(outputs, shape, kind, blend, align)
     if not found.distance.isfinite().any():
         raise SettingError(
             "result of the function",

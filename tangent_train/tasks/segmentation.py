@@ -17,7 +17,7 @@ from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
-from tangent_train.inference.engine import fill, view_scores
+from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.segmentation import (
     AbsentClass,
     SegmentationCounts,
@@ -174,12 +174,11 @@ class SegmentationTask(ViewsTask):
         sets = self.view_sets(images, rotation, area)
         averaged, blend = len(sets) > 1, self.representation.blend
         mosaic = ScoreMosaic(shape, self.num_scores, blend, averaged=averaged, device=images.device)
-
-        def add_loss(scores: Tensor, views: Any) -> None:
+        for views, scores in scored_views(self, sets, self.images_per_forward):
+            mosaic.add(scores, views)
             if target is not None:
                 self._add_loss(scores, labels_of_views(target, views))
-
-        return fill(mosaic, self, sets, self.images_per_forward, scored=add_loss)
+        return mosaic
 
     def _add_loss(self, scores: Tensor, labels: Tensor) -> None:
         """Add the cross-entropy of views, without auxiliary scores, to the validation loss."""
