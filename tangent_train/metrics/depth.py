@@ -120,30 +120,44 @@ class DepthProtocol:
         lengths = 1.0 if ray_lengths is None else ray_lengths.double()
         used = (truth > 0) & distances.isfinite()
         if self.alignment != "none" and used.any():
-            values, true = distances / lengths, truth.double() / lengths
-            is_disparity = self.alignment_in == "disparity"
-            if is_disparity:
-                values, true = 1 / values, 1 / true
-            scale, shift = _fit(values[used], true[used], self.alignment)
-            values = scale * values + shift
-            if is_disparity and self.clip:
+            power = -1 if self.alignment_in == "disparity" else 1
+            values, true = (distances / lengths) ** power, (truth.double() / lengths) ** power
+            known_values, known_true = values[used], true[used]
+            if self.alignment == "affine":
+                values = scaled_and_shifted(values, true.where(used, torch.nan))
+            elif self.alignment == "median":
+                values *= known_true.median() / known_values.median()
+            else:
+                values *= known_values @ known_true / known_values.square().sum()
+            if power < 0 and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
-            distances = lengths * (1 / values if is_disparity else values)
+            distances = lengths * values**power
         if self.clip:
             distances = distances.clamp(self.min_distance, self.max_distance)
         return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)
 
 
-def _fit(values: Tensor, true: Tensor, alignment: Alignment) -> tuple[Any, Any]:
-    """Return scale and shift of values for some true values."""
-    if alignment == "median":
-        return true.median() / values.median(), 0.0
-    if alignment == "scale":
-        return (values * true).sum() / values.square().sum(), 0.0
-    centered = values - values.mean()
-    variance = centered.square().sum()
-    scale = torch.where(variance > 0, (centered * true).sum() / variance, 0.0)
-    return scale, true.mean() - scale * values.mean()
+def scaled_and_shifted(
+    values: Float[Tensor, "*images height width"], truth: Float[Tensor, "*images height width"]
+) -> Float[Tensor, "*images height width"]:
+    """Scale and shift values of each image by least squares, as far as the truth is known.
+
+    This is the alignment of Ranftl et al. (TPAMI 2022, equation 4). It can be differentiated.
+
+    Args:
+        values: Values of any scale and shift; finite where the truth is known.
+        truth: True values; NaN where unknown.
+    """
+    known = ~truth.isnan()
+    counts = known.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.where(known, 0).sum(dim=(-2, -1), keepdim=True) / counts
+
+    true = truth.where(known, 0)  # without NaN, whose gradients would be NaN too
+    centered, true_mean = values - mean(values), mean(true)
+    variance = mean(centered.square()).clamp(min=torch.finfo(values.dtype).eps)
+    return centered * (mean(centered * (true - true_mean)) / variance) + true_mean
 
 
 def error_sums(

@@ -55,7 +55,9 @@ class Publication(NamedTuple):
 
     def scores(self, name: str) -> list[float]:
         """Return a score of the folds, in the unit of the file."""
-        return [float(line["mean"]) for line in self.lines if line["score"] == name and line["mean"]]
+        return [
+            float(line["mean"]) for line in self.lines if line["score"] == name and line["mean"]
+        ]
 
     @property
     def folds(self) -> tuple[str, ...]:

@@ -38,6 +38,7 @@ from tangent_train.metrics.depth import (
     depth_scores,
     error_sums,
     mean_depth_scores,
+    scaled_and_shifted,
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
@@ -46,7 +47,7 @@ from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import distance_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.tasks.base import RGB
-from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
+from tangent_train.tasks.losses import DepthLoss, log_error_sum
 from tangent_train.tasks.views import ViewsTask, labels_of_views
 
 _LEAST = 1e-3

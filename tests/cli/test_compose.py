@@ -46,7 +46,8 @@ def test_every_option_of_every_group_composes(group: str) -> None:
 @pytest.mark.parametrize("task", ["classification", "depth", "segmentation"])
 def test_a_recipe_sets_what_the_task_has(task: str, command: str) -> None:
     plain, small = (
-        composed_settings(command, f"task={task}", *more)["task"] for more in ((), ("recipe=small",))
+        composed_settings(command, f"task={task}", *more)["task"]
+        for more in ((), ("recipe=small",))
     )
     weights = {"class_weights": "sqrt"} if task == "segmentation" else {}
     assert small == plain | {"channels_last": True} | weights
