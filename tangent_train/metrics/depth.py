@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -122,13 +122,11 @@ class DepthProtocol:
         if self.alignment != "none" and used.any():
             power = -1 if self.alignment_in == "disparity" else 1
             values, true = (distances / lengths) ** power, (truth.double() / lengths) ** power
-            known_values, known_true = values[used], true[used]
             if self.alignment == "affine":
                 values = scaled_and_shifted(values, true.where(used, torch.nan))
-            elif self.alignment == "median":
-                values *= known_true.median() / known_values.median()
             else:
-                values *= known_values @ known_true / known_values.square().sum()
+                v, t = values[used], true[used]
+                values *= t.median() / v.median() if self.alignment == "median" else v @ t / (v @ v)
             if power < 0 and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
             distances = lengths * values**power

@@ -35,7 +35,6 @@ from tangent_train.metrics.depth import (
     DepthProtocol,
     Quantity,
     depth_intervals,
-    depth_scores,
     error_sums,
     mean_depth_scores,
     scaled_and_shifted,
@@ -144,9 +143,8 @@ class DepthTask(ViewsTask):
                 expected="median, scale or affine: the scale of its distances is unknown",
                 remedy="task.alignment=affine",
             )
-        if alignment_in is None:
-            alignment_in = "disparity" if is_disparity(self.depth_kind) else "distance"
-        self.protocol = DepthProtocol(alignment, alignment_in, min_distance, max_distance, clip)
+        quantity = alignment_in or ("disparity" if is_disparity(self.depth_kind) else "distance")
+        self.protocol = DepthProtocol(alignment, quantity, min_distance, max_distance, clip)
         self.loss: DepthLoss = loss
         self.scale_invariance = scale_invariance
         self.align = align
@@ -217,8 +215,14 @@ class DepthTask(ViewsTask):
         truth = self.meters(sample.target)
         if truth.ndim == 2:
             return self.protocol.aligned(self._of_panorama(sample, truth), truth), truth
+        lengths = sample.ray_lengths
+        depth = self._depth_of(sample.images.__getitem__, len(truth))
+        if not self.is_tested:
+            self._add_loss(depth, truth, lengths)
+        values, kind = depth_of_output(depth, self.depth_kind, lengths[:, None])
+        distances = distance_of(along_rays(values, kind, lengths[:, None]), kind)[:, 0]
         # The crops of a photo have separate scales.
-        crops = zip(self._of_crops(sample, truth), truth, sample.ray_lengths, strict=True)
+        crops = zip(distances, truth, lengths, strict=True)
         return torch.stack([self.protocol.aligned(*crop) for crop in crops]), truth
 
     def _of_panorama(
@@ -238,17 +242,6 @@ class DepthTask(ViewsTask):
         self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
 
-    def _of_crops(
-        self, sample: EvaluationSample[Tensor], truth: Tensor
-    ) -> Float[Tensor, "crops height width"]:
-        """Predict the distances of the crops of a photo, each separately."""
-        depth = self._depth_of(sample.images.__getitem__, len(truth))
-        if not self.is_tested:
-            self._add_loss(depth, truth, sample.ray_lengths)
-        lengths = sample.ray_lengths[:, None]
-        values, kind = depth_of_output(depth, self.depth_kind, lengths)
-        return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
-
     def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
         """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
         parts = view_scores(self, images, count, self.images_per_forward, rays)
@@ -260,10 +253,8 @@ class DepthTask(ViewsTask):
 
     def logged_scores(self, result: NDArray[np.float64]) -> dict[str, float]:
         """Return means over images; for panoramas, also weighted by solid angle."""
-        scores = mean_depth_scores(result[:, 0])
-        if result[:, 1].any():
-            scores |= by_solid_angle(mean_depth_scores(result[:, 1]))
-        return {name: scores[name] for name in self.headings if name in scores}
+        pixels, angles = (mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
+        return pixels | (by_solid_angle(angles) if result[:, 1].any() else {})
 
     def record(self, result: NDArray[np.float64], noun: str) -> Record:
         """Return the record with scores of latitude bands, and confidence intervals."""
@@ -298,16 +289,12 @@ class DepthTask(ViewsTask):
     ) -> EncodedImage:
         """Return the image with its true and predicted distances, aligned as for the scores."""
         truth = self.meters(target)
-        absrel = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())["absrel"]
-        arrays = shown_arrays(image, truth, prediction, self.representation, cut=False)
-        return encode_image(
-            name,
-            arrays[0],
-            prediction=arrays[2],
-            truth=arrays[1],
-            sphere=target.ndim == 2,
-            note="" if np.isnan(absrel) else f"AbsRel {absrel:.3g}",
-        )
+        sums = error_sums(prediction, truth)[:1].cpu().numpy()
+        absrel = mean_depth_scores(sums)["absrel"]
+        note = "" if np.isnan(absrel) else f"AbsRel {absrel:.3g}"
+        rgb, true, shown = shown_arrays(image, truth, prediction, self.representation, cut=False)
+        sphere = target.ndim == 2
+        return encode_image(name, rgb, prediction=shown, truth=true, sphere=sphere, note=note)
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
         """See `Task`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -158,10 +158,8 @@ class ViewsTask(Task):
         rotated = limited if rotation is None else limited.with_rotation(rotation)
         sets = rotated.view_sets()
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
-        rays: Iterable[Tensor | None] = [None] * len(sets)
-        if self.sees_rays:
-            rays = upright_rays(sets, rotation, images.device)
-        return list(zip(sets, readers, rays, strict=True))
+        seen = upright_rays(sets, rotation, images.device) if self.sees_rays else [None] * len(sets)
+        return list(zip(sets, readers, seen, strict=True))
 
 
 def labels_of_views(target: Tensor, views: Any) -> Tensor:
