@@ -125,17 +125,14 @@ class DepthTask(ViewsTask):
         super().__init__(network, representation, class_names, *arguments, **settings)
         of_file = getattr(network, "kind", None)
         self.depth_kind: DepthKind = depth_kind or of_file or "log_distance"
-        check_choice(
-            "task.depth_kind", self.depth_kind, (of_file,) if of_file else get_args(DepthKind)
-        )
-        check_choice("task.align", align or "none", get_args(Align))
+        kinds = (of_file,) if of_file else get_args(DepthKind)
+        check_choice("task.depth_kind", self.depth_kind, kinds)
         check_align("task.align", align, representation)
         check_choice("task.loss", loss, get_args(DepthLoss))
         if not 0 <= scale_invariance <= 1:
             raise SettingError("task.scale_invariance", found=scale_invariance, expected="0 to 1")
         if self.label_smoothing:
-            found = self.label_smoothing
-            raise SettingError("task.label_smoothing", found=found, expected="0 for distances")
+            raise SettingError("task.label_smoothing", found=self.label_smoothing, expected="0")
         if alignment == "none" and not is_metric(self.depth_kind):
             raise SettingError(
                 "task.alignment",
@@ -280,9 +277,8 @@ class DepthTask(ViewsTask):
     ) -> RGB:
         """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
         truth = self.meters(target)
-        return distance_panel(
-            *shown_arrays(image, truth, prediction, self.representation, most_rows)
-        )
+        shown = shown_arrays(image, truth, prediction, self.representation, most_rows)
+        return distance_panel(*shown)
 
     def report_image(
         self, name: str, image: Any, target: Tensor, prediction: Tensor
@@ -297,5 +293,6 @@ class DepthTask(ViewsTask):
         return encode_image(name, rgb, prediction=shown, truth=true, sphere=sphere, note=note)
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
-        """See `Task`."""
-        return self.logged_scores(result[list(places)])
+        """See `Task`; NaN if the images have no known distances."""
+        undefined = dict.fromkeys(self.logged_scores(result), np.nan)
+        return undefined | self.logged_scores(result[list(places)])
