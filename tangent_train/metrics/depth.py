@@ -182,18 +182,17 @@ def error_sums(
     away, ratio = (d - g).abs(), torch.maximum(d / g, g / d)
     values = [known, predicted, away / g, away**2 / g, away**2, (d / g).log() ** 2, away]
     values += [predicted & (ratio < _THRESHOLD**n) for n in (1, 2, 3)]
-    if truth.ndim != 2:  # a photo
-        sums = torch.stack([value.double().sum() for value in values])
-        return torch.cat([sums[None], sums.new_zeros(len(BAND_EDGES_DEG), _SUMS)])
-    rows = torch.stack([value.double().sum(dim=1) for value in values], dim=1)
+    rows = torch.stack([value.double().flatten(1).sum(dim=1) for value in values], dim=1)
     return torch.from_numpy(_row_weights(tuple(truth.shape))).to(rows.device) @ rows
 
 
 @lru_cache(maxsize=4)
-def _row_weights(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the weights of the rows of a panorama, see `error_sums`."""
+def _row_weights(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the weights of the rows of a panorama, or of the crops of a photo."""
+    if len(shape) != 2:
+        return np.outer(np.arange(1 + len(BAND_EDGES_DEG)) == 0, np.ones(shape[0]))
     bands = np.eye(len(BAND_EDGES_DEG) - 1)[:, band_of_rows(shape[0])]
-    return np.stack([np.ones(shape[0]), equirect_solid_angles(shape), *bands])
+    return np.stack([np.ones(shape[0]), equirect_solid_angles((shape[0], shape[1])), *bands])
 
 
 def depth_scores(sums: Float[np.ndarray, "*some sums"]) -> dict[str, NDArray[np.float64]]:

@@ -64,9 +64,7 @@ class DepthTask(ViewsTask):
     Args:
         network: Network with one output, see `ViewsTask`: the natural logarithm of the distance, or
             `depth_kind`.
-        representation: Representation of the images.
-        class_names: Empty.
-        *arguments: Optimizer and scheduler, see `Task`.
+        *arguments: Representation, no class names, optimizer and scheduler, see `Task`.
         depth_kind: Kind of the network's output; None for that of a network from a file, else
             ``log_distance``.
         loss: Kind of loss, see `log_error_sum`.
@@ -108,8 +106,6 @@ class DepthTask(ViewsTask):
     def __init__(
         self,
         network: nn.Module,
-        representation: Any,
-        class_names: Sequence[str],
         *arguments: Any,
         depth_kind: DepthKind | None = None,
         loss: DepthLoss = "log_l1",
@@ -122,12 +118,12 @@ class DepthTask(ViewsTask):
         clip: bool = False,
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, class_names, *arguments, **settings)
+        super().__init__(network, *arguments, **settings)
         of_file = getattr(network, "kind", None)
         self.depth_kind: DepthKind = depth_kind or of_file or "log_distance"
         kinds = (of_file,) if of_file else get_args(DepthKind)
         check_choice("task.depth_kind", self.depth_kind, kinds)
-        check_align("task.align", align, representation)
+        check_align("task.align", align, self.representation)
         check_choice("task.loss", loss, get_args(DepthLoss))
         if not 0 <= scale_invariance <= 1:
             raise SettingError("task.scale_invariance", found=scale_invariance, expected="0 to 1")

@@ -51,9 +51,8 @@ class SegmentationTask(ViewsTask):
 
     Args:
         network: Network, see `ViewsTask`. Score k is that of label k + 1.
-        representation: Representation of the images.
-        class_names: Names of the K + 1 labels, the unknown class first.
-        *arguments: Optimizer and scheduler, see `Task`.
+        *arguments: Representation, names of the K + 1 labels (the unknown class first), optimizer
+            and scheduler, see `Task`.
         class_weights: Weights of the loss: a name (``none``, ``log``, ``sqrt``), for weights that
             the data module computes, or K numbers.
         absent_class: Treatment of classes absent from the ground truth in the means.
@@ -74,14 +73,12 @@ class SegmentationTask(ViewsTask):
     def __init__(
         self,
         network: nn.Module,
-        representation: Any,
-        class_names: Sequence[str],
         *arguments: Any,
         class_weights: ClassWeights | Sequence[float] = "log",
         absent_class: AbsentClass = "skip",
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, class_names, *arguments, **settings)
+        super().__init__(network, *arguments, **settings)
         check_choice("task.absent_class", absent_class, get_args(AbsentClass))
         names, classes = get_args(ClassWeights), self.class_names[1:]
         is_name = isinstance(class_weights, str)
