@@ -131,8 +131,9 @@ def check_align(setting: str, align: Align | None, representation: Any) -> None:
         representation: Views of panoramas; None or others for photos, which may have one crop.
 
     Raises:
-        SettingError: There is only one view, and a correction is given.
+        SettingError: The value is unknown; or there is only one view, and a correction is given.
     """
+    check_choice(setting, align or "none", get_args(Align))
     if align in (None, "none") or not isinstance(representation, Representation):
         return
     if sum(map(len, representation.view_sets())) == 1:
@@ -162,7 +163,6 @@ class DepthPredictor(ViewPredictor):
         images_per_forward: int | None = None,
         align: Align | None = None,
     ) -> None:
-        check_choice("align", align or "none", get_args(Align))
         check_align("align", align, getattr(view_sets, "representation", None))
         super().__init__(trained, view_sets, device, images_per_forward)
         self._kind: Any = trained.depth_kind
