@@ -60,11 +60,7 @@ from tangent_train.geometry import SphereArea, shift_range
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
-_DISTANCES = (
-    "For task=depth, choose data=synthrooms, stanford2d3ds, structured3d, matterport360 or folder, "
-    "or photos: synthrooms_perspective, stanford2d3ds_perspective, structured3d_perspective, "
-    "folder_photos."
-)
+_DISTANCES = "Data sets with depth are listed in docs/how-to/train_depth.md."
 
 
 @dataclass(kw_only=True, eq=False, repr=False)

@@ -85,22 +85,18 @@ class DatasetIndex(Generic[_Item]):
         """Return the items of the given splits."""
         return [item for split in splits for item in self.splits[split]]
 
-    def check(self, problems: Problems, label_counts: dict[str, NDArray[np.int64]]) -> int:
+    def check(self, problems: Problems, label_counts: dict[str, NDArray[np.int64]]) -> None:
         """Decode every file separately and note broken ones; write nothing.
 
         Args:
             problems: Known problems; collects new problems and warnings.
             label_counts: Collects the number of pixels of each label by image; unused for shapes.
-
-        Returns:
-            Number of images or shapes read.
         """
         items = problems.without(self.of())
         read: Any = self.read
         parts = hasattr(read, "parts")
         reads = read.parts(label_counts, problems.warnings) if parts else {_WHOLE: read}
         self._note(problems, reads, items, "Checking")
-        return len(items)
 
     def read_all(self, items: Sequence[_Item], problems: Problems, *, whole: bool) -> None:
         """Read items once, into the store if there is one; note broken items.

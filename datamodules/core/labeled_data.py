@@ -227,13 +227,14 @@ class LabeledData(ABC, Generic[_Item]):
         """Read the whole data set and count its labels; generate and write nothing.
 
         Returns:
-            All problems, and the number of images or shapes read.
+            All problems, and the number of images or shapes, broken ones included.
         """
         problems, count = Problems(), 0
         counts: dict[str, NDArray[np.int64]] = {}
         with problems.noted():
             index = self._find_all(problems)
-            count = index.check(problems, counts)
+            count = len(problems.items.union(item.name for item in index.of()))
+            index.check(problems, counts)
             for split in SPLITS:
                 of_split = [counts[i.name] for i in index.splits[split] if i.name in counts]
                 none = np.zeros(len(self.label_names), np.int64)

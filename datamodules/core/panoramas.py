@@ -375,7 +375,8 @@ class _Reading:
 
     def distances(self, files: ImageFiles) -> NDArray[np.uint16]:
         """Return distances from the center in steps of 1/512 m, 0 where missing."""
-        raise NotImplementedError
+        depth = self.reader.depth(files)
+        return depth if self.shape is None else resize_depth(depth, self.shape)
 
     def depth(self, files: ImageFiles) -> NDArray[np.uint16] | None:
         """Return the distances if depth is an input."""
@@ -434,11 +435,6 @@ class PanoramaReading(_Reading):
         shape: Any = self.shape
         rgb = resize_area(self.reader.rgb(files), shape)
         return Panorama(rgb, self.depth(files), self.labels(files))
-
-    def distances(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Return distances at the size of the result."""
-        depth = self.reader.depth(files)
-        return depth if self.shape is None else resize_depth(depth, self.shape)
 
 
 class PhotoReading(_Reading):

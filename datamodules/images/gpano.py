@@ -40,8 +40,9 @@ _TOLERANCE = 0.02  # tolerance of square pixels: angles and sizes are rounded
 _MOST_COLUMNS = 32768  # columns of the whole panorama
 _SAY_IT = "Give area=[west,east,south,north] in degrees: the part of the sphere that it shows."
 _NOT_WHOLE = (
-    "If it is a part of a panorama, say which with area=[west,east,south,north] in degrees or with "
-    "GPano tags in its XMP data. Photos are for tangent-predict with projection=perspective."
+    "For a part of a panorama, give area=[west,east,south,north] in degrees, or GPano tags in its "
+    "XMP data. For a photo, give fov=, its horizontal field of view in degrees; tangent-predict "
+    "also needs projection=perspective."
 )
 
 Fill = Literal["black", "mean", "edge", "reflect"]
@@ -352,7 +353,7 @@ def _area(
             subject,
             found=f"a part of a panorama of {2 * full_height} columns",
             expected=f"at most {_MOST_COLUMNS}",
-            remedy="Shrink the image, or take it as a photo (projection=perspective).",
+            remedy="Shrink the image, or use it as a photo.",
         )
     full_width = 2 * full_height
     left, width = round(across[0] * full_width) % full_width, min(size[1], full_width)

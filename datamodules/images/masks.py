@@ -85,7 +85,7 @@ class Masks:
         elif isinstance(mask, int | float) and not isinstance(mask, bool) and -90 < mask <= 0:
             self._lowest_deg = float(mask)
         elif mask is not None:
-            expected = "a latitude above −90, at most 0 degrees; a file or folder; or null"
+            expected = "a latitude above −90, at most 0 degrees; or a file or folder"
             raise SettingError(setting, found=mask, expected=expected)
 
     def check(self, name: str, area: PanoramaArea) -> None:

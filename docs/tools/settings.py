@@ -62,7 +62,7 @@ protocols differ. Different data sets are not compared.
 | `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
 | `alignment` | of depth: alignment with the true distances, in distance or disparity |
 | `range` | of depth: true distances that count, and whether predictions are clipped to them |
-| `views_aligned` | of depth of panoramas: alignment of the views with each other |
+| `views_aligned` | of depth of panoramas: alignment of the views with each other; not compared |
 | `images` | number of test images, if some are missing or were left out as broken: `2 of 100` |
 | `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
 | | `pixels, then images`: the mean over the pixels of each image, then over the images |

@@ -45,9 +45,8 @@ def check(settings: Mapping[str, Any]) -> None:
     with redirect_stdout(sys.stdout if terminal else sys.stderr):
         if labeled:
             shares = [[percent(share) for share in n / n.sum()] for n in labeled.values()]
-            columns = zip(data.label_names, *shares, strict=True)
+            rows = [[*row] for row in zip(data.label_names, *shares, strict=True)]
             kind = "class" if data.class_names else "label"
-            rows = list(map(list, columns))
             Table(f"Pixels of each {kind}, %", [kind, *labeled], rows).print()
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)

@@ -82,7 +82,7 @@ def _settings(section: Any, text: str, prefix: str) -> Iterator[Setting]:
             for choice in value.value:
                 if isinstance(choice, yaml.MappingNode):
                     for name, option, meaning in _settings(choice, text, ""):
-                        if not name.startswith(("/", "override ")):
+                        if not name.startswith(("/", "optional ", "override ")):
                             yield Setting(name.partition("@")[2] or name, option, meaning)
         elif isinstance(value, yaml.MappingNode) and not value.flow_style:
             yield Setting(prefix + key.value, "", comment)

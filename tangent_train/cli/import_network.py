@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from importlib import import_module
+from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
     from tangent_train.inference.photo_networks import PhotoNetwork
 
+
+_OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
+"""Settings that only some of the functions `load` take."""
 
 _LIBRARIES = ("torchvision", "huggingface", "smp")
 """Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
@@ -104,26 +109,26 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
 
 def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
-    name, classes, depth = settings.network, settings.classes, settings.depth
-    if name in _LIBRARIES:
-        with elsewhere():
-            library = import_module(f"tangent_train.inference.photo_networks.{name}")
-        model, weights = settings.model, settings.weights
-        network: PhotoNetwork = library.load(
-            model=model, weights=weights, classes=classes, normalization=normalization, depth=depth
-        )
-        return network
-    from tangent_train.inference.photo_networks import own_files
+    with elsewhere():
+        from tangent_train.inference.photo_networks import own_files
 
-    if name == "onnx":
-        return own_files.load_onnx(settings.file, classes, normalization, depth)
-    try:
-        config: Any = compose("import", [f"+network@section={name}"])
-    except MissingConfigException as error:
-        known = ", ".join((*_LIBRARIES, "onnx", *(error.options or ())))
-        raise SettingError("network", found=name, expected=f"of {known}") from error
-    section: Any = OmegaConf.to_container(config.section)
-    return own_files.load_config(section, settings.weights, classes, normalization, depth)
+        name = settings.network
+        load: Callable[..., PhotoNetwork] = own_files.load_onnx
+        if name in _LIBRARIES:
+            load = import_module(f"tangent_train.inference.photo_networks.{name}").load
+    if name not in (*_LIBRARIES, "onnx"):
+        try:
+            config: Any = compose("import", [f"+network@section={name}"])
+        except MissingConfigException as error:
+            known = ", ".join((*_LIBRARIES, "onnx", *(error.options or ())))
+            raise SettingError("network", found=name, expected=f"of {known}") from error
+        section: Any = OmegaConf.to_container(config.section)
+        load = partial(own_files.load_config, section)
+    read = signature(load).parameters
+    unread = dict.fromkeys(name for name in _OF_LIBRARIES if name not in read)
+    check_unread(settings, f"for network={name}", **unread)
+    given = {name: getattr(settings, name) for name in _OF_LIBRARIES if name in read}
+    return load(**given, normalization=normalization)
 
 
 def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from contextlib import closing
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -60,7 +61,7 @@ def predict(config: Mapping[str, Any]) -> None:
         DataError: The checkpoint cannot be read, or no images are found.
     """
     settings = parse_settings(PredictSettings, config)
-    _check_projection(settings)
+    _check_unread(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_trained(settings.checkpoint, settings.trust)
@@ -72,22 +73,28 @@ def predict(config: Mapping[str, Any]) -> None:
     folder = PredictionFolder(settings.output, results, results.kinds(settings.write))
     _check_videos(inputs, folder)
     names = inputs.names()
-    shown = [names[number] for number in evenly_spread(settings.report, len(names))]
-    images = _Images(settings, prediction, folder, _depth_folder(settings, trained), shown)
+    shown: dict[str, Any] = {names[n]: None for n in evenly_spread(settings.report, len(names))}
+    depth = _depth_folder(settings, trained)
+    images = _Images(settings, prediction, folder, depth, Masks(settings.mask), shown)
     prediction.prepare(images.examples(inputs))
     if shard is None:
-        done = _predict(settings, decisive, inputs, images, folder)
-        _finish(settings, inputs, images, folder, done)
+        entries = done = _predict(settings, decisive, inputs, images)
     else:
         shared = {**decisive, "write": list(folder.kinds)}
         part = PredictionShard(shard, settings.output / "shards", list(inputs.files), shared)
-        done = _predict(settings, decisive, inputs.part(shard), images, folder, part)
+        done = _predict(settings, decisive, inputs.part(shard), images, part)
         part.save(done, done=True)
         count, entries = part.finished()
         print_text(f"Shard {shard} is done: {count} of {shard.count} in all.")
         if count == shard.count:
             folder.write_summary(decisive, entries)
-            _finish(settings, inputs, images, folder, entries)
+        else:
+            entries = []
+    if predicted := folder.predicted(entries):
+        if pictures := images.pictures(inputs, {entry["name"] for entry in predicted}):
+            folder.write_page(entries, pictures)
+        results.table(predicted).print()
+        print_text(f"Results are in {settings.output}.")
     if failed := sum("error" in entry for entry in done):
         sys.exit(f"tangent-predict: {failed} of {len(done)} images could not be used, see above")
 
@@ -97,11 +104,10 @@ def _predict(
     decisive: Mapping[str, Any],
     inputs: Inputs,
     images: _Images,
-    folder: PredictionFolder,
     part: PredictionShard | None = None,
 ) -> list[Entry]:
     """Predict all images, or those of a shard; return their entries and those of earlier runs."""
-    summary = None if part is None else part.path
+    folder, summary = images.folder, None if part is None else part.path
     known = folder.earlier(decisive, summary) if settings.resume else None
     if not (settings.overwrite or known is not None or (part and part.folder.exists())):
         folder.check(resume=settings.resume)
@@ -146,45 +152,25 @@ def _predict(
     return entries
 
 
-def _finish(
-    settings: PredictSettings,
-    inputs: Inputs,
-    images: _Images,
-    folder: PredictionFolder,
-    entries: Sequence[Entry],
-) -> None:
-    """Write the report and print the table of the results."""
-    if not (predicted := folder.predicted(entries)):
-        return
-    pictures = images.pictures(inputs, {entry["name"] for entry in predicted})
-    if pictures:
-        folder.write_page(entries, pictures)
-    folder.results.table(predicted).print()
-    print_text(f"Results are in {settings.output}.")
-
-
+@dataclass(frozen=True)
 class _Images:
     """Reads images, predicts them and writes the results.
 
-    Args:
+    Attributes:
         settings: Settings of the command.
         prediction: Predicts one image.
         folder: Output folder.
         depth: Depth images, for networks that take depth.
-        shown: Names of the images in the report.
+        masks: Masks of panoramas.
+        shown: Images of the report by name; None until they are predicted.
     """
 
-    def __init__(
-        self,
-        settings: PredictSettings,
-        prediction: Prediction,
-        folder: PredictionFolder,
-        depth: DepthFolder | None,
-        shown: Sequence[str],
-    ) -> None:
-        self._settings, self._prediction, self._folder = settings, prediction, folder
-        self._depth, self._masks = depth, Masks(settings.mask)
-        self._shown: dict[str, EncodedImage | None] = dict.fromkeys(shown)
+    settings: PredictSettings
+    prediction: Prediction
+    folder: PredictionFolder
+    depth: DepthFolder | None
+    masks: Masks
+    shown: dict[str, EncodedImage | None]
 
     def examples(self, inputs: Inputs) -> Iterator[Callable[[], InputImage]]:
         """Yield functions that read some of all images."""
@@ -197,16 +183,16 @@ class _Images:
 
     def read(self, job: Job) -> InputImage:
         """Read one image."""
-        settings, image = self._settings, job.path if job.value is None else job.value()
+        settings, image = self.settings, job.path if job.value is None else job.value()
         stem = job.item.removesuffix(job.path.suffix)
-        depth = None if self._depth is None else partial(self._depth.read, stem)
+        depth = None if self.depth is None else partial(self.depth.read, stem)
         if settings.projection == "perspective":
             return read_photo(image, settings.fov, depth)
         return read_panorama(image, settings.area, settings.upright, depth)
 
     def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
         """Predict one image."""
-        return self._prediction(job.value, self._folder.files(job.item), progress)
+        return self.prediction(job.value, self.folder.files(job.item), progress)
 
     def write(self, job: Job) -> Entry:
         """Write the results of one image; return its entry in the summary."""
@@ -214,10 +200,10 @@ class _Images:
         image, pixels, _ = predicted
         is_counted = np.array(True)
         if image.area is not None:
-            is_counted = image.cut(self._masks.read(job.item, image.area)) > 0
-            unknown = pixels.dtype.type(self._folder.results.unknown)
+            is_counted = image.cut(self.masks.read(job.item, image.area)) > 0
+            unknown = pixels.dtype.type(self.folder.results.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
-        folder = self._folder.of_frames if is_video(job.path) else self._folder
+        folder = self.folder.of_frames if is_video(job.path) else self.folder
         folder.results.write(folder.files(job.item), predicted)
         rows, columns = pixels.shape
         entry: Entry = {"rows": rows, "columns": columns}
@@ -226,8 +212,8 @@ class _Images:
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
         entry[folder.results.summary] = folder.results.summarize(predicted, is_counted)
-        if job.item in self._shown:
-            self._shown[job.item] = folder.results.encode(job.item, predicted)
+        if job.item in self.shown:
+            self.shown[job.item] = folder.results.encode(job.item, predicted)
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
@@ -237,18 +223,18 @@ class _Images:
             inputs: All images and videos.
             used: Names of the predicted images and frames.
         """
-        count, names = self._settings.report, [name for name in inputs.names() if name in used]
+        count, names = self.settings.report, [name for name in inputs.names() if name in used]
         wanted = [names[number] for number in evenly_spread(count, len(names))]
-        earlier = {name for name in wanted if self._shown.get(name) is None}
-        results = self._folder.results
+        earlier = {name for name in wanted if self.shown.get(name) is None}
+        results = self.folder.results
         for job in inputs.missing(set(inputs.names()) - earlier):
-            file = self._folder.files(job.item).get(results.source)
+            file = self.folder.files(job.item).get(results.source)
             if file is not None and not job.error:
                 predicted = PredictedImage(self.read(job), results.read(file))
-                self._shown[job.item] = results.encode(job.item, predicted)
-        others = [name for name in self._shown if name not in wanted]
-        available = [name for name in (*wanted, *others) if self._shown.get(name) is not None]
-        shown = (self._shown[name] for name in names if name in available[:count])
+                self.shown[job.item] = results.encode(job.item, predicted)
+        others = [name for name in self.shown if name not in wanted]
+        available = [name for name in (*wanted, *others) if self.shown.get(name) is not None]
+        shown = (self.shown[name] for name in names if name in available[:count])
         return [picture for picture in shown if picture is not None]
 
 
@@ -294,12 +280,17 @@ def _views(settings: PredictSettings, trained: TrainedNetwork) -> PanoramaViews 
     return PanoramaViews(trained, *how, settings.views, settings.fill)
 
 
-def _check_projection(settings: PredictSettings) -> None:
-    """Refuse settings of photos for panoramas, and of panoramas for photos."""
+def _check_unread(settings: PredictSettings) -> None:
+    """Refuse settings that nothing reads beside the others."""
     if settings.projection == "perspective":
-        check_unread(settings, "for photos", area=None, upright=None, mask=None, views=None)
+        of_panoramas = dict.fromkeys(("area", "fill", "mask", "upright", "views"))
+        check_unread(settings, "for photos", **of_panoramas)
     else:
         check_unread(settings, "without projection=perspective", fov=None)
+    if settings.upright != "auto":
+        check_unread(settings, "without upright=auto", max_tilt_deg=60)
+    if settings.class_map is None:
+        check_unread(settings, "without class_map", unmapped="unknown")
 
 
 def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

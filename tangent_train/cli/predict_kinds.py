@@ -56,6 +56,8 @@ class LabelPrediction:
         self, settings: PredictSettings, original: TrainedNetwork, views: PanoramaViews | PhotoViews
     ) -> None:
         check_unread(settings, "for networks of classes", **_OF_DEPTH)
+        if settings.depth is None:
+            check_unread(settings, "without depth files", depth_scale=1000)
         _check_confidence(settings)
         self._settings, self._trained = settings, original
         if settings.class_map is not None:
@@ -135,6 +137,13 @@ class DepthPrediction:
         if settings.upright == "auto":
             expected = "pose or null: depth networks do not estimate the up direction"
             raise SettingError("upright", found="auto", expected=expected)
+        written = ("depth",) if settings.write is None else settings.write
+        if "depth" not in written:
+            check_unread(settings, "without depth in write", depth_format=None)
+        if "depth" not in written or settings.depth_format not in (None, "png"):
+            check_unread(settings, "without depth files of integers", depth_scale=1000)
+        if "points" not in written:
+            check_unread(settings, "without points in write", points=None)
         how = settings.device, settings.images_per_forward, settings.align
         self._predictor = DepthPredictor(trained, views, *how)
         kind: Any = trained.depth_kind

@@ -25,7 +25,7 @@ def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.
         SettingError: The field of view is not between 0° and 180°.
     """
     if not 0 < fov_deg < 180:
-        raise SettingError("fov_deg", found=fov_deg, expected="more than 0 and less than 180")
+        raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
     height, width = size
     focal = width / (2 * math.tan(math.radians(fov_deg) / 2))
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])

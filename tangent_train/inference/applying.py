@@ -13,12 +13,11 @@ from torch import Tensor
 from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.errors import SettingError, at_least
 from tangent_train.inference.depth import combine_depth
-from tangent_train.rendering.accumulate import NO_OWNERS, add_to_canvas, zero_sums
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_choice, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
+from tangent_train.rendering.mosaic import Mosaic
 from tangent_train.rendering.representations.views import PinholeViews
-from tangent_train.rendering.tables import owners
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -152,14 +151,15 @@ def _mean(
 ) -> NDArray[np.float32]:
     """Return the blended results ``(H, W, *channels)``, written over their sums."""
     (height, width), count, feather = shape, math.prod(channels), blend == "feather"
-    owner = NO_OWNERS if feather else owners(grid, shape)
-    sums = zero_sums(shape, count + feather)  # with feathering, the last channel sums the weights
+    # With feathering, the last channel sums the weights.
+    mosaic = Mosaic(shape, count + feather, blend, averaged=True, softmax=False)
+    views, sums = PinholeViews(grid), mosaic.sums
     for faces, results in parts:
         flat = results.reshape(*results.shape[:3], -1)
         images = np.moveaxis(flat, -1, 1).astype(np.float32)
         if feather:
             images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
-        add_to_canvas(images, PinholeViews(grid, faces), shape, slice(0, height), owner, sums)
+        mosaic.add(torch.from_numpy(images), views[faces[0] : faces[-1] + 1])
     means, size = np.asarray(sums).reshape(-1), width * count
     for i in range(height):
         row = sums[i, :, : count + feather]
@@ -177,17 +177,17 @@ def _distance(
     align: Align,
 ) -> NDArray[np.float32]:
     """Return the distances ``(H, W)`` of aligned and blended depth."""
-    images = [results for _, results in parts]
-    depth = torch.from_numpy(np.concatenate(images).astype(np.float32))
-    channels = depth.shape[3:]
-    if math.prod(channels) != 1 or images[0].dtype.kind != "f":
-        raise SettingError(
-            "result of the function",
-            found=f"K = {math.prod(channels)} of {images[0].dtype}",
-            expected="one float per pixel, which is depth, with align=",
-        )
-    depth = depth.reshape(-1, 1, *grid.size)
-    found = combine_depth([(PinholeViews(grid), depth)], shape, kind, blend, align)
+    views, outputs = PinholeViews(grid), []
+    for faces, results in parts:
+        if (channels := math.prod(results.shape[3:])) != 1 or results.dtype.kind != "f":
+            raise SettingError(
+                "result of the function",
+                found=f"K = {channels} of {results.dtype}",
+                expected="one float per pixel, which is depth, with align=",
+            )
+        depth = torch.from_numpy(results.astype(np.float32)).reshape(-1, 1, *grid.size)
+        outputs.append((views[faces[0] : faces[-1] + 1], depth))
+    found = combine_depth(outputs, shape, kind, blend, align)
     if not found.distance.isfinite().any():
         raise SettingError(
             "result of the function",

@@ -19,7 +19,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.inference.alignment import align as align_views
 from tangent_train.inference.alignment import lattice, sample_views, sphere_points
-from tangent_train.inference.engine import ViewPredictor, view_scores, views_per_forward
+from tangent_train.inference.engine import ViewPredictor
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import DepthMosaic
 from tangent_train.rendering.representations.views import Representation
@@ -90,8 +90,8 @@ def combine_depth(
     Views are blended in the logarithm of distance, or in disparity for networks that return it.
 
     Args:
-        outputs: Sets of views that each cover the image, and the network's output for all views of
-            a set, ``(n, 1, h, w)``.
+        outputs: Views that cover the image, once or several times, and the network's output for
+            them, ``(n, 1, h, w)``.
         shape: ``(H, W)`` of the panorama or photo.
         kind: Kind of the output.
         blend: Blend of the views.
@@ -104,22 +104,17 @@ def combine_depth(
     """
     points = sphere_points(shape) if camera_matrix is None else lattice(shape)
     points = points[_inside(area, points, shape)]
-    sets, samples, count = [], [], 0
+    parts, samples, count = [], [], 0
     for views, raw in outputs:
         lengths = torch.from_numpy(views.ray_lengths()).to(raw)
         depth, depth_kind = depth_of_output(raw, kind, lengths[:, None])
         samples.append(sample_views(depth[:, 0].cpu().numpy(), views, shape, points))
-        sets.append((views, depth, count))
+        parts.append((views, depth, slice(count, count + len(views)), lengths))
         count += len(views)
     alignment = align_views(samples, depth_kind, align)
     mosaic = DepthMosaic(shape, blend, device=outputs[0][1].device)
-    for views, depth, start in sets:
-        step = views_per_forward((depth.shape[-2], depth.shape[-1]))
-        for first in range(0, len(views), step):
-            part = slice(first, min(first + step, len(views)))
-            numbers = slice(start + part.start, start + part.stop)
-            lengths = torch.from_numpy(views[part].ray_lengths())
-            mosaic.add(alignment.applied(depth[part], numbers, lengths), views[part])
+    for views, depth, numbers, lengths in parts:
+        mosaic.add(alignment.applied(depth, numbers, lengths), views)
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
         distance = distance / _median(distance, area, camera_matrix)
@@ -136,12 +131,13 @@ def check_align(setting: str, align: Align | None, representation: Any) -> None:
         representation: Views of panoramas; None or others for photos, which may have one crop.
 
     Raises:
-        SettingError: There is only one view, and a correction is given.
+        SettingError: The value is unknown; or there is only one view, and a correction is given.
     """
+    check_choice(setting, align or "none", get_args(Align))
     if align in (None, "none") or not isinstance(representation, Representation):
         return
     if sum(map(len, representation.view_sets())) == 1:
-        expected = "null or none: the panorama is one view, with nothing to align it to"
+        expected = "none: the panorama is one view, with nothing to align it to"
         raise SettingError(setting, found=align, expected=expected)
 
 
@@ -167,7 +163,6 @@ class DepthPredictor(ViewPredictor):
         images_per_forward: int | None = None,
         align: Align | None = None,
     ) -> None:
-        check_choice("align", align or "none", get_args(Align))
         check_align("align", align, getattr(view_sets, "representation", None))
         super().__init__(trained, view_sets, device, images_per_forward)
         self._kind: Any = trained.depth_kind
@@ -186,18 +181,8 @@ class DepthPredictor(ViewPredictor):
         Raises:
             SettingError: The views cannot be aligned in this way.
         """
-        sets, outputs = self._sets(image), []
-        count = sum(len(views) for views, _, _ in sets)
-        for views, images, rays in sets:
-            depth = []
-            for part, output in view_scores(
-                self._network, images, len(views), self._per_forward, rays
-            ):
-                depth.append(output)
-                progress((part.stop - part.start) / count)
-            outputs.append((views, torch.cat(depth)))
         return combine_depth(
-            outputs,
+            list(self._scored(self._sets(image), progress)),
             image.shape,
             self._kind,
             self._view_sets.blend,

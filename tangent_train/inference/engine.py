@@ -45,6 +45,9 @@ if TYPE_CHECKING:
     ViewImages = Callable[[slice], Tensor]
     """Returns some of the views as normalized images ``(n, C, h, w)``."""
 
+    ViewSet = tuple[Views, ViewImages, Tensor | None]
+    """Views that cover the whole image, their images, and rays if the network takes them."""
+
 _PIXELS_PER_FORWARD = 2**20
 
 
@@ -89,34 +92,19 @@ def view_scores(
         yield part, plain_scores(returned).float()
 
 
-def fill(
-    mosaic: ScoreMosaic,
-    network: Callable[..., Any],
-    sets: Iterable[tuple[Views, ViewImages, Tensor | None]],
-    per_forward: int,
-    progress: Callable[[int], object] = lambda count: None,
-    scored: Callable[[Tensor, Views], object] = lambda scores, views: None,
-) -> ScoreMosaic:
-    """Add the scores of sets of views to a mosaic.
+def scored_views(
+    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
+) -> Iterator[tuple[Views, Tensor]]:
+    """Yield views of one image with their scores, a few at a time, see `view_scores`.
 
     Args:
-        mosaic: The mosaic.
         network: See `view_scores`.
-        sets: Views that cover the whole image, their images, and viewing rays if the network takes
-            them.
+        sets: Sets of views.
         per_forward: Number of views per call of the network.
-        progress: Called with the number of views since the last call.
-        scored: Called with scores and their views.
-
-    Returns:
-        The mosaic.
     """
     for views, images, rays in sets:
         for part, scores in view_scores(network, images, len(views), per_forward, rays):
-            mosaic.add(scores, views[part])
-            scored(scores, views[part])
-            progress(part.stop - part.start)
-    return mosaic
+            yield views[part], scores
 
 
 def upright_rays(
@@ -261,9 +249,9 @@ class ViewPredictor:
             network = partial(network, images_per_chunk=self._per_forward)
         self._network, self._trained, self._view_sets = network, trained, view_sets
 
-    def _sets(self, image: InputImage) -> list[tuple[Views, ViewImages, Tensor | None]]:
-        """Return the sets of views of an image, see `fill`."""
-        sets: list[tuple[Views, ViewImages, Tensor | None]] = []
+    def _sets(self, image: InputImage) -> list[ViewSet]:
+        """Return the sets of views of an image."""
+        sets: list[ViewSet] = []
         for shown, shape, views, rotation in self._view_sets(image):
             rendered = RenderedViews(self._trained, shown, shape, self.device)
             rays: Iterable[Tensor | None] = [None] * len(views)
@@ -271,6 +259,15 @@ class ViewPredictor:
                 rays = upright_rays(views, rotation, self.device)
             sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
         return sets
+
+    def _scored(
+        self, sets: Sequence[ViewSet], progress: Callable[[float], object]
+    ) -> Iterator[tuple[Views, Tensor]]:
+        """Yield views with their scores; call `progress` with the share of them."""
+        count = sum(len(views) for views, _, _ in sets)
+        for views, scores in scored_views(self._network, sets, self._per_forward):
+            yield views, scores
+            progress(len(views) / count)
 
 
 class Predictor(ViewPredictor):
@@ -320,11 +317,10 @@ class Predictor(ViewPredictor):
             `TrainedNetwork.groups`.
         """
         sets = self._sets(image)
-        count = sum(len(views) for views, _, _ in sets)
         mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
-        return fill(
-            mosaic, self._network, sets, self._per_forward, lambda done: progress(done / count)
-        )
+        for views, scores in self._scored(sets, progress):
+            mosaic.add(scores, views)
+        return mosaic
 
     def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
         """Return an empty mosaic, which reuses the memory of an earlier one if possible."""

@@ -37,10 +37,6 @@ uint8 on any device."""
 
 _ASPECT_TOLERANCE = 0.01
 _IN_MEMORY = Path("image")
-_NOT_WHOLE = (
-    "For a photo, give fov=, its horizontal field of view in degrees; for a part of a panorama, "
-    "area=[west, east, south, north] in degrees."
-)
 
 
 @dataclass(frozen=True)
@@ -143,7 +139,7 @@ def read_panorama(
     if path is not None or angles is not None:
         area = panorama_area(path or _IN_MEMORY, size, angles)
     else:
-        area = whole_area(_IN_MEMORY, size, _NOT_WHOLE)
+        area = whole_area(_IN_MEMORY, size)
     steps = None if depth is None else depth(size)
     up = None if upright is None or path is None else read_up(path)
     placed = None if steps is None else area.place(steps)

@@ -94,19 +94,22 @@ def load(
         SettingError: A setting does not suit the network.
     """
     check_choice("unmapped", unmapped, get_args(Unmapped))
+    check_choice("blend", blend, get_args(Blend))
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
-    if class_map is not None:
+    if class_map is None:
+        _check_unset("unmapped", unmapped, "unknown", "without class_map")
+    else:
         trained = map_classes(original, load_class_map(class_map), unmapped).trained
     chosen = trained, levels, base_level, blend, rotations
     how = device, images_per_forward
     predictor: Any
     if trained.predicts == DISTANCE:
-        _check_unset("min_confidence", min_confidence or None, "depth networks")
+        _check_unset("min_confidence", min_confidence, 0, "for depth networks")
         predictor = partial(DepthPredictor, align=align)
     else:
-        _check_unset("align", align, "networks of classes")
+        _check_unset("align", align, None, "for networks of classes")
         predictor = partial(Predictor, min_confidence=min_confidence)
     panoramas = predictor(trained, PanoramaViews(*chosen, views, fill), *how)
     return Network(
@@ -117,10 +120,10 @@ def load(
     )
 
 
-def _check_unset(setting: str, value: object, what: str) -> None:
+def _check_unset(setting: str, value: object, unused: object, reason: str) -> None:
     """Refuse a setting that would be ignored."""
-    if value is not None:
-        raise SettingError(setting, found=value, expected=f"None for {what}")
+    if value != unused:
+        raise SettingError(setting, found=value, expected=f"{unused} {reason}")
 
 
 class Network:
@@ -269,6 +272,9 @@ class Network:
             SettingError: See `labels`.
         """
         self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
+        if settings.get("mask") is not None:
+            expected = "None for scores: they are not masked"
+            raise SettingError("mask", found="one", expected=expected)
         mosaic, read = self._predict(image, probabilities=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
         if read.area is not None:

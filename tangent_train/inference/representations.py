@@ -198,12 +198,8 @@ class PhotoViews:
         if rotations != 1:
             raise SettingError("rotations", found=rotations, expected="1 for photos")
         if "elevation" in trained.inputs:
-            raise SettingError(
-                "projection",
-                found="perspective",
-                expected="equirectangular: the network takes the elevation of every pixel, which "
-                "is unknown in photos",
-            )
+            expected = "a panorama: the elevation of pixels, which the network takes, is unknown"
+            raise SettingError("image", found="a photo", expected=expected)
         self._crops = [
             _photo_representation(trained, level, base_level)
             for level in level_list(levels, trained.photo_level or trained.level)
@@ -313,7 +309,7 @@ def photo_network_settings(
 def _check_single(levels: Sequence[int], base_level: int | None) -> None:
     """Refuse settings that only tangent images have."""
     if base_level is not None:
-        raise SettingError("base_level", found=base_level, expected="null, for these views")
+        raise SettingError("base_level", found=base_level, expected="tangent images")
     if len(levels) > 1:
         raise SettingError(
             "levels",

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -120,30 +120,42 @@ class DepthProtocol:
         lengths = 1.0 if ray_lengths is None else ray_lengths.double()
         used = (truth > 0) & distances.isfinite()
         if self.alignment != "none" and used.any():
-            values, true = distances / lengths, truth.double() / lengths
-            is_disparity = self.alignment_in == "disparity"
-            if is_disparity:
-                values, true = 1 / values, 1 / true
-            scale, shift = _fit(values[used], true[used], self.alignment)
-            values = scale * values + shift
-            if is_disparity and self.clip:
+            power = -1 if self.alignment_in == "disparity" else 1
+            values, true = (distances / lengths) ** power, (truth.double() / lengths) ** power
+            if self.alignment == "affine":
+                values = scaled_and_shifted(values, true.where(used, torch.nan))
+            else:
+                v, t = values[used], true[used]
+                values *= t.median() / v.median() if self.alignment == "median" else v @ t / (v @ v)
+            if power < 0 and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
-            distances = lengths * (1 / values if is_disparity else values)
+            distances = lengths * values**power
         if self.clip:
             distances = distances.clamp(self.min_distance, self.max_distance)
         return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)
 
 
-def _fit(values: Tensor, true: Tensor, alignment: Alignment) -> tuple[Any, Any]:
-    """Return scale and shift of values for some true values."""
-    if alignment == "median":
-        return true.median() / values.median(), 0.0
-    if alignment == "scale":
-        return (values * true).sum() / values.square().sum(), 0.0
-    centered = values - values.mean()
-    variance = centered.square().sum()
-    scale = torch.where(variance > 0, (centered * true).sum() / variance, 0.0)
-    return scale, true.mean() - scale * values.mean()
+def scaled_and_shifted(
+    values: Float[Tensor, "*images height width"], truth: Float[Tensor, "*images height width"]
+) -> Float[Tensor, "*images height width"]:
+    """Scale and shift values of each image by least squares, as far as the truth is known.
+
+    This is the alignment of Ranftl et al. (TPAMI 2022, equation 4). It can be differentiated.
+
+    Args:
+        values: Values of any scale and shift; finite where the truth is known.
+        truth: True values; NaN where unknown.
+    """
+    known = ~truth.isnan()
+    counts = known.sum(dim=(-2, -1), keepdim=True).clamp(min=1)
+
+    def mean(x: Tensor) -> Tensor:
+        return x.where(known, 0).sum(dim=(-2, -1), keepdim=True) / counts
+
+    true = truth.where(known, 0)  # without NaN, whose gradients would be NaN too
+    centered, true_mean = values - mean(values), mean(true)
+    variance = mean(centered.square()).clamp(min=torch.finfo(values.dtype).eps)
+    return centered * (mean(centered * (true - true_mean)) / variance) + true_mean
 
 
 def error_sums(
@@ -170,18 +182,17 @@ def error_sums(
     away, ratio = (d - g).abs(), torch.maximum(d / g, g / d)
     values = [known, predicted, away / g, away**2 / g, away**2, (d / g).log() ** 2, away]
     values += [predicted & (ratio < _THRESHOLD**n) for n in (1, 2, 3)]
-    if truth.ndim != 2:  # a photo
-        sums = torch.stack([value.double().sum() for value in values])
-        return torch.cat([sums[None], sums.new_zeros(len(BAND_EDGES_DEG), _SUMS)])
-    rows = torch.stack([value.double().sum(dim=1) for value in values], dim=1)
+    rows = torch.stack([value.double().flatten(1).sum(dim=1) for value in values], dim=1)
     return torch.from_numpy(_row_weights(tuple(truth.shape))).to(rows.device) @ rows
 
 
 @lru_cache(maxsize=4)
-def _row_weights(shape: tuple[int, int]) -> NDArray[np.float64]:
-    """Return the weights of the rows of a panorama, see `error_sums`."""
+def _row_weights(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Return the weights of the rows of a panorama, or of the crops of a photo."""
+    if len(shape) != 2:
+        return np.outer(np.arange(1 + len(BAND_EDGES_DEG)) == 0, np.ones(shape[0]))
     bands = np.eye(len(BAND_EDGES_DEG) - 1)[:, band_of_rows(shape[0])]
-    return np.stack([np.ones(shape[0]), equirect_solid_angles(shape), *bands])
+    return np.stack([np.ones(shape[0]), equirect_solid_angles((shape[0], shape[1])), *bands])
 
 
 def depth_scores(sums: Float[np.ndarray, "*some sums"]) -> dict[str, NDArray[np.float64]]:

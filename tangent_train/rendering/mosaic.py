@@ -36,7 +36,7 @@ _LEAST_VALID = {"nearest": 0.5, "feather": 1e-3}
 Backend = Literal["numba", "torch"] | None
 
 
-class _Mosaic:
+class Mosaic:
     """Weighted sums of K channels of images at every pixel of a panorama or photo.
 
     Args:
@@ -61,8 +61,8 @@ class _Mosaic:
         *,
         averaged: bool,
         softmax: bool,
-        device: torch.device | str,
-        backend: Backend,
+        device: torch.device | str = "cpu",
+        backend: Backend = None,
         spare: NDArray[np.float32] | None = None,
     ) -> None:
         self.shape = shape
@@ -120,7 +120,7 @@ class _Mosaic:
         return self._owned[1]
 
 
-class ScoreMosaic(_Mosaic):
+class ScoreMosaic(Mosaic):
     """Scores of K classes at every pixel of a panorama or photo.
 
     Args:
@@ -187,7 +187,7 @@ class ScoreMosaic(_Mosaic):
         return torch.cat(parts).cpu().numpy()
 
 
-class DepthMosaic(_Mosaic):
+class DepthMosaic(Mosaic):
     """Means of the depth of images, weighted as scores are; unknown pixels of images do not count.
 
     The second of two channels sums the weights, so that the memory is that of two numbers per

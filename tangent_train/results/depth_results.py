@@ -169,7 +169,7 @@ class DepthResults(ImageResults):
         rows, unit = [], ", m" if self.is_metric else ""
         for name, title in _ROWS.items():
             values = [v for e in entries if (v := e["depth"].get(name)) is not None]
-            if any(values):
+            if any(values) or (name == "known" and values):
                 mean = np.mean(values) * (100 if "%" in title else 1)
                 rows.append([title.format(unit=unit), f"{mean:.3g}"])
         steps = [(e["depth"].get("step_before"), e["depth"].get("step_after")) for e in entries]

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 _SUMMARY = "summary.json"
 _FILES = (_SUMMARY, "classes.json", "summary.csv", "report.html", "shards")
 _PICTURES = ("color", "overlay")  # of the frames of a video: videos
-_FOLDERS = ("labels", "color", "overlay", "probabilities", "depth", "points")
+_NAMES = (*_FILES, "labels", "color", "overlay", "probabilities", "depth", "points")
 
 Entry = dict[str, Any]
 """Entry of an image: file, name, rows, columns and its summary, or file, name and error."""
@@ -47,9 +47,19 @@ def frame_name(video: str, number: int) -> str:
 
 
 def is_result_in(output: Path) -> Callable[[Path], bool]:
-    """Return a function that is True for files of predictions in an output folder."""
-    results = [(output / name).resolve() for name in (*_FOLDERS, *_FILES)]
-    return lambda path: any(path.resolve().is_relative_to(result) for result in results)
+    """Return a function that is True for files of predictions.
+
+    Args:
+        output: Folder of predictions. Others are recognized by their summary.
+    """
+    output = output.resolve()
+
+    def is_result(path: Path) -> bool:
+        path = path.resolve()
+        named = [folder for folder in path.parents if path.relative_to(folder).parts[0] in _NAMES]
+        return any(folder == output or (folder / _SUMMARY).is_file() for folder in named)
+
+    return is_result
 
 
 class PredictedImage(NamedTuple):

@@ -1,7 +1,8 @@
 """Published scores, beside results of the same protocol.
 
-``published.csv`` contains published scores in percent with their sources, one score per line, and
-those of single classes of Stanford2D3DS. ``protocols.yaml`` contains the facts that make scores
+``published.csv`` contains published scores with their sources, one score per line, and those of
+single classes of Stanford2D3DS: in percent, or in the unit of the score, see `Heading`.
+``protocols.yaml`` contains the facts that make scores
 comparable (`LabeledData.facts`, `Task.facts`), for each ``protocol`` of the scores. A score
 stands beside a result if all facts are the same; else the facts that differ are named.
 
@@ -14,6 +15,7 @@ because the paper's rows for all folds repeat fold 3; scores per class are over 
 from __future__ import annotations
 
 import csv
+import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
@@ -51,11 +53,11 @@ class Publication(NamedTuple):
         trained = self.trained_on and f"trained on {self.trained_on}"
         return ", ".join(filter(None, (method, self.stage, trained)))
 
-    @property
-    def scores(self) -> list[float]:
-        """Scores of the folds in percent, without mAcc."""
-        named = [line for line in self.lines if line["score"] != "macc"]
-        return [float(line["mean"]) for line in named if line["mean"]]
+    def scores(self, name: str) -> list[float]:
+        """Return a score of the folds, in the unit of the file."""
+        return [
+            float(line["mean"]) for line in self.lines if line["score"] == name and line["mean"]
+        ]
 
     @property
     def folds(self) -> tuple[str, ...]:
@@ -65,6 +67,7 @@ class Publication(NamedTuple):
     def differences(self, record: Record) -> tuple[str, ...]:
         """Return the facts that differ from those of an evaluation, with both values."""
         published, found = facts(self.protocol), dict(record.protocol)
+        found.pop("views_aligned", None)  # of the method
         if self.level:
             published["level"], found["level"] = self.level, str(record.settings.get("level"))
         if self.folds and record.fold is not None and str(record.fold) not in self.folds:
@@ -128,7 +131,7 @@ class Comparison(NamedTuple):
         sources = ", ".join(dict.fromkeys(publication.source for publication in same))
         notes = [f"Published scores of the same protocol: {sources}."] if same else []
         nearest = sorted(groups, key=len)[:_MOST_NAMED]
-        notes += [_difference(groups[differences], differences) for differences in nearest]
+        notes += [_difference(groups[some], some, records[0]) for some in nearest]
         return Comparison([publication.row(records[0], shown) for publication in same], notes)
 
     def tables(self, like: Record) -> list[Table]:
@@ -152,10 +155,12 @@ class Comparison(NamedTuple):
         return [table] if rows else []
 
 
-def _difference(group: Sequence[Publication], differences: Sequence[str]) -> str:
-    """Return a sentence on published scores with the same differences."""
-    best = max(group, key=lambda publication: fmean(publication.scores or [0.0]))
-    text = ", ".join(f"{score:g}" for score in best.scores)
+def _difference(group: Sequence[Publication], differences: Sequence[str], record: Record) -> str:
+    """Return a sentence on published scores with the same differences from an evaluation."""
+    sign = -1 if record.headings[record.main].better == "lower" else 1
+    named = [(publication.scores(record.main), publication) for publication in group]
+    scores, best = max(named, key=lambda pair: fmean([sign * s for s in pair[0]] or [-math.inf]))
+    text = ", ".join(f"{score:g}" for score in scores)
     more = f" and {len(group) - 1} more" if len(group) > 1 else ""
     return f"Not comparable: {best.name}: {text}{more} ({best.protocol}). {'; '.join(differences)}."
 
@@ -192,14 +197,15 @@ def _read(name: str) -> str:
 
 
 def _record(like: Record, fold: str, by_score: Mapping[str, Mapping[str, str]]) -> Record:
-    def share(score: str, column: str) -> float | None:
-        percent = by_score.get(score, {}).get(column)
-        return round(float(percent) / 100, 6) if percent else None
+    def value(score: str, column: str) -> float | None:
+        text = by_score.get(score, {}).get(column)
+        whole = 100 if like.headings[score].unit == "%" else 1
+        return round(float(text) / whole, 6) if text else None
 
     classes = [
-        {"class": c, **{name: share(mean, c) for name, mean in like.class_means.items()}}
+        {"class": c, **{name: value(mean, c) for name, mean in like.class_means.items()}}
         for c in like.class_names
     ]
-    means = {name: share(name, "mean") for name in like.means}
+    means = {name: value(name, "mean") for name in like.means}
     settings = {"data.fold": int(fold) if fold else None}
     return Record("", 0, like.headings, means, classes, settings=settings)

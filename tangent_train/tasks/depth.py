@@ -35,9 +35,9 @@ from tangent_train.metrics.depth import (
     DepthProtocol,
     Quantity,
     depth_intervals,
-    depth_scores,
     error_sums,
     mean_depth_scores,
+    scaled_and_shifted,
 )
 from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
@@ -46,7 +46,7 @@ from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import distance_panel, shown_arrays
 from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.tasks.base import RGB
-from tangent_train.tasks.losses import DepthLoss, log_error_sum, scaled_and_shifted
+from tangent_train.tasks.losses import DepthLoss, log_error_sum
 from tangent_train.tasks.views import ViewsTask, labels_of_views
 
 _LEAST = 1e-3
@@ -64,9 +64,7 @@ class DepthTask(ViewsTask):
     Args:
         network: Network with one output, see `ViewsTask`: the natural logarithm of the distance, or
             `depth_kind`.
-        representation: Representation of the images.
-        class_names: Empty.
-        *arguments: Optimizer and scheduler, see `Task`.
+        *arguments: Representation, no class names, optimizer and scheduler, see `Task`.
         depth_kind: Kind of the network's output; None for that of a network from a file, else
             ``log_distance``.
         loss: Kind of loss, see `log_error_sum`.
@@ -108,8 +106,6 @@ class DepthTask(ViewsTask):
     def __init__(
         self,
         network: nn.Module,
-        representation: Any,
-        class_names: Sequence[str],
         *arguments: Any,
         depth_kind: DepthKind | None = None,
         loss: DepthLoss = "log_l1",
@@ -122,20 +118,17 @@ class DepthTask(ViewsTask):
         clip: bool = False,
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, class_names, *arguments, **settings)
+        super().__init__(network, *arguments, **settings)
         of_file = getattr(network, "kind", None)
         self.depth_kind: DepthKind = depth_kind or of_file or "log_distance"
-        check_choice(
-            "task.depth_kind", self.depth_kind, (of_file,) if of_file else get_args(DepthKind)
-        )
-        check_choice("task.align", align or "none", get_args(Align))
-        check_align("task.align", align, representation)
+        kinds = (of_file,) if of_file else get_args(DepthKind)
+        check_choice("task.depth_kind", self.depth_kind, kinds)
+        check_align("task.align", align, self.representation)
         check_choice("task.loss", loss, get_args(DepthLoss))
         if not 0 <= scale_invariance <= 1:
             raise SettingError("task.scale_invariance", found=scale_invariance, expected="0 to 1")
         if self.label_smoothing:
-            found = self.label_smoothing
-            raise SettingError("task.label_smoothing", found=found, expected="0 for distances")
+            raise SettingError("task.label_smoothing", found=self.label_smoothing, expected="0")
         if alignment == "none" and not is_metric(self.depth_kind):
             raise SettingError(
                 "task.alignment",
@@ -143,9 +136,8 @@ class DepthTask(ViewsTask):
                 expected="median, scale or affine: the scale of its distances is unknown",
                 remedy="task.alignment=affine",
             )
-        if alignment_in is None:
-            alignment_in = "disparity" if is_disparity(self.depth_kind) else "distance"
-        self.protocol = DepthProtocol(alignment, alignment_in, min_distance, max_distance, clip)
+        quantity = alignment_in or ("disparity" if is_disparity(self.depth_kind) else "distance")
+        self.protocol = DepthProtocol(alignment, quantity, min_distance, max_distance, clip)
         self.loss: DepthLoss = loss
         self.scale_invariance = scale_invariance
         self.align = align
@@ -216,8 +208,14 @@ class DepthTask(ViewsTask):
         truth = self.meters(sample.target)
         if truth.ndim == 2:
             return self.protocol.aligned(self._of_panorama(sample, truth), truth), truth
+        lengths = sample.ray_lengths
+        depth = self._depth_of(sample.images.__getitem__, len(truth))
+        if not self.is_tested:
+            self._add_loss(depth, truth, lengths)
+        values, kind = depth_of_output(depth, self.depth_kind, lengths[:, None])
+        distances = distance_of(along_rays(values, kind, lengths[:, None]), kind)[:, 0]
         # The crops of a photo have separate scales.
-        crops = zip(self._of_crops(sample, truth), truth, sample.ray_lengths, strict=True)
+        crops = zip(distances, truth, lengths, strict=True)
         return torch.stack([self.protocol.aligned(*crop) for crop in crops]), truth
 
     def _of_panorama(
@@ -237,17 +235,6 @@ class DepthTask(ViewsTask):
         self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
 
-    def _of_crops(
-        self, sample: EvaluationSample[Tensor], truth: Tensor
-    ) -> Float[Tensor, "crops height width"]:
-        """Predict the distances of the crops of a photo, each separately."""
-        depth = self._depth_of(sample.images.__getitem__, len(truth))
-        if not self.is_tested:
-            self._add_loss(depth, truth, sample.ray_lengths)
-        lengths = sample.ray_lengths[:, None]
-        values, kind = depth_of_output(depth, self.depth_kind, lengths)
-        return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
-
     def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
         """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
         parts = view_scores(self, images, count, self.images_per_forward, rays)
@@ -259,10 +246,8 @@ class DepthTask(ViewsTask):
 
     def logged_scores(self, result: NDArray[np.float64]) -> dict[str, float]:
         """Return means over images; for panoramas, also weighted by solid angle."""
-        scores = mean_depth_scores(result[:, 0])
-        if result[:, 1].any():
-            scores |= by_solid_angle(mean_depth_scores(result[:, 1]))
-        return {name: scores[name] for name in self.headings if name in scores}
+        pixels, angles = (mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
+        return pixels | (by_solid_angle(angles) if result[:, 1].any() else {})
 
     def record(self, result: NDArray[np.float64], noun: str) -> Record:
         """Return the record with scores of latitude bands, and confidence intervals."""
@@ -288,26 +273,22 @@ class DepthTask(ViewsTask):
     ) -> RGB:
         """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
         truth = self.meters(target)
-        return distance_panel(
-            *shown_arrays(image, truth, prediction, self.representation, most_rows)
-        )
+        shown = shown_arrays(image, truth, prediction, self.representation, most_rows)
+        return distance_panel(*shown)
 
     def report_image(
         self, name: str, image: Any, target: Tensor, prediction: Tensor
     ) -> EncodedImage:
         """Return the image with its true and predicted distances, aligned as for the scores."""
         truth = self.meters(target)
-        absrel = depth_scores(error_sums(prediction, truth)[0].cpu().numpy())["absrel"]
-        arrays = shown_arrays(image, truth, prediction, self.representation, cut=False)
-        return encode_image(
-            name,
-            arrays[0],
-            prediction=arrays[2],
-            truth=arrays[1],
-            sphere=target.ndim == 2,
-            note="" if np.isnan(absrel) else f"AbsRel {absrel:.3g}",
-        )
+        sums = error_sums(prediction, truth)[:1].cpu().numpy()
+        absrel = mean_depth_scores(sums)["absrel"]
+        note = "" if np.isnan(absrel) else f"AbsRel {absrel:.3g}"
+        rgb, true, shown = shown_arrays(image, truth, prediction, self.representation, cut=False)
+        sphere = target.ndim == 2
+        return encode_image(name, rgb, prediction=shown, truth=true, sphere=sphere, note=note)
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
-        """See `Task`."""
-        return self.logged_scores(result[list(places)])
+        """See `Task`; NaN if the images have no known distances."""
+        undefined = dict.fromkeys(self.logged_scores(result), np.nan)
+        return undefined | self.logged_scores(result[list(places)])

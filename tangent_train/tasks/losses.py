@@ -108,30 +108,6 @@ def log_error_sum(
     return exact.square().sum() - scale_invariance * common.sum()
 
 
-def scaled_and_shifted(
-    values: Float[Tensor, "images height width"], truth: Float[Tensor, "images height width"]
-) -> Tensor:
-    """Scale and shift values of each image by least squares, as far as the truth is known.
-
-    This is the alignment of Ranftl et al. (TPAMI 2022, equation 4).
-
-    Args:
-        values: Values of any scale and shift.
-        truth: True values; NaN where unknown.
-    """
-    known = ~truth.isnan()
-    counts = known.sum(dim=(1, 2), keepdim=True).clamp(min=1)
-
-    def mean(x: Tensor) -> Tensor:
-        return x.where(known, 0).sum(dim=(1, 2), keepdim=True) / counts
-
-    # Without NaN, whose gradients would be NaN too.
-    exact, true = _exact(values), _exact(truth).where(known, 0)
-    centered, true_mean = exact - mean(exact), mean(true)
-    variance = mean(centered.square()).clamp(min=torch.finfo(exact.dtype).eps)
-    return centered * (mean(centered * (true - true_mean)) / variance) + true_mean
-
-
 def _exact(values: Tensor) -> Tensor:
     """Convert to at least float32, for sums over millions of pixels."""
     return values.to(torch.promote_types(values.dtype, torch.float32))

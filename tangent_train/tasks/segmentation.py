@@ -17,7 +17,7 @@ from datamodules.core.labels import PIXEL_CLASSES
 from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
-from tangent_train.inference.engine import fill, view_scores
+from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.segmentation import (
     AbsentClass,
     SegmentationCounts,
@@ -29,6 +29,7 @@ from tangent_train.metrics.segmentation import (
     segmentation_scores,
 )
 from tangent_train.registry import registered
+from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.evaluation import class_entries, latitude_entries
 from tangent_train.results.html.page import EncodedImage, encode_image
@@ -50,9 +51,8 @@ class SegmentationTask(ViewsTask):
 
     Args:
         network: Network, see `ViewsTask`. Score k is that of label k + 1.
-        representation: Representation of the images.
-        class_names: Names of the K + 1 labels, the unknown class first.
-        *arguments: Optimizer and scheduler, see `Task`.
+        *arguments: Representation, names of the K + 1 labels (the unknown class first), optimizer
+            and scheduler, see `Task`.
         class_weights: Weights of the loss: a name (``none``, ``log``, ``sqrt``), for weights that
             the data module computes, or K numbers.
         absent_class: Treatment of classes absent from the ground truth in the means.
@@ -73,28 +73,18 @@ class SegmentationTask(ViewsTask):
     def __init__(
         self,
         network: nn.Module,
-        representation: Any,
-        class_names: Sequence[str],
         *arguments: Any,
         class_weights: ClassWeights | Sequence[float] = "log",
         absent_class: AbsentClass = "skip",
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, class_names, *arguments, **settings)
+        super().__init__(network, *arguments, **settings)
+        check_choice("task.absent_class", absent_class, get_args(AbsentClass))
         names, classes = get_args(ClassWeights), self.class_names[1:]
-        for name, value, fits, expected in (
-            ("absent_class", absent_class, absent_class in get_args(AbsentClass), "skip or zero"),
-            (
-                "class_weights",
-                class_weights,
-                class_weights in names
-                if isinstance(class_weights, str)
-                else len(class_weights) == len(classes),
-                f"{', '.join(names)}; or {len(classes)} numbers, for {', '.join(classes)}",
-            ),
-        ):
-            if not fits:
-                raise SettingError(f"task.{name}", found=value, expected=expected)
+        is_name = isinstance(class_weights, str)
+        if not (class_weights in names if is_name else len(class_weights) == len(classes)):
+            expected = f"{', '.join(names)}; or {len(classes)} numbers, for {', '.join(classes)}"
+            raise SettingError("task.class_weights", found=class_weights, expected=expected)
         self.weighting = class_weights
         self.absent_class: AbsentClass = absent_class
         self.register_buffer("class_weights", torch.ones(len(classes)))
@@ -157,29 +147,22 @@ class SegmentationTask(ViewsTask):
                 best[part] = scores.argmax(dim=1)
                 if target is not None:
                     self._add_loss(scores, target[part])
-        else:
-            mosaic = self._mosaic(images, (shape[0], shape[1]), rotation, target, area)
-            best = mosaic.labels().long().to(images.device)
-        return (best + 1).where(best < len(self.class_weights), 0)
+            return (best + 1).where(best < len(self.class_weights), 0)
 
-    def _mosaic(
-        self,
-        images: Tensor,
-        shape: tuple[int, int],
-        rotation: NDArray[np.float64] | None,
-        target: Tensor | None,
-        area: SphereArea | None,
-    ) -> ScoreMosaic:
-        """Combine the scores of all views of a panorama, see `predict_labels`."""
-        sets = self.view_sets(images, rotation, area)
-        averaged, blend = len(sets) > 1, self.representation.blend
-        mosaic = ScoreMosaic(shape, self.num_scores, blend, averaged=averaged, device=images.device)
-
-        def add_loss(scores: Tensor, views: Any) -> None:
+        sets, blend = self.view_sets(images, rotation, area), self.representation.blend
+        mosaic = ScoreMosaic(
+            (shape[0], shape[1]),
+            self.num_scores,
+            blend,
+            averaged=len(sets) > 1,
+            device=images.device,
+        )
+        for views, scores in scored_views(self, sets, self.images_per_forward):
+            mosaic.add(scores, views)
             if target is not None:
                 self._add_loss(scores, labels_of_views(target, views))
-
-        return fill(mosaic, self, sets, self.images_per_forward, scored=add_loss)
+        best = mosaic.labels().long().to(images.device)
+        return (best + 1).where(best < len(self.class_weights), 0)
 
     def _add_loss(self, scores: Tensor, labels: Tensor) -> None:
         """Add the cross-entropy of views, without auxiliary scores, to the validation loss."""
@@ -188,14 +171,10 @@ class SegmentationTask(ViewsTask):
 
     def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the predicted and the true labels, see `ViewsTask`."""
-        labels = self.predict_labels(
-            sample.images,
-            tuple(sample.target.shape),
-            sample.rotation.cpu().numpy(),
-            None if self.is_tested else sample.target,
-            SphereArea.of_numbers(sample.area.cpu().numpy()),
-        )
-        return labels, sample.target
+        rotation, shape = sample.rotation.cpu().numpy(), tuple(sample.target.shape)
+        area = SphereArea.of_numbers(sample.area.cpu().numpy())
+        target = None if self.is_tested else sample.target
+        return self.predict_labels(sample.images, shape, rotation, target, area), sample.target
 
     def build_metric(self) -> SegmentationMetric:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
@@ -214,12 +193,8 @@ class SegmentationTask(ViewsTask):
     def record(self, result: SegmentationCounts, noun: str) -> Record:
         """Return the record with scores of classes and latitude bands, and confidence intervals."""
         pixels, angles = self._scores(result)
-        intervals = [
-            bootstrap_intervals(images, absent)
-            for images, absent in zip(
-                result.of_images.swapaxes(0, 1), self._absent_classes(result), strict=True
-            )
-        ]
+        of_images, absent = result.of_images.swapaxes(0, 1), self._absent_classes(result)
+        intervals = list(map(bootstrap_intervals, of_images, absent))
         columns = pixels.of_classes | by_solid_angle(angles.of_classes) | {"share": pixels.share}
         return replace(
             super().record(result, noun),
@@ -271,11 +246,5 @@ class SegmentationTask(ViewsTask):
         counts = count_image(prediction.cpu(), target.cpu(), classes).pixels
         note = f"mIoU {percent(segmentation_scores(counts).miou)}\u00a0%" if truth.any() else ""
         return encode_image(
-            name,
-            rgb,
-            classes,
-            prediction=labels,
-            truth=truth,
-            sphere=target.ndim == 2,
-            note=note,
+            name, rgb, classes, prediction=labels, truth=truth, sphere=target.ndim == 2, note=note
         )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -37,8 +37,7 @@ class ViewsTask(Task):
             network whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing
             rays of its images and bounds its memory (`models.SphereContext`).
         representation: Representation of the images.
-        class_names: Names of the labels.
-        *arguments: Optimizer and scheduler, see `Task`.
+        *arguments: Class names, optimizer and scheduler, see `Task`.
         auxiliary_weight: Weight of the loss of the auxiliary output.
         images_per_forward: Number of images per forward pass in evaluation, which bounds memory.
         **settings: Further arguments of `Task`.
@@ -48,13 +47,12 @@ class ViewsTask(Task):
         self,
         network: nn.Module,
         representation: Any,
-        class_names: Sequence[str],
         *arguments: Any,
         auxiliary_weight: float = 0.4,
         images_per_forward: int = 32,
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, class_names, *arguments, **settings)
+        super().__init__(network, representation, *arguments, **settings)
         if not auxiliary_weight >= 0:
             expected = "0 or more"
             raise SettingError("task.auxiliary_weight", found=auxiliary_weight, expected=expected)
@@ -158,10 +156,8 @@ class ViewsTask(Task):
         rotated = limited if rotation is None else limited.with_rotation(rotation)
         sets = rotated.view_sets()
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
-        rays: Iterable[Tensor | None] = [None] * len(sets)
-        if self.sees_rays:
-            rays = upright_rays(sets, rotation, images.device)
-        return list(zip(sets, readers, rays, strict=True))
+        seen = upright_rays(sets, rotation, images.device) if self.sees_rays else [None] * len(sets)
+        return list(zip(sets, readers, seen, strict=True))
 
 
 def labels_of_views(target: Tensor, views: Any) -> Tensor:

@@ -354,10 +354,6 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
             ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.images_per_chunk=1"],
             r"task.images_per_chunk: found 1, .* DeepLabV3 gets \(1, 3, .*more than 1 value",
         ),
-        (
-            ["task=depth", "data.inputs=[rgb]"],
-            r"class_weights for .*DepthTask; .*~task\.class_weights, or choose",
-        ),
         (["data=folder"], "data: found rooms for datamodules.FolderPanoramas; .*recipe=small"),
         (["data=synthshapes"], "data: found panoramas_per_step, rooms for .*SynthShapes"),
         (["data=zind_pairs"], "data: found ZindPairs; expected labeled images"),

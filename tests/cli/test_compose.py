@@ -18,7 +18,7 @@ from tangent_train.cli.compose import literal_paths, path_text, quoted
 from tangent_train.cli.stored import stored_run
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import config_folder
-from tests.running import command_of, composed
+from tests.running import command_of, composed, composed_settings
 
 EXPERIMENTS = sorted(
     path.relative_to(config_folder() / "experiment").with_suffix("").as_posix()
@@ -40,6 +40,17 @@ def test_every_experiment_composes(experiment: str) -> None:
 def test_every_option_of_every_group_composes(group: str) -> None:
     for path in (config_folder() / group).glob("*.yaml"):
         OmegaConf.resolve(composed("train", f"{group}={path.stem}"))
+
+
+@pytest.mark.parametrize("command", ["train", "transfer"])
+@pytest.mark.parametrize("task", ["classification", "depth", "segmentation"])
+def test_a_recipe_sets_what_the_task_has(task: str, command: str) -> None:
+    plain, small = (
+        composed_settings(command, f"task={task}", *more)["task"]
+        for more in ((), ("recipe=small",))
+    )
+    weights = {"class_weights": "sqrt"} if task == "segmentation" else {}
+    assert small == plain | {"channels_last": True} | weights
 
 
 def test_a_command_starts_from_a_stored_run_only_where_there_is_one(tmp_path: Path) -> None:

@@ -29,6 +29,7 @@ from tangent_train.inference.representations import (
     wide_levels,
 )
 from tests.cli.tiny_runs import Predict, Run
+from tests.inference.photo_networks.huggingface_networks import saved, segformer
 from tests.models.onnx_files import write_linear
 from tests.running import Capture, Patch
 from tests.tasks.small_networks import with_statistics
@@ -251,18 +252,24 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
             "found 4 per pixel, .*Leave out depth=",
         ),
         (
-            (*TORCHVISION, "model=lraspp_mobilenet_v3_large", "weights=s.pt", "depth=metric_z"),
+            ("network=huggingface", "model=net", "output=net.ckpt", "depth=metric_z"),
             "depth: found metric_z; expected null for networks of classes",
         ),
+        ((*TORCHVISION, "depth=metric_z"), "depth: found metric_z; .*null for network=torchvision"),
+        (
+            ("network=huggingface", "output=net.ckpt", "weights=DEFAULT"),
+            "weights: .*network=huggingface",
+        ),
+        ((*OF_DEPTH, "model=net"), "model: found net; expected null for network=onnx"),
+        (("network=unet", "output=net.ckpt", "file=depth.onnx"), "file: .*null for network=unet"),
     ],
 )
 def test_settings_of_depth_and_of_classes_exclude_each_other(
     given: tuple[str, ...], message: str, here: Path, run: Run
 ) -> None:
     write_linear(here / "depth.onnx", WEIGHT[3:], np.ones(1, np.float32))
-    if "network=torchvision" in given:
-        network = torchvision_models.get_model("lraspp_mobilenet_v3_large", weights_backbone=None)
-        torch.save(network.state_dict(), here / "s.pt")
+    if "model=net" in given:
+        saved(segformer, here / "net")
     with pytest.raises(SystemExit, match=message):
         run("import", *given)
 
@@ -522,7 +529,7 @@ def test_unusable_files_are_one_clear_message(
     (here / "escapes.json").write_text(json.dumps([*NAMES[1:], "a\x1b[2J"]))
     before = set(here.iterdir())
     with pytest.raises(SystemExit, match=message):
-        run("import", *OF_ONNX, "output=ours.onnx", *changes)
+        run("import", *(() if changes[0] in TORCHVISION else OF_ONNX), "output=ours.onnx", *changes)
     assert set(here.iterdir()) == before
 
 

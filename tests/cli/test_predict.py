@@ -86,6 +86,7 @@ def test_earlier_results_stay_and_are_not_labeled_again(tmp_path: Path, predict:
     assert {path: path.stat().st_mtime_ns for path in before} != before
     with pytest.raises(SystemExit, match="found only results"):
         predict(**settings, input=tmp_path / "in" / "color", overwrite="true")
+    assert predict(output=tmp_path / "another").keys() == {"a"}
 
 
 def test_an_interruption_keeps_what_is_done(
@@ -282,12 +283,16 @@ def test_a_share_of_each_class_is_kept_below_the_least_confidence(
         ({"min_share": 1}, "min_share: found 1.0; expected 0 to below 1"),
         ({"min_share": 0.5}, "min_confidence: found 0.0; expected above 0 to 1 with min_share"),
         ({"fov": 70}, "fov: found 70.0; expected null without projection=perspective"),
+        ({"max_tilt_deg": 90}, "max_tilt_deg: found 90.0; expected 60 without upright=auto"),
+        ({"unmapped": "never"}, "unmapped: found never; expected unknown without class_map"),
+        ({"depth_scale": 512}, "depth_scale: found 512.0; expected 1000 without depth files"),
         *(
             ({"projection": "perspective", **of_panoramas}, f"{next(iter(of_panoramas))}: found")
             for of_panoramas in (
                 {"area": "[0,90,0,45]"},
                 {"upright": "auto"},
                 {"mask": -30},
+                {"fill": "mean"},
                 {"rotations": 2},
             )
         ),

@@ -166,7 +166,16 @@ _OF_CLASSES = "expected null for networks of classes"
         ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0 for depth networks"),
         ({"upright": "auto"}, "upright: found auto; expected pose or null"),
         ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),
-        ({"points": 0}, "points: found 0"),
+        ({"points": 0, "write": "[points]"}, "points: found 0; expected an integer of 1 or more"),
+        ({"points": 9}, "points: found 9; expected null without points in write"),
+        (
+            {"depth_format": "npy", "write": "[color]"},
+            "depth_format: .*null without depth",
+        ),
+        (
+            {"depth_format": "npy", "depth_scale": 9},
+            "depth_scale: .* 1000 without depth",
+        ),
         ({"depth": "."}, "depth: found .*expected null"),
         ({"align": "none", "checkpoint": None}, f"align: found none; {_OF_CLASSES}"),
         ({"depth_format": "npy", "checkpoint": None}, f"depth_format: found npy; {_OF_CLASSES}"),

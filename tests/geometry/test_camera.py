@@ -93,7 +93,7 @@ def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, i
 
 @pytest.mark.parametrize("fov_deg", [0, 180, math.nan])
 def test_impossible_fields_of_view_are_refused(fov_deg: float) -> None:
-    with pytest.raises(SettingError, match=r"fov_deg: found .*; expected more than 0 and less"):
+    with pytest.raises(SettingError, match=r"fov: found .*; expected more than 0 and less"):
         camera_matrix_from_fov(fov_deg, (4, 4))
 
 

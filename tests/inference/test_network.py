@@ -19,7 +19,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.network import Network
 from tests.cli.tiny_runs import run_command
 from tests.datamodules.data_files import gpano_xmp
-from tests.inference.trained import CUBE, ERP, PERSPECTIVE, TANGENT, sphere, write_checkpoint
+from tests.inference.trained import CUBE, PERSPECTIVE, TANGENT, sphere, write_checkpoint
 
 Predicted = Callable[..., tuple[NDArray[Any], NDArray[Any]]]
 
@@ -264,7 +264,7 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
 @pytest.mark.parametrize(
     ("image", "message"),
     [
-        (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*fov=.*area="),
+        (_RGB[:, :30], "expected a whole panorama, twice as wide as high.*area=.*fov="),
         (_RGB[..., 0], r"ndarray \(16, 32\) of uint8; expected .* array \(H, W, 3\)"),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), r"found Tensor \(16, 32, 3\).*\(3, H, W\)"),
         (torch.zeros(3, 16, 32), "found Tensor.*float32; expected RGB from 0 to 255"),
@@ -315,10 +315,43 @@ def test_settings_that_do_not_suit_the_image_are_refused(
         network.labels(_RGB, **settings)
 
 
-def test_impossible_settings_of_a_network_are_refused(tmp_path: Path) -> None:
-    path = write_checkpoint(tmp_path / "net.ckpt", ERP)
-    with pytest.raises(SettingError, match="unmapped: found '0'"):
-        tt.load(path, unmapped="0")  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"unmapped": "0"}, "unmapped: found '0'; expected 'unknown' or 'never'"),
+        ({"unmapped": "never"}, "unmapped: found never; expected unknown without class_map"),
+        ({"blend": "0"}, "blend: found '0'; expected 'nearest' or 'feather'"),
+        ({"levels": []}, r"levels: found \[\]; expected a level, or several"),
+        ({"views": "ring", "base_level": 1}, "base_level: found 1; expected tangent images"),
+        (
+            {"views": {"option": "ring", "dim": [1, 2, 3]}},
+            r"dim: .* expected columns, or",
+        ),
+    ],
+)
+def test_impossible_settings_of_a_network_are_refused(
+    tmp_path: Path, settings: dict[str, Any], message: str
+) -> None:
+    """Messages have values of Python: None, not null."""
+    path = write_checkpoint(tmp_path / "net.ckpt", TANGENT)
+    with pytest.raises(SettingError, match=message) as error:
+        tt.load(path, **settings)
+    assert "null" not in str(error.value)
+
+
+def test_scores_are_not_masked(network: Network) -> None:
+    with pytest.raises(SettingError, match="mask: found one; expected None for scores"):
+        network.scores(_RGB, mask=-30)
+
+
+def test_photos_without_a_field_of_view_are_explained(network: Network, tmp_path: Path) -> None:
+    """A file too: the argument comes before the setting of the command."""
+    Image.fromarray(_RGB[:, :30]).save(tmp_path / "photo.png")
+    for method in (network.labels, network.scores):
+        with pytest.raises(DataError, match=r"photo, give fov=, its horizontal field of view"):
+            method(tmp_path / "photo.png")
+    with pytest.raises(SettingError, match=r"fov: found 200; .* less than 180 degrees"):
+        network.labels(_RGB, fov=200)
 
 
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:

@@ -190,7 +190,7 @@ def test_elevation_follows_the_zenith() -> None:
     assert (labels[17:] == 0).all()
     tilted = _labels(trained, InputImage(sphere(32), up=np.array([1.0, 0.0, 0.0])))
     assert (tilted[:, 20:44] == 2).mean() > 0.85, "around the middle column"
-    with pytest.raises(SettingError, match="expected equirectangular"):
+    with pytest.raises(SettingError, match="image: found a photo; expected a panorama"):
         PhotoViews(trained)
 
 

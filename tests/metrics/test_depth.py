@@ -19,6 +19,7 @@ from tangent_train.metrics.depth import (
     depth_scores,
     error_sums,
     mean_depth_scores,
+    scaled_and_shifted,
 )
 
 Image = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -135,6 +136,25 @@ def test_alignments_equal_least_squares_of_numpy(alignment: Alignment, quantity:
         torch.from_numpy(prediction), torch.from_numpy(truth)
     )
     np.testing.assert_allclose(aligned.numpy(), expected, rtol=1e-9)
+
+
+def test_scale_and_shift_of_each_image_are_those_of_least_squares() -> None:
+    values, truth = (
+        torch.from_numpy(np.stack(x)) for x in zip(*map(_image, range(4)), strict=True)
+    )
+    values, truth[2] = (2 - 0.3 * values.nan_to_num(5)).requires_grad_(), torch.nan
+    found = scaled_and_shifted(values, truth)
+    for x, g, y in zip(values.detach(), truth, found.detach(), strict=True):
+        known = ~g.isnan()
+        if known.any():
+            fit = np.polyfit(x[known].numpy(), g[known].numpy(), 1)
+            torch.testing.assert_close(y, fit[0] * x + fit[1])
+    known = ~truth.isnan()
+    (gradient,) = torch.autograd.grad((found - truth)[known].square().sum(), values)
+    assert gradient.isfinite().all()
+    assert found.isfinite().all()
+    constant = scaled_and_shifted(torch.ones_like(truth), truth)
+    torch.testing.assert_close(constant[0], truth[0].nanmean().expand(12, 24))
 
 
 def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> None:

@@ -104,6 +104,8 @@ def test_a_video_has_one_range_of_colors() -> None:
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
     assert not painted[2].any()
+    (row,) = results.table(entries[2:3]).rows
+    assert row == ["known pixels, % of the solid angle", "0"]
 
 
 def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> None:

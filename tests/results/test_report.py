@@ -15,7 +15,7 @@ from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import runs_report, transfer_report
-from tangent_train.results.published import Comparison, facts, published_lines
+from tangent_train.results.published import Comparison, facts, publications, published_lines
 from tangent_train.results.record import Record, load_record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
@@ -237,6 +237,33 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
     assert high - middle == pytest.approx(middle - low, abs=8)
     assert high - low > 200
+
+
+def test_published_depth_has_its_units_and_the_smallest_error_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The file has no such scores yet."""
+    lines = [
+        dict.fromkeys(next(published_lines()), "")
+        | {"protocol": "stanford2d3ds_depth", "method": method, "score": score, "mean": mean}
+        for method, scores in (("far", ("0.12", "88", "0.4")), ("near", ("0.1", "92.5", "0.36")))
+        for score, mean in zip(("absrel", "delta1", "rmse"), scores, strict=True)
+    ]
+    monkeypatch.setattr("tangent_train.results.published.published_lines", lambda: lines)
+    uncached = publications.__wrapped__
+    monkeypatch.setattr("tangent_train.results.published.publications", uncached)
+    protocol = facts("stanford2d3ds_depth")
+    means = dict.fromkeys(DepthTask.headings, 0.25)
+    record = Record("panoramas", 2, DepthTask.headings, means, protocol=protocol)
+    aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
+    (table,) = Comparison.of([aligned]).tables(aligned)
+    assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
+    assert table.rows == [
+        ("far (paper)", "–", "0.12", "88.0", "0.4"),
+        ("near (paper)", "–", "0.1", "92.5", "0.36"),
+    ]
+    (note,) = Comparison.of([replace(record, protocol=protocol | {"mask": "-60"})]).notes
+    assert note.startswith("Not comparable: near: 0.1 and 1 more (stanford2d3ds_depth). mask: ")
 
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:

@@ -110,6 +110,8 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     assert next(band["latitude_deg"] for band in record.latitude_bands) == [60, 90]
     assert record.intervals.keys() == record.means.keys() == task.headings.keys()
     assert task.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
+    with_unknown = np.concatenate([task.result, np.zeros_like(task.result[:1])])
+    assert task.scores_of(with_unknown, [3]).keys() == record.means.keys()
     if is_metric(kind):
         images[:, 0] += np.log(1.1)
         loss = task.loss_sum((images,), truth) / near.sum()

@@ -52,7 +52,6 @@ def load(
     classes: Path | None,
     normalization: Any,
     depth: DepthKind | None = None,
-    **_: Any,
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
 

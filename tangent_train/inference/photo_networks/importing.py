@@ -28,7 +28,7 @@ from tangent_train.checkpoints.trained import (
 )
 from tangent_train.errors import SettingError, width_height
 from tangent_train.files import atomic_path
-from tangent_train.geometry import vertex_resolution
+from tangent_train.geometry import camera_matrix_from_fov, vertex_resolution
 from tangent_train.inference.photo_networks.depth_kinds import try_depth
 from tangent_train.inference.photo_networks.network import PhotoNetwork
 from tangent_train.inference.photo_networks.score_kinds import try_network
@@ -143,9 +143,7 @@ def _photo_level(columns: int, fov_deg: float) -> int:
     Raises:
         SettingError: The field of view is not between 0° and 180°.
     """
-    if not 0 < fov_deg < 180:
-        raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
-    focal = columns / 2 / math.tan(math.radians(fov_deg) / 2)
+    focal = camera_matrix_from_fov(fov_deg, (1, columns))[0, 0]
     level = round(math.log2(focal * vertex_resolution(-1)))
     return min(max(level, _PHOTO_LEVELS[0]), _PHOTO_LEVELS[1])
 

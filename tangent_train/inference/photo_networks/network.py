@@ -49,17 +49,20 @@ class PhotoNetwork:
     remarks: Sequence[str] = ()
 
 
-def class_names_in(path: Path | None) -> tuple[str, ...]:
-    """Read the names of a network's scores, in their order.
+def class_names_in(path: Path | None, depth: DepthKind | None = None) -> tuple[str, ...]:
+    """Read the names of a network's scores, in their order; return none for a depth network.
 
     Args:
         path: JSON file with a list of names, or an object that maps each index to a name, such as
             ``{"0": "wall"}`` (``id2label``).
+        depth: Kind of depth; None for a network that predicts classes.
 
     Raises:
         SettingError: No file is given.
         DataError: The file has other content.
     """
+    if depth is not None:
+        return ()
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
     if path is None:
         raise SettingError(

@@ -17,7 +17,11 @@ from tangent_train.registry import build_from_config
 
 
 def load_onnx(
-    file: Path | None, classes: Path | None, normalization: Any, depth: DepthKind | None = None
+    *,
+    file: Path | None,
+    classes: Path | None,
+    normalization: Any,
+    depth: DepthKind | None = None,
 ) -> PhotoNetwork:
     """Load a network from an ONNX file, see `OnnxNetwork`.
 
@@ -37,7 +41,7 @@ def load_onnx(
     return PhotoNetwork(
         network=network,
         settings=None,
-        score_names=() if depth else class_names_in(classes),
+        score_names=class_names_in(classes, depth),
         normalization=Normalization.of(normalization, 3),
         image_size=network.image_size or USUAL_SIZE,
         fixed_size=network.image_size is not None,
@@ -47,6 +51,7 @@ def load_onnx(
 
 def load_config(
     settings: Mapping[str, Any],
+    *,
     weights: str | Path | None,
     classes: Path | None,
     normalization: Any,
@@ -67,8 +72,8 @@ def load_config(
     """
     if weights is None:
         raise SettingError("weights", found="none", expected="a file with the network's tensors")
-    names = () if depth else class_names_in(classes)
-    whole = completed_settings(settings, 3, 1 if depth else len(names), restored=True)
+    names = class_names_in(classes, depth)
+    whole = completed_settings(settings, 3, len(names) or 1, restored=True)
     network = build_from_config(whole, "network")
     load_tensors(network, tensors_for(network, Path(weights)), weights)
     normalized = Normalization.of(normalization, 3)

@@ -21,7 +21,7 @@ _HEAD_OF_IMAGES = "classification_head."
 _NORMALIZATION = "imagenet, unit, symmetric, or {mean: […], std: […]} of RGB from 0 to 1"
 
 
-def load(*, model: str | None, classes: Path | None, normalization: Any, **_: Any) -> PhotoNetwork:
+def load(*, model: str | None, classes: Path | None, normalization: Any) -> PhotoNetwork:
     """Load a network that segmentation-models-pytorch saved with ``save_pretrained``.
 
     Args:

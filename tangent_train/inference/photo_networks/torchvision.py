@@ -19,7 +19,7 @@ _AUXILIARY = "aux_classifier."
 
 
 def load(
-    *, model: str | None, weights: str | None, classes: Path | None, normalization: Any, **_: Any
+    *, model: str | None, weights: str | None, classes: Path | None, normalization: Any
 ) -> PhotoNetwork:
     """Load a network of ``torchvision.models.segmentation``.
 

@@ -300,7 +300,7 @@ def level_list(levels: int | Sequence[int] | None, level: int) -> list[int]:
         return [level]
     found = [levels] if isinstance(levels, int) else list(levels)
     if not found:
-        raise SettingError("levels", found="[]", expected="null, a level, or several: [9, 10]")
+        raise SettingError("levels", found="[]", expected="a level, or several: [9, 10]")
     return found
 
 

@@ -137,7 +137,7 @@ def ring_size(
     across, down = half_extents(fov_deg)
     if isinstance(dim, Sequence):
         if len(dim) != 2:
-            raise SettingError("dim", found=list(dim), expected="null, columns or [rows, columns]")
+            raise SettingError("dim", found=list(dim), expected="columns, or [rows, columns]")
         return dim[0], dim[1]
     if dim is None:
         step = 2 ** max(0, level - 2)

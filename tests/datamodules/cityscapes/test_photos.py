@@ -74,7 +74,7 @@ def test_a_check_counts_and_finds_strays_and_missing_labels(root: Path) -> None:
     missing = root / "gtFine/train/aachen/aachen_000000_000000_gtFine_labelIds.png"
     missing.unlink()
     problems, count = photos(root).check()
-    assert count == 3
+    assert count == 4
     assert [problem.file for problem in problems.listed()] == [str(missing)]
     assert sorted(problems.warnings) == [
         "found 3 train, 1 val; published are 2975 train, 500 val",

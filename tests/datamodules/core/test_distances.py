@@ -266,7 +266,7 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
     ("data", "settings", "message"),
     [
         *(
-            (module, settings, r"data\.labels: found distance; .* choose data=synthrooms")
+            (module, settings, r"data\.labels: found distance; .*train_depth\.md")
             for module in (Cityscapes, DensePASS, SynPASS, Zind, OmniSynthia)
             for settings in ({}, {"classes": 13, "inputs": ["rgb", "depth"]})
         ),

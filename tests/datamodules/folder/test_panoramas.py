@@ -202,7 +202,7 @@ def test_the_check_names_what_a_hand_made_data_set_gets_wrong(tmp_path: Path, er
     # Splits that are impossible hide nothing.
     (tmp_path / "test.txt").write_text("")
     problems, count = FolderPanoramas(tmp_path, erp).check()
-    assert count == 1
+    assert count == 3
     findings = {Path(p.file).name: (p.finding, p.remedy) for p in problems.listed()}
     assert findings["a.png"][0].startswith("no such file, but a_mask.png; expected the labels of")
     assert findings["b.png"][0].startswith("no such file, but b.jpg; expected the labels of")

@@ -289,7 +289,7 @@ def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, widt
 
 @pytest.mark.parametrize("size", [(10, 18), (10, 22), (1, 1)])
 def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
-    message = rf"a\.jpg: found {size[1]} × {size[0]} .*area=.*GPano.*projection=perspective"
+    message = rf"a\.jpg: found {size[1]} × {size[0]} .*area=.*GPano.*photo, give fov=.*projection="
     with pytest.raises(DataError, match=message):
         whole_area(tmp_path / "a.jpg", size)
 

@@ -170,7 +170,7 @@ def test_a_broken_record_is_named_with_its_place(root: Path, name: str) -> None:
         _zind(root).setup()
     problems, count = _zind(root).check()
     assert problems.items == {f"{ROOM}/pano_1"}
-    assert count == 5
+    assert count == 6
     data = _zind(root, test_fraction=1, skip_broken=True)
     assert len(names_of(data, "test")) == 5
 

@@ -5,16 +5,20 @@ from __future__ import annotations
 import csv
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
+from tangent_train.results.record import load_record
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
+from tests.datamodules.data_files import write_png
 from tests.running import ROOT, further_processes, has_ended, run_python, wait_for
 
 
@@ -84,6 +88,37 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     assert figures[0]["images"] == figures[1]["images"] == 5
     assert figures[0]["confusion"] == figures[1]["confusion"]
     assert figures[0]["miou_solid_angle"] == pytest.approx(figures[1]["miou_solid_angle"])
+
+
+def test_depth_of_two_processes_is_that_of_one(
+    rooms: str, tmp_path: Path, run: Run, plain: tuple[str, ...]
+) -> None:
+    """Three and two test panoramas; one of them, and one for training, without known distances."""
+    root = shutil.copytree(rooms.split("'")[1], tmp_path / "rooms")
+    for area in ("area_3", "area_5a"):
+        depth = max(root.glob(f"{area}/pano/depth/*.png"))
+        write_png(depth, np.full((32, 64), 65535, np.uint16))
+    common = [*plain, *(text for text in SETTINGS if not text.startswith("network."))]
+    common += ["task=depth", "network.in_channels=3", "network.out_channels=1", "data.inputs=[rgb]"]
+    common += [f"data.root={root}", "data.fold=3"]
+    common += ["trainer.max_steps=2", "trainer.log_every_n_steps=1", "logger=csv"]
+    common += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1"]
+    run("train", *common, "hydra.run.dir=one")
+    two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=2"]
+    _train(tmp_path, *common, *two, "data.panoramas_per_step=1", "hydra.run.dir=two")
+    logged = [_scalars(tmp_path / name) for name in ("one", "two")]
+    assert logged[1].keys() == logged[0].keys()
+    for name in ("train/loss", "val/loss", "val/absrel"):
+        assert logged[1][name] == pytest.approx(logged[0][name], rel=1e-5), name
+    first, second = (load_record(tmp_path / name) for name in ("one", "two"))
+    assert second.images == first.images == 5
+    assert second.protocol == first.protocol
+    assert second.protocol["views_aligned"] == "scale"
+    assert second.means == pytest.approx(first.means, rel=1e-4)
+    for name, interval in first.intervals.items():
+        assert second.intervals[name] == pytest.approx(interval, rel=1e-4)
+    for bands in zip(first.latitude_bands, second.latitude_bands, strict=True):
+        assert bands[1]["absrel"] == pytest.approx(bands[0]["absrel"], rel=1e-4)
 
 
 @pytest.mark.parametrize("seconds", [0, 3, 8])
