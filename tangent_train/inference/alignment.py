@@ -109,9 +109,9 @@ def sphere_points(shape: tuple[int, int]) -> Indices:
     return np.stack(np.divmod(pixels, shape[1]), axis=-1)
 
 
-def lattice(shape: tuple[int, int], count: int = _PHOTO_POINTS) -> Indices:
-    """Return ``(P, 2)`` rows and columns of a square lattice of about some number of pixels."""
-    step = max(1.0, (shape[0] * shape[1] / count) ** 0.5)
+def lattice(shape: tuple[int, int]) -> Indices:
+    """Return ``(P, 2)`` rows and columns of a square lattice of about 8,000 pixels."""
+    step = max(1.0, (shape[0] * shape[1] / _PHOTO_POINTS) ** 0.5)
     lines = (np.arange(step / 2, side, step).astype(np.int64) for side in shape)
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
 

@@ -12,7 +12,6 @@ from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    equirect_solid_angles,
     equirect_to_lonlat,
     lonlat_to_xyz,
     ray_lengths,
@@ -39,10 +38,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
 
-_MEDIAN_POINTS = 2**16
-"""Number of pixels, about, from which the median distance is computed."""
-
-
 _FARTHEST = 100.0
 """Multiples of the median beyond which relative depth is unknown, like sky: small errors of the
 disparity change it without limit."""
@@ -53,9 +48,9 @@ class DistanceMap:
     """Distances from the center along the rays of a panorama or photo.
 
     Attributes:
-        distance: ``(H, W)`` float32, NaN where unknown: meters, or multiples of the median, up to
-            100.
-        is_metric: True for meters. False for a median distance of 1, by solid angle.
+        distance: ``(H, W)`` float32, NaN where unknown: meters, or without a unit.
+        is_metric: True for meters. False for a median depth of 1, by solid angle: the median of
+            known distances of a panorama, or z-depths of a photo.
         report: Facts about the alignment of the views.
     """
 
@@ -117,8 +112,10 @@ def combine_depth(
         mosaic.add(alignment.applied(depth, numbers, lengths), views)
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
-        distance = distance / _median(distance, area, camera_matrix)
-        distance = distance.where(distance <= _FARTHEST, torch.nan)
+        of_photo = None if camera_matrix is None else ray_lengths(camera_matrix, shape)
+        for farthest in (_FARTHEST, torch.inf):
+            distance = distance / _median(distance, points, of_photo)
+            distance = distance.where(distance <= farthest, torch.nan)
     return DistanceMap(distance, is_metric(kind), alignment.report)
 
 
@@ -193,21 +190,25 @@ class DepthPredictor(ViewPredictor):
 
 
 def _median(
-    distance: Tensor, area: SphereArea | None, camera_matrix: NDArray[np.float64] | None
+    distance: Tensor, points: NDArray[np.int64], of_photo: NDArray[np.float64] | None
 ) -> float:
-    """Return the median of known distances, weighted by solid angle; 1 if all are unknown."""
-    shape = distance.shape[0], distance.shape[1]
-    points = lattice(shape, _MEDIAN_POINTS)
-    rows, columns = points.T
-    if camera_matrix is None:
-        weight = equirect_solid_angles(shape)[rows]
-    else:
-        weight = ray_lengths(camera_matrix, shape)[rows, columns] ** -3.0
-    values = distance.cpu().numpy()[rows, columns]
-    known = np.isfinite(values) & _inside(area, points, shape)
-    if not known.any():
-        return 1.0
-    return float(np.quantile(values[known], 0.5, weights=weight[known], method="inverted_cdf"))
+    """Return the median of known depth by solid angle; 1 if all are unknown.
+
+    Args:
+        distance: ``(H, W)`` distances.
+        points: ``(P, 2)`` rows and columns, evenly spread over the sphere or photo.
+        of_photo: ``(H, W)`` lengths of a photo's rays, whose z-depth is meant; None of a panorama.
+    """
+    values, length = distance.cpu().numpy()[tuple(points.T)], np.ones(len(points))
+    if of_photo is not None:
+        length = of_photo[tuple(points.T)]
+    known = np.isfinite(values)
+    values, weight = (values / length)[known], length[known] ** -3.0
+    return (
+        float(np.quantile(values, 0.5, weights=weight, method="inverted_cdf"))
+        if len(values)
+        else 1.0
+    )
 
 
 def _inside(
