@@ -48,14 +48,12 @@ class DistanceMap:
     """Distances from the center along the rays of a panorama or photo.
 
     Attributes:
-        distance: ``(H, W)`` float32, NaN where unknown: meters, or without a unit.
-        is_metric: True for meters. False for a median depth of 1, by solid angle: the median of
-            known distances of a panorama, or z-depths of a photo.
+        distance: ``(H, W)`` float32, NaN where unknown: meters; or for relative kinds multiples of
+            the median of known distances, of a photo of z-depth, by solid angle.
         report: Facts about the alignment of the views.
     """
 
     distance: Tensor
-    is_metric: bool
     report: AlignmentReport
 
     def depth(self, camera_matrix: NDArray[np.float64] | None) -> Tensor:
@@ -112,11 +110,10 @@ def combine_depth(
         mosaic.add(alignment.applied(depth, numbers, lengths), views)
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
-        of_photo = None if camera_matrix is None else ray_lengths(camera_matrix, shape)
-        for farthest in (_FARTHEST, torch.inf):
-            distance = distance / _median(distance, points, of_photo)
+        for farthest in (_FARTHEST, torch.inf):  # the second time without what is too far
+            distance = distance / _median(distance, points, camera_matrix)
             distance = distance.where(distance <= farthest, torch.nan)
-    return DistanceMap(distance, is_metric(kind), alignment.report)
+    return DistanceMap(distance, alignment.report)
 
 
 def check_align(setting: str, align: Align | None, representation: Any) -> None:
@@ -190,25 +187,18 @@ class DepthPredictor(ViewPredictor):
 
 
 def _median(
-    distance: Tensor, points: NDArray[np.int64], of_photo: NDArray[np.float64] | None
+    distance: Tensor, points: NDArray[np.int64], camera_matrix: NDArray[np.float64] | None
 ) -> float:
-    """Return the median of known depth by solid angle; 1 if all are unknown.
-
-    Args:
-        distance: ``(H, W)`` distances.
-        points: ``(P, 2)`` rows and columns, evenly spread over the sphere or photo.
-        of_photo: ``(H, W)`` lengths of a photo's rays, whose z-depth is meant; None of a panorama.
-    """
-    values, length = distance.cpu().numpy()[tuple(points.T)], np.ones(len(points))
-    if of_photo is not None:
-        length = of_photo[tuple(points.T)]
+    """Return the median of known depth at points, by solid angle; 1 if all are unknown."""
+    rows, columns = points.T
+    values, lengths = distance.cpu().numpy()[rows, columns], np.ones(len(points))
+    if camera_matrix is not None:
+        lengths = ray_lengths(camera_matrix, distance.shape)[rows, columns]
     known = np.isfinite(values)
-    values, weight = (values / length)[known], length[known] ** -3.0
-    return (
-        float(np.quantile(values, 0.5, weights=weight, method="inverted_cdf"))
-        if len(values)
-        else 1.0
-    )
+    if not known.any():
+        return 1.0
+    weights, values = lengths[known] ** -3.0, (values / lengths)[known]
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def _inside(
