@@ -282,23 +282,20 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
         after = after + added
     is_empty = np.bincount(view[is_valid], minlength=count) == 0
     alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
+    isolated, empty, constant = (np.flatnonzero(x).tolist() for x in (alone, is_empty, is_constant))
     report = AlignmentReport(
         mode,
         count,
-        groups=len(np.unique(groups[~is_empty])),
-        isolated=_numbers(alone),
-        empty=_numbers(is_empty),
-        constant=_numbers(is_constant),
+        len(np.unique(groups[~is_empty])),
+        tuple(isolated),
+        tuple(empty),
+        tuple(constant),
         invalid=1 - float(is_valid.mean()) if len(view) else 0.0,
         outliers=float(outliers.mean()) if len(outliers) else 0.0,
         step_before=pairs.step(before),
         step_after=pairs.step(after),
     )
     return Alignment(kind, scale, shift, grid, report)
-
-
-def _numbers(mask: NDArray[np.bool_]) -> tuple[int, ...]:
-    return tuple(np.flatnonzero(mask).tolist())
 
 
 def _medians(values: Floats, groups: Indices) -> Floats:
@@ -329,8 +326,7 @@ class _Pairs(NamedTuple):
     def step(self, logs: Floats) -> float | None:
         """Return the median difference of logarithms."""
         steps = np.abs(logs[self.first] - logs[self.second])
-        steps = steps[np.isfinite(steps)]
-        return float(np.median(steps)) if len(steps) else None
+        return float(np.nanmedian(steps)) if np.isfinite(steps).any() else None
 
 
 def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:

@@ -203,12 +203,11 @@ def test_the_fit_minimizes_the_cauchy_loss() -> None:
     np.testing.assert_allclose(found.shift, ratio * np.exp(unknowns[:4]) * unknowns[4:], atol=1e-4)
 
 
-@pytest.mark.parametrize("outliers", [0.0, 0.2])
-def test_nearly_flat_views_are_aligned(outliers: float) -> None:
+def test_nearly_flat_views_with_outliers_are_aligned() -> None:
     """A cube's face in front of a wall has one z-depth: only the wall's edges determine a shift."""
     truth, rng = _truth("cube"), np.random.default_rng(52)
     noise = rng.normal(0, 0.02, len(truth.distance))
-    bad = rng.random(len(noise)) < outliers
+    bad = rng.random(len(noise)) < 0.2
     distance = truth.distance * np.exp(noise + bad * rng.normal(0, 1, len(noise)))
     samples = _corrupted(Truth(truth.samples, distance), "relative_depth", rng)
     errors = _errors(align([samples], "relative_depth"), samples, truth.distance)
