@@ -230,7 +230,7 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
     given = ("network=unet_small", "weights=state.pt", "normalization=unit", "output=net.ckpt")
     run("import", *given, "depth=relative_disparity", "image_size=32")
     assert (
-        "it returns negative numbers, which relative_disparity should not be, from -"
+        "it returns negative numbers, unusual for relative_disparity, from -"
         in capsys.readouterr().out
     )
     trained = load_trained(here / "net.ckpt")

@@ -96,7 +96,7 @@ def try_depth(network: PhotoNetwork) -> list[str]:
     noise = _SPREAD * max(abs(least), abs(most))
     odd = {
         "nearly the same depth everywhere": most - least <= noise,
-        f"negative numbers, which {kind} should not be": least < -noise and kind != "log_distance",
+        f"negative numbers, unusual for {kind}": least < -noise and kind != "log_distance",
         "depth of more than 1 km": most > _FARTHEST_M and kind in _METRIC,
     }
     numbers = f"from {least:.4g} to {most:.4g} on images of noise"

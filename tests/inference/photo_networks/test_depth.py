@@ -157,7 +157,11 @@ class _Output(nn.Module):
         (_Output(-3), "log_distance", None),
         (_Output(1, 2), "relative_disparity", None),
         (_Output(0, 2), "relative_disparity", "nearly the same depth everywhere, from 2 to 2"),
-        (_Output(-3), "relative_depth", "negative numbers, which relative_.*, from -3 to 0"),
+        (
+            _Output(-3),
+            "relative_depth",
+            "negative numbers, unusual for relative_depth, from -3 to 0",
+        ),
         (_Output(5000), "metric_distance", "depth of more than 1 km, from 0 to 5000 on images of"),
         (_Output(1, channels=3), "metric_z", "found 3 per pixel, .* Leave out depth="),
         (_Output(math.nan), "metric_z", "found 1 per pixel, 0 of 786432 numbers are finite"),
