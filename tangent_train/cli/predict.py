@@ -114,15 +114,10 @@ def _predict(
     earlier = known or {}
     names = dict.fromkeys(inputs.names())
     entries = [entry for name, entry in earlier.items() if name in names]
+    save = partial(folder.write_summary, decisive, entries)
     if part is not None:
         part.begin(entries, resume=settings.resume, overwrite=settings.overwrite)
-
-    def save() -> None:
-        if part is not None:
-            part.save(entries)
-        else:
-            folder.write_summary(decisive, entries)
-
+        save = partial(part.save, entries)
     count = len(names)
     print_text(f"{counted(count, 'images')}, {len(entries)} done already.")
     missing = count - len(entries)
@@ -232,10 +227,9 @@ class _Images:
             if file is not None and not job.error:
                 predicted = PredictedImage(self.read(job), results.read(file))
                 self.shown[job.item] = results.encode(job.item, predicted)
-        others = [name for name in self.shown if name not in wanted]
-        available = [name for name in (*wanted, *others) if self.shown.get(name) is not None]
-        shown = (self.shown[name] for name in names if name in available[:count])
-        return [picture for picture in shown if picture is not None]
+        encoded = {name: picture for name, picture in self.shown.items() if picture is not None}
+        available = [name for name in dict.fromkeys((*wanted, *self.shown)) if name in encoded]
+        return [encoded[name] for name in names if name in available[:count]]
 
 
 def _make_videos(

@@ -53,14 +53,12 @@ class DistanceMap:
     """Distances from the center along the rays of a panorama or photo.
 
     Attributes:
-        distance: ``(H, W)`` float32, NaN where unknown: meters, or multiples of the median, up to
-            100.
-        is_metric: True for meters. False for a median distance of 1, by solid angle.
+        distance: ``(H, W)`` float32, NaN where unknown: meters, or for relative kinds multiples of
+            the median by solid angle, up to 100.
         report: Facts about the alignment of the views.
     """
 
     distance: Tensor
-    is_metric: bool
     report: AlignmentReport
 
     def depth(self, camera_matrix: NDArray[np.float64] | None) -> Tensor:
@@ -119,7 +117,7 @@ def combine_depth(
     if not is_metric(kind):
         distance = distance / _median(distance, area, camera_matrix)
         distance = distance.where(distance <= _FARTHEST, torch.nan)
-    return DistanceMap(distance, is_metric(kind), alignment.report)
+    return DistanceMap(distance, alignment.report)
 
 
 def check_align(setting: str, align: Align | None, representation: Any) -> None:

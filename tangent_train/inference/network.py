@@ -296,13 +296,11 @@ class Network:
         **settings: Any,
     ) -> tuple[Any, InputImage]:
         """Predict a photo or a panorama; return the result and the image."""
-        if mask is not None and fov is not None:
-            raise SettingError("mask", found="one, with fov=", expected="None for photos")
         of_size = partial(self._depth, depth)
         if fov is not None:
-            if area is not None or upright is not None:
-                given = "area" if area is not None else "upright"
-                raise SettingError(given, found="one, with fov=", expected="None for photos")
+            for name, value in {"area": area, "upright": upright, "mask": mask}.items():
+                if value is not None:
+                    raise SettingError(name, found="one, with fov=", expected="None for photos")
             photo = read_photo(image, fov, of_size)
             return self._photos().predict(photo, **settings), photo
         if upright is not None:

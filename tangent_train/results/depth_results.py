@@ -24,6 +24,9 @@ if TYPE_CHECKING:
     from tangent_train.results.predictions import Painter
 
 _POINTS = 500_000
+_WORSE = 1.01
+"""Quotient of the steps after and before an alignment above which views agree less."""
+
 _SAMPLES = 2**16
 """Pixels whose median is that of an image."""
 
@@ -173,7 +176,7 @@ class DepthResults(ImageResults):
                 mean = np.mean(values) * (100 if "%" in title else 1)
                 rows.append([title.format(unit=unit), f"{mean:.3g}"])
         steps = [(e["depth"].get("step_before"), e["depth"].get("step_after")) for e in entries]
-        if worse := sum(None not in step and step[1] > step[0] for step in steps):
+        if worse := sum(None not in step and step[1] > _WORSE * step[0] for step in steps):
             rows.append(
                 ["images whose views agree less than before: try another align", str(worse)]
             )

@@ -328,9 +328,8 @@ class PredictionFolder:
         tables = [self.results.table(self.predicted(entries))]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
         if failed:
-            tables.append(
-                Table("Images that could not be used", ["image", "error"], failed, "", (0, 1))
-            )
+            title, columns = "Images that could not be used", ("image", "error")
+            tables.append(Table(title, columns, failed, "", (0, 1)))
         write_report(
             self.path / "report.html",
             "Predictions",

@@ -92,7 +92,6 @@ def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind)
     for blend in ("nearest", "feather"):
         found = combine_depth(scaled, SHAPE, kind, blend, "scale")
         assert (found.distance.dtype, found.distance.shape) == (torch.float32, SHAPE)
-        assert found.is_metric == is_metric(kind)
         ratio = found.distance.numpy() / _truth()
         np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02 if single else 0.01)
     plain = combine_depth(scaled, SHAPE, kind, "feather", "none").distance.numpy() / _truth()
@@ -116,7 +115,6 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
         order = np.argsort(values)
         total = weight[order].cumsum()
         assert values[order][np.searchsorted(total, total[-1] / 2)] == pytest.approx(1, abs=0.01)
-        assert not found.is_metric
 
 
 def test_the_sky_and_unknown_pixels_are_unknown() -> None:
@@ -187,7 +185,6 @@ def test_a_predictor_aligns_what_its_network_scales(kind: DepthKind) -> None:
     assert sum(shares) == pytest.approx(2)
     assert found["none"] > 0.08
     assert found[None] < 0.02
-    assert result.is_metric == (kind != "relative_disparity")
     before, after = result.report.step_before, result.report.step_after
     assert before is not None
     assert after is not None

@@ -119,7 +119,7 @@ def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> Non
 
 def test_the_table_counts_images_whose_views_agree_less_than_before() -> None:
     results = DepthResults(is_metric=True, depth_format=None, depth_scale=1000, points=None)
-    steps = [{"step_before": 0.2, "step_after": after} for after in (0.1, 0.3, 0.4)]
+    steps = [{"step_before": 0.2, "step_after": after} for after in (0.1, 0.201, 0.3, 0.4)]
     rows = results.table([{"depth": step} for step in (*steps, {"step_before": None})]).rows
     assert [row for row in rows if "agree less" in row[0]] == [
         ["images whose views agree less than before: try another align", "2"]

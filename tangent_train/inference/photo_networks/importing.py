@@ -156,23 +156,17 @@ def _groups(
     wins: bool,
 ) -> tuple[list[str], Groups | None]:
     """Return the names of the labels, and the scores of each, see `TrainedNetwork.groups`."""
-    score_names, unknown_classes = (
-        list(map(composed, score_names)),
-        list(map(composed, unknown_classes)),
-    )
-    missing = set(unknown_classes) - set(score_names)
-    if missing:
+    score_names = list(map(composed, score_names))
+    unknown_classes = set(map(composed, unknown_classes))
+    if missing := unknown_classes - set(score_names):
         raise SettingError(
             "unknown_classes",
             found=", ".join(sorted(missing)),
             expected=f"names among {', '.join(score_names)}",
         )
     scores, rest = _scores_of(len(score_names), kind, count)
-    kept = [
-        (k, name)
-        for k, name in zip(scores, score_names, strict=True)
-        if name not in unknown_classes
-    ]
+    named = list(zip(scores, score_names, strict=True))
+    kept = [(k, name) for k, name in named if name not in unknown_classes]
     if not kept:
         raise SettingError("unknown_classes", found="all classes", expected="a part of them")
     if not wins and (len(kept) == 1 or kind == "labels"):
@@ -181,7 +175,7 @@ def _groups(
             found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
             expected="true, because the network has no other class to predict",
         )
-    rest += [k for k, name in zip(scores, score_names, strict=True) if name in unknown_classes]
+    rest += [k for k, name in named if name in unknown_classes]
     names = ["unknown", *(name for _, name in kept)]
     if kind in ("logits", "probabilities") and not unknown_classes:
         return names, None
