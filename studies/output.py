@@ -21,17 +21,29 @@ COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#99
 def save(
     name: str, rows: Sequence[Row], figure: Figure, folder: str = "figures", digits: int = 6
 ) -> None:
-    """Print a Markdown table; write ``<name>.csv`` and ``<name>.png``.
+    """Save a figure ``<name>.png``, and a table as `save_table` does.
+
+    Args:
+        name: Name of the study.
+        rows: See `save_table`.
+        figure: Figure to save.
+        folder: See `save_table`.
+        digits: See `save_table`.
+    """
+    save_table(name, rows, folder, digits)
+    figure.savefig(Path(folder) / f"{name}.png", dpi=110)
+
+
+def save_table(name: str, rows: Sequence[Row], folder: str = "figures", digits: int = 6) -> None:
+    """Print a Markdown table, and write ``<name>.csv``.
 
     Args:
         name: Name of the study.
         rows: Lines of the table, all with the same columns.
-        figure: Figure to save.
         folder: Output folder; created if missing.
         digits: Significant digits of the printed table; the CSV file contains all digits.
     """
     write_text(Path(folder) / f"{name}.csv", csv_text(list(rows[0]), rows))
-    figure.savefig(Path(folder) / f"{name}.png", dpi=110)
     print(markdown(rows, digits))
 
 

@@ -8,13 +8,15 @@ and one scale (and shift) per view is fitted to all pairs of views at once.
   disparity along the ray. It is linear in the unknown a.
 * **Affine**: ``q_i = (s_i x_i + t_i) f_i``, with the network's output x, and f the length of the
   ray for depth or its inverse for disparity. Because f differs between views, a shift of all views
-  is observable. The differences of two views are divided by the noise that their scales cause,
-  ``√((s_i² h_i² + s_j² h_j²) / 2)`` with the spread h of x in a view. Without this, small scales
-  would always fit better: the trivial solution s = 0, and shrinkage of noisy views (total least
-  squares, Golub & Van Loan 1980). Scales are exponentials, so they are positive.
+  is observable. The differences of two views are divided by ``√((q_i² + q_j²) / 2)``: the errors of
+  a network are about proportional to its depth or disparity. This noise follows the scales, else
+  small scales would always fit better: the trivial solution s = 0, and shrinkage of noisy views
+  (total least squares, Golub & Van Loan 1980). It does not follow the shifts, else large shifts
+  would fit better. Scales are exponentials, so they are positive.
 
-Both are robust: iteratively reweighted least squares with the weights of Huber (1964), and the
-median absolute deviation as the unit of residuals.
+Both are robust: iteratively reweighted least squares with the weights of a Cauchy distribution
+(Holland & Welsch 1977), and the median absolute deviation as the unit of residuals. The unit
+shrinks slowly, so that views with a wrong start are not taken for outliers.
 """
 
 from __future__ import annotations
@@ -50,23 +52,20 @@ _LEAST_SAMPLES = 8
 _MOST_PAIRS = 2**16
 """Pairs of samples above which directions are left out, to limit the time."""
 
-_HUBER = 1.345
-"""Residuals that keep weight 1, in standard deviations: 95 % efficiency for Gaussian noise."""
+_CAUCHY = 2.385
+"""Residuals of weight ½, in standard deviations: 95 % efficiency for Gaussian noise."""
 _MAD_TO_STD = 1.4826
+_SHRINKAGE = 0.7
+"""Least ratio of the noise in successive iterations."""
 _ITERATIONS, _TOLERANCE = 100, 1e-7
 _NO_NOISE, _DAMPING, _NEGLIGIBLE = 1e-10, 1e-8, 1e-30
-_LEVERAGE = 2.5
-"""Distance from the median, in spreads, beyond which samples lose weight in an affine fit."""
 
 _CONSTANT = 1e-4
-"""Spread of a constant view, as a share of its median."""
-_RANGE_TO_STD = 1.349
-"""Between the quartiles of a Gaussian, in standard deviations."""
+"""Range between the quartiles of a constant view, as a share of its median."""
 
-_CORRELATED = 30.0
-"""Number of neighboring samples whose errors are alike; priors weigh as much as this many."""
-_SCALE_PRIOR = 2.0
-"""Standard deviation of the logarithms of scales, where the overlap does not determine them."""
+_SCALE_PRIOR, _SHIFT_PRIOR = 2.0, 1.0
+"""Standard deviations of the logarithms of scales, and of shifts in medians of a view, where the
+overlap does not determine them."""
 _NODES = 5
 """Nodes of a grid of corrections per side."""
 _SLOPE_PRIOR, _NODE_PRIOR = 0.1, 0.3
@@ -110,9 +109,9 @@ def sphere_points(shape: tuple[int, int]) -> Indices:
     return np.stack(np.divmod(pixels, shape[1]), axis=-1)
 
 
-def lattice(shape: tuple[int, int], count: int = _PHOTO_POINTS) -> Indices:
-    """Return ``(P, 2)`` rows and columns of a square lattice of about some number of pixels."""
-    step = max(1.0, (shape[0] * shape[1] / count) ** 0.5)
+def lattice(shape: tuple[int, int]) -> Indices:
+    """Return ``(P, 2)`` rows and columns of a square lattice of about 8,000 pixels."""
+    step = max(1.0, (shape[0] * shape[1] / _PHOTO_POINTS) ** 0.5)
     lines = (np.arange(step / 2, side, step).astype(np.int64) for side in shape)
     return np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -170,7 +169,7 @@ class AlignmentReport:
         empty: Views without a valid value.
         constant: Views with constant output, which got a scale but no shift.
         invalid: Share of samples without a valid value, such as sky.
-        outliers: Share of pairs of samples with a Huber weight below ½.
+        outliers: Share of pairs of samples with a robust weight below ½.
         step_before: Median difference of the logarithms of two views at a direction.
         step_after: The same after the alignment.
     """
@@ -259,46 +258,44 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     base = usual if mode == "grid" else mode
     factor = samples.ray_length ** RAY_POWERS[kind]
     is_valid = np.isfinite(value) & (value != 0 if base == "affine" else value > 0)
-    pairs = _pairs(samples, np.flatnonzero(is_valid))
+    value = np.where(is_valid, value, np.nan)
+    before, pairs = _logarithm(value * factor), _pairs(samples, np.flatnonzero(is_valid))
     scale, shift, grid = np.ones(count), np.zeros(count), None
-    outliers, is_constant = np.zeros(len(pairs.first), bool), np.zeros(count, bool)
-    if base == "scale" and len(outliers):
-        logs, outliers = _fit_scales(pairs, _logarithm(value * factor), count)
+    outliers, is_constant = np.zeros(0, bool), np.zeros(count, bool)
+    if base == "scale" and len(pairs.a):
+        ones, offset = np.ones(len(pairs.a)), before[pairs.first] - before[pairs.second]
+        slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
+        logs, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count))
         scale = np.exp(logs)
-    elif base == "affine" and len(outliers):
+    elif base == "affine" and len(pairs.a):
         scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
-    groups = pairs.groups(count)
-    before = _logarithm(value * factor)
-    after = _logarithm((scale[view] * value + shift[view]) * factor)
-    changes = np.log(scale)
-    if is_metric(kind) and shift.any():  # distances change by other factors than the scales
-        for number in np.unique(view[np.isfinite(after - before)]):
-            changes[number] = np.nanmedian((after - before)[view == number])
-    unit = np.exp(_medians(changes, groups))
-    scale, shift, after = scale / unit, shift / unit, after - np.log(unit)[view]
-    if mode == "grid" and len(outliers):
+    links = sparse.coo_array((np.ones(len(pairs.a)), (pairs.a, pairs.b)), (count, count))
+    groups: Indices = connected_components(links, directed=False)[1]
+    after, changes = _logarithm((scale[view] * value + shift[view]) * factor), np.zeros(count)
+    for number in np.unique(view[np.isfinite(after - before)]):
+        changes[number] = np.nanmedian((after - before)[view == number])
+    unit = _medians(changes, groups)
+    scale, shift, after = scale / np.exp(unit), shift / np.exp(unit), after - unit[view]
+    if mode == "grid" and len(pairs.a):
         grid, added, outliers = _fit_grid(pairs, after, samples)
         grid -= _medians(grid.mean(axis=(1, 2)), groups)[:, None, None]
         after = after + added
     is_empty = np.bincount(view[is_valid], minlength=count) == 0
     alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
+    isolated, empty, constant = (np.flatnonzero(x).tolist() for x in (alone, is_empty, is_constant))
     report = AlignmentReport(
         mode,
         count,
-        groups=len(np.unique(groups[~is_empty])),
-        isolated=_numbers(alone),
-        empty=_numbers(is_empty),
-        constant=_numbers(is_constant),
+        len(np.unique(groups[~is_empty])),
+        tuple(isolated),
+        tuple(empty),
+        tuple(constant),
         invalid=1 - float(is_valid.mean()) if len(view) else 0.0,
         outliers=float(outliers.mean()) if len(outliers) else 0.0,
         step_before=pairs.step(before),
         step_after=pairs.step(after),
     )
     return Alignment(kind, scale, shift, grid, report)
-
-
-def _numbers(mask: NDArray[np.bool_]) -> tuple[int, ...]:
-    return tuple(np.flatnonzero(mask).tolist())
 
 
 def _medians(values: Floats, groups: Indices) -> Floats:
@@ -326,17 +323,10 @@ class _Pairs(NamedTuple):
     a: Indices
     b: Indices
 
-    def groups(self, count: int) -> Indices:
-        """Return the group of each of the views, directly or indirectly connected by pairs."""
-        links = sparse.coo_array((np.ones(len(self.a)), (self.a, self.b)), (count, count))
-        groups: Indices = connected_components(links, directed=False)[1]
-        return groups
-
     def step(self, logs: Floats) -> float | None:
         """Return the median difference of logarithms."""
         steps = np.abs(logs[self.first] - logs[self.second])
-        steps = steps[np.isfinite(steps)]
-        return float(np.median(steps)) if len(steps) else None
+        return float(np.nanmedian(steps)) if np.isfinite(steps).any() else None
 
 
 def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
@@ -369,12 +359,9 @@ def _slopes(entries: Sequence[Floats], unknowns: Sequence[Indices], count: int) 
 def _robust_fit(
     evaluate: Callable[[Floats], tuple[Floats, sparse.csr_array]],
     start: Floats,
-    prior: sparse.csr_array,
-    expected: Floats,
-    design: Floats | float = 1.0,
-    logarithms: int = 0,
+    prior: sparse.csr_array | None = None,
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Minimize the Huber loss of residuals, in units of their median absolute deviation.
+    """Minimize the Cauchy loss of residuals, in units of their median absolute deviation.
 
     Gauss-Newton steps on reweighted squares. Priors are measured in the noise of the residuals:
     they decide what the samples do not determine, and vanish without noise.
@@ -382,37 +369,29 @@ def _robust_fit(
     Args:
         evaluate: Returns residuals ``(m,)`` and their derivatives ``(m, n)``.
         start: ``(n,)`` first values of the unknowns.
-        prior: ``(k, n)`` matrix; its product with the unknowns is expected to be `expected`, with
-            a standard deviation of 1.
-        expected: ``(k,)``.
-        design: ``(m,)`` weights that do not depend on residuals.
-        logarithms: Number of unknowns, the first ones, whose steps are limited to 1.
+        prior: ``(k, n)`` matrix; its product with the unknowns is expected to be that with `start`,
+            with a standard deviation of 1.
 
     Returns:
         The unknowns, and a mask of residuals with a weight below ½.
     """
-    unknowns, weight = start, np.ones(0)
+    unknowns, weight, noise = start, np.ones(0), _NO_NOISE
     for _ in range(_ITERATIONS):
         residual, slopes = evaluate(unknowns)
-        noise = max(_MAD_TO_STD * float(np.median(np.abs(residual))), _NO_NOISE)
-        weight = 1 / np.maximum(1, np.abs(residual) / (_HUBER * noise))
-        weighted, strength = slopes.T @ sparse.diags_array(design * weight), _CORRELATED * noise**2
-        normal = weighted @ slopes + strength * (prior.T @ prior)
-        slope = weighted @ residual + strength * (prior.T @ (prior @ unknowns - expected))
+        spread = _MAD_TO_STD * float(np.median(np.abs(residual)))
+        noise = max(spread, _SHRINKAGE * noise, _NO_NOISE)
+        weight = 1 / (1 + (residual / (_CAUCHY * noise)) ** 2)
+        weighted = slopes.T @ sparse.diags_array(weight)
+        normal, slope = weighted @ slopes, weighted @ residual
+        if prior is not None:
+            normal += noise**2 * prior.T @ prior
+            slope += noise**2 * prior.T @ (prior @ (unknowns - start))
         normal += sparse.diags_array(_DAMPING * normal.diagonal() + _NEGLIGIBLE)
         step = spsolve(normal.tocsc(), -slope)
-        unknowns = unknowns + step / max(1.0, np.abs(step[:logarithms]).max(initial=0))
+        unknowns = unknowns + step.clip(-1, 1)
         if np.abs(step).max() < _TOLERANCE:
             break
     return unknowns, weight < 1 / 2
-
-
-def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return ``(N,)`` logarithms of scales, and a mask of outliers."""
-    ones, offset = np.ones(len(pairs.a)), logs[pairs.first] - logs[pairs.second]
-    slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
-    none = sparse.csr_array((0, count)), np.zeros(0)
-    return _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count), *none)
 
 
 def _fit_affine(
@@ -420,25 +399,22 @@ def _fit_affine(
 ) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
     """Return scales and shifts ``(N,)``, a mask of constant views, and a mask of outliers.
 
-    The unknowns are u and b in ``(s x + t) = exp(u) ((x − center) / spread + b)``.
+    The unknowns are u and b in ``s x + t = exp(u) (x / unit + b)``.
     """
     first, second, a, b = pairs
-    center, spread = np.zeros(count), np.ones(count)
+    unit, is_constant = np.ones(count), np.zeros(count, bool)
     used = np.unique(np.concatenate([first, second]))
     for number in np.unique(view[used]):
         low, middle, high = np.quantile(value[used[view[used] == number]], (0.25, 0.5, 0.75))
-        center[number], spread[number] = middle, (high - low) / _RANGE_TO_STD
-    is_constant = spread <= _CONSTANT * np.abs(center)
-    spread, has_shift = np.where(is_constant, np.abs(center), spread), ~is_constant
-    normal, no_shift = (value - center[view]) / spread[view], center / spread
-    farness = np.maximum(1, np.abs(normal) / _LEVERAGE)
-    design = (farness[first] * farness[second]) ** -2.0
+        unit[number] = max(high - low, abs(middle))
+        is_constant[number] = high - low <= _CONSTANT * abs(middle)
+    normal, has_shift = value / unit[view], ~is_constant
 
     def evaluate(unknowns: Floats) -> tuple[Floats, sparse.csr_array]:
         scale, shift = np.exp(unknowns[:count]), unknowns[count:]
         depth = scale[view] * (normal + shift[view]) * factor
-        noise = np.sqrt((scale[a] ** 2 + scale[b] ** 2) / 2)
-        residual, share = (depth[first] - depth[second]) / noise, (scale[a] / noise) ** 2 / 2
+        noise = np.hypot(depth[first], depth[second]) / 2**0.5 + _NEGLIGIBLE
+        residual, share = (depth[first] - depth[second]) / noise, (depth[first] / noise) ** 2 / 2
         entries = [
             depth[first] / noise - residual * share,
             -depth[second] / noise - residual * (1 - share),
@@ -447,13 +423,11 @@ def _fit_affine(
         ]
         return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
 
-    deviation = np.concatenate([np.full(count, _SCALE_PRIOR), np.maximum(1, np.abs(no_shift))])
-    prior = sparse.diags_array(1 / deviation).tocsr()
-    expected = np.concatenate([np.log(spread), no_shift]) / deviation
-    start = np.concatenate([np.zeros(count), no_shift])
-    fit, outliers = _robust_fit(evaluate, start, prior, expected, design, count)
-    scale = np.exp(fit[:count]) / spread
-    return scale, scale * (fit[count:] * spread - center), is_constant, outliers
+    prior = sparse.diags_array(np.repeat([1 / _SCALE_PRIOR, 1 / _SHIFT_PRIOR], count)).tocsr()
+    start = np.concatenate([np.log(unit), np.zeros(count)])
+    fit, outliers = _robust_fit(evaluate, start, prior)
+    scale = np.exp(fit[:count])
+    return scale / unit, scale * fit[count:], is_constant, outliers
 
 
 def _fit_grid(
@@ -474,9 +448,7 @@ def _fit_grid(
     small = sparse.vstack([smooth / _SLOPE_PRIOR, sparse.eye_array(nodes) / _NODE_PRIOR])
     prior = sparse.kron(sparse.eye_array(count), small).tocsr()
     start = np.zeros(count * nodes)
-    fit, outliers = _robust_fit(
-        lambda grid: (slopes @ grid + offset, slopes), start, prior, np.zeros(prior.shape[0])
-    )
+    fit, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
     return fit.reshape(count, _NODES, _NODES), at_samples @ fit, outliers
 
 

@@ -12,7 +12,6 @@ from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    equirect_solid_angles,
     equirect_to_lonlat,
     lonlat_to_xyz,
     ray_lengths,
@@ -39,10 +38,6 @@ if TYPE_CHECKING:
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
 
-_MEDIAN_POINTS = 2**16
-"""Number of pixels, about, from which the median distance is computed."""
-
-
 _FARTHEST = 100.0
 """Multiples of the median beyond which relative depth is unknown, like sky: small errors of the
 disparity change it without limit."""
@@ -53,8 +48,8 @@ class DistanceMap:
     """Distances from the center along the rays of a panorama or photo.
 
     Attributes:
-        distance: ``(H, W)`` float32, NaN where unknown: meters, or for relative kinds multiples of
-            the median by solid angle, up to 100.
+        distance: ``(H, W)`` float32, NaN where unknown: meters; or for relative kinds multiples of
+            the median of known distances, of a photo of z-depth, by solid angle.
         report: Facts about the alignment of the views.
     """
 
@@ -115,8 +110,9 @@ def combine_depth(
         mosaic.add(alignment.applied(depth, numbers, lengths), views)
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
-        distance = distance / _median(distance, area, camera_matrix)
-        distance = distance.where(distance <= _FARTHEST, torch.nan)
+        for farthest in (_FARTHEST, torch.inf):  # the second time without what is too far
+            distance = distance / _median(distance, points, camera_matrix)
+            distance = distance.where(distance <= farthest, torch.nan)
     return DistanceMap(distance, alignment.report)
 
 
@@ -191,21 +187,18 @@ class DepthPredictor(ViewPredictor):
 
 
 def _median(
-    distance: Tensor, area: SphereArea | None, camera_matrix: NDArray[np.float64] | None
+    distance: Tensor, points: NDArray[np.int64], camera_matrix: NDArray[np.float64] | None
 ) -> float:
-    """Return the median of known distances, weighted by solid angle; 1 if all are unknown."""
-    shape = distance.shape[0], distance.shape[1]
-    points = lattice(shape, _MEDIAN_POINTS)
+    """Return the median of known depth at points, by solid angle; 1 if all are unknown."""
     rows, columns = points.T
-    if camera_matrix is None:
-        weight = equirect_solid_angles(shape)[rows]
-    else:
-        weight = ray_lengths(camera_matrix, shape)[rows, columns] ** -3.0
-    values = distance.cpu().numpy()[rows, columns]
-    known = np.isfinite(values) & _inside(area, points, shape)
+    values, lengths = distance.cpu().numpy()[rows, columns], np.ones(len(points))
+    if camera_matrix is not None:
+        lengths = ray_lengths(camera_matrix, distance.shape)[rows, columns]
+    known = np.isfinite(values)
     if not known.any():
         return 1.0
-    return float(np.quantile(values[known], 0.5, weights=weight[known], method="inverted_cdf"))
+    weights, values = lengths[known] ** -3.0, (values / lengths)[known]
+    return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
 
 
 def _inside(

@@ -117,6 +117,29 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
         assert values[order][np.searchsorted(total, total[-1] / 2)] == pytest.approx(1, abs=0.01)
 
 
+def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
+    """A third of the sphere is 10⁴ times as far, and becomes unknown; z-depth of a photo."""
+    outputs = []
+    for views, depth in _true_depth(VIEWS["ring"], "relative_disparity"):
+        up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
+        outputs.append((views, depth.where(up < 1 / 3, depth / 1e4)))
+    found = combine_depth(outputs, SHAPE, "relative_disparity", "nearest", "none").distance.numpy()
+    known, weight = (
+        np.isfinite(found),
+        np.broadcast_to(equirect_solid_angles(SHAPE)[:, None], SHAPE),
+    )
+    assert weight[known].sum() == pytest.approx(4 * np.pi * 2 / 3, rel=0.03)
+    nearer = weight[known & (found < 1)].sum() / weight[known].sum()
+    assert nearer == pytest.approx(0.5, abs=0.02)
+
+    photo, _ = _photo((60, 90), 70)
+    trained = depth_network("relative_depth")
+    result = DepthPredictor(trained, PhotoViews(trained)).predict(photo)
+    depth = result.depth(photo.camera_matrix)
+    angle = (depth / result.distance) ** 3
+    assert angle[depth < 1].sum() / angle.sum() == pytest.approx(0.5, abs=0.02)
+
+
 def test_the_sky_and_unknown_pixels_are_unknown() -> None:
     """Disparity 0 is infinitely far, and is not mixed into the depth beside it."""
     outputs = []

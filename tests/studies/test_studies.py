@@ -160,4 +160,8 @@ def test_scales_of_a_box_are_recovered_and_smooth_errors_reduced_by_a_grid() -> 
     assert exact["step before"] > 50
     assert exact["view"] < 0.5
     assert smooth["error"] > 5
+    noisy = depth_alignment(
+        distance_m, "metric_z", 0, dim=64, pixel_noise=0.1, modes=[None], seed=1
+    )
+    assert noisy["view"] < 2
     assert smooth["error, grid"] < smooth["error"] / 2
