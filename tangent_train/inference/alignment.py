@@ -105,8 +105,7 @@ def sphere_points(shape: tuple[int, int]) -> Indices:
     """Return ``(P, 2)`` rows and columns of the pixels of a panorama at an icosphere's vertices."""
     positions = lonlat_to_equirect(xyz_to_lonlat(icosphere(_LEVEL).vertices), shape)
     columns, rows = np.rint(positions).astype(np.int64).T
-    pixels = np.unique(rows.clip(0, shape[0] - 1) * shape[1] + columns % shape[1])
-    return np.stack(np.divmod(pixels, shape[1]), axis=-1)
+    return np.stack([rows.clip(0, shape[0] - 1), columns % shape[1]], axis=-1)
 
 
 def lattice(shape: tuple[int, int]) -> Indices:

@@ -235,7 +235,7 @@ class Network:
 
         Returns:
             ``(H, W)`` float32, NaN where unknown: an array, or a tensor. In meters for networks
-            that return meters. Others have an unknown unit: the median distance is 1, by solid
+            that return meters. Others have an unknown unit: the median of the depth is 1, by solid
             angle (`trained.depth_kind` starts with ``relative``).
 
         Raises:
