@@ -342,7 +342,7 @@ def test_a_strip_whose_angles_are_given(tmp_path: Path, refused: Refused, colmap
     settings = {"base_level": 0, "faces": [9], "colmap": colmap}
     message = refused(input=tmp_path / "strip.png", output=tmp_path / "none", **settings)
     assert "area=[west,east,south,north]" in message
-    assert "tangent-predict with projection=perspective" in message
+    assert "tangent-predict also needs projection=perspective" in message
     area = [-180, 180, -45, 45]
     render_with(input=tmp_path / "strip.png", output=tmp_path / "strip", area=area, **settings)
     render_with(input=tmp_path / "whole.png", output=tmp_path / "whole", **settings)
