@@ -262,4 +262,4 @@ def test_the_command_lists_problems_line_by_line(
         f"{cut.stat().st_size} bytes, truncated; expected a whole PNG",
         "Copy or extract the file again.",
     ]
-    assert "2 problems; 13 panoramas" in captured.err
+    assert "2 problems; 14 panoramas" in captured.err
