@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 import subprocess
+from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -22,8 +23,10 @@ BLOCKS = [
 ]
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    # A server that another test started has not imported the modules of `run`.
+    forkserver._forkserver._stop()  # type: ignore[attr-defined]
     return build_world(tmp_path_factory.mktemp("documentation"))
 
 
