@@ -1,6 +1,6 @@
 # make demo   sets up, makes furnished rooms, trains on them and shows the results
 # make test   sets up and runs the tests, 3 to 5 minutes on two cores
-# make test-all  with the slow ones and the coverage, 25 to 35 minutes; what CI runs
+# make test-all  with the slow ones and the coverage, 35 to 50 minutes; what CI runs
 # make real ZIND=zind/sample_tour NETWORK=net.onnx  the tables of docs/results/real_panoramas.md, in hours
 # make docs  builds the documentation site in site/, offline, in under a minute
 # make bench  measures speed and memory, under 10 minutes; make bench-compare looks for regressions
