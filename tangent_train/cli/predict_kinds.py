@@ -137,7 +137,14 @@ class DepthPrediction:
         if settings.upright == "auto":
             expected = "pose or null: depth networks do not estimate the up direction"
             raise SettingError("upright", found="auto", expected=expected)
-        written = ("depth",) if settings.write is None else settings.write
+        kind: Any = trained.depth_kind
+        self.results = DepthResults(
+            is_metric=is_metric(kind),
+            depth_format=settings.depth_format,
+            depth_scale=settings.depth_scale,
+            points=settings.points,
+        )
+        written = self.results.kinds(settings.write)
         if "depth" not in written:
             check_unread(settings, "without depth in write", depth_format=None)
         if "depth" not in written or settings.depth_format not in (None, "png"):
@@ -146,13 +153,6 @@ class DepthPrediction:
             check_unread(settings, "without points in write", points=None)
         how = settings.device, settings.images_per_forward, settings.align
         self._predictor = DepthPredictor(trained, views, *how)
-        kind: Any = trained.depth_kind
-        self.results = DepthResults(
-            is_metric=is_metric(kind),
-            depth_format=settings.depth_format,
-            depth_scale=settings.depth_scale,
-            points=settings.points,
-        )
 
     def prepare(self, examples: Iterable[Callable[[], InputImage]]) -> None:
         """Do nothing."""

@@ -262,10 +262,7 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
     scale, shift, grid = np.ones(count), np.zeros(count), None
     outliers, is_constant = np.zeros(0, bool), np.zeros(count, bool)
     if base == "scale" and len(pairs.a):
-        ones, offset = np.ones(len(pairs.a)), before[pairs.first] - before[pairs.second]
-        slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
-        logs, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count))
-        scale = np.exp(logs)
+        scale, outliers = _fit_scales(pairs, before, count)
     elif base == "affine" and len(pairs.a):
         scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
     links = sparse.coo_array((np.ones(len(pairs.a)), (pairs.a, pairs.b)), (count, count))
@@ -281,14 +278,13 @@ def align(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = No
         after = after + added
     is_empty = np.bincount(view[is_valid], minlength=count) == 0
     alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
-    isolated, empty, constant = (np.flatnonzero(x).tolist() for x in (alone, is_empty, is_constant))
     report = AlignmentReport(
         mode,
         count,
-        len(np.unique(groups[~is_empty])),
-        tuple(isolated),
-        tuple(empty),
-        tuple(constant),
+        groups=len(np.unique(groups[~is_empty])),
+        isolated=tuple(np.flatnonzero(alone).tolist()),
+        empty=tuple(np.flatnonzero(is_empty).tolist()),
+        constant=tuple(np.flatnonzero(is_constant).tolist()),
         invalid=1 - float(is_valid.mean()) if len(view) else 0.0,
         outliers=float(outliers.mean()) if len(outliers) else 0.0,
         step_before=pairs.step(before),
@@ -391,6 +387,14 @@ def _robust_fit(
         if np.abs(step).max() < _TOLERANCE:
             break
     return unknowns, weight < 1 / 2
+
+
+def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> tuple[Floats, NDArray[np.bool_]]:
+    """Return scales ``(N,)``, and a mask of outliers."""
+    ones, offset = np.ones(len(pairs.a)), logs[pairs.first] - logs[pairs.second]
+    slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
+    fit, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count))
+    return np.exp(fit), outliers
 
 
 def _fit_affine(

@@ -110,9 +110,9 @@ def combine_depth(
         mosaic.add(alignment.applied(depth, numbers, lengths), views)
     distance = distance_of(mosaic.values(), depth_kind)
     if not is_metric(kind):
-        for farthest in (_FARTHEST, torch.inf):  # the second time without what is too far
-            distance = distance / _median(distance, points, camera_matrix)
-            distance = distance.where(distance <= farthest, torch.nan)
+        distance = distance / _median(distance, points, camera_matrix)
+        distance = distance.where(distance <= _FARTHEST, torch.nan)
+        distance = distance / _median(distance, points, camera_matrix)  # without what was too far
     return DistanceMap(distance, alignment.report)
 
 

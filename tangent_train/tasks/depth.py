@@ -28,7 +28,7 @@ from tangent_train.checkpoints.distances import (
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.depth import check_align, combine_depth
-from tangent_train.inference.engine import view_scores
+from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.depth import (
     Alignment,
     DepthMetric,
@@ -209,7 +209,8 @@ class DepthTask(ViewsTask):
         if truth.ndim == 2:
             return self.protocol.aligned(self._of_panorama(sample, truth), truth), truth
         lengths = sample.ray_lengths
-        depth = self._depth_of(sample.images.__getitem__, len(truth))
+        parts = view_scores(self, sample.images.__getitem__, len(truth), self.images_per_forward)
+        depth = torch.cat([scores for _, scores in parts])
         if not self.is_tested:
             self._add_loss(depth, truth, lengths)
         values, kind = depth_of_output(depth, self.depth_kind, lengths[:, None])
@@ -223,22 +224,15 @@ class DepthTask(ViewsTask):
     ) -> Float[Tensor, "height width"]:
         """Predict the distances of a panorama from its views, which are aligned with each other."""
         area = SphereArea.of_numbers(sample.area.cpu().numpy())
-        sets, outputs = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area), []
-        for views, images, rays in sets:
-            depth = self._depth_of(images, len(views), rays)
-            if not self.is_tested:
-                lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
-                self._add_loss(depth, labels_of_views(truth, views), lengths)
-            outputs.append((views, depth))
+        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area)
+        outputs = list(scored_views(self, sets, self.images_per_forward))
+        for views, depth in [] if self.is_tested else outputs:
+            lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
+            self._add_loss(depth, labels_of_views(truth, views), lengths)
         shape, blend = (truth.shape[0], truth.shape[1]), self.representation.blend
         combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, area=area)
         self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
-
-    def _depth_of(self, images: Any, count: int, rays: Tensor | None = None) -> Tensor:
-        """Return the output of the network ``(n, 1, h, w)`` for a set of views."""
-        parts = view_scores(self, images, count, self.images_per_forward, rays)
-        return torch.cat([depth for _, depth in parts])
 
     def build_metric(self) -> DepthMetric:
         """Build the metric, which keeps the sums of the errors of each image."""

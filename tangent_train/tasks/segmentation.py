@@ -147,21 +147,15 @@ class SegmentationTask(ViewsTask):
                 best[part] = scores.argmax(dim=1)
                 if target is not None:
                     self._add_loss(scores, target[part])
-            return (best + 1).where(best < len(self.class_weights), 0)
-
-        sets, blend = self.view_sets(images, rotation, area), self.representation.blend
-        mosaic = ScoreMosaic(
-            (shape[0], shape[1]),
-            self.num_scores,
-            blend,
-            averaged=len(sets) > 1,
-            device=images.device,
-        )
-        for views, scores in scored_views(self, sets, self.images_per_forward):
-            mosaic.add(scores, views)
-            if target is not None:
-                self._add_loss(scores, labels_of_views(target, views))
-        best = mosaic.labels().long().to(images.device)
+        else:
+            sets, blend = self.view_sets(images, rotation, area), self.representation.blend
+            how: Any = {"averaged": len(sets) > 1, "device": images.device}
+            mosaic = ScoreMosaic((shape[0], shape[1]), self.num_scores, blend, **how)
+            for views, scores in scored_views(self, sets, self.images_per_forward):
+                mosaic.add(scores, views)
+                if target is not None:
+                    self._add_loss(scores, labels_of_views(target, views))
+            best = mosaic.labels().long().to(images.device)
         return (best + 1).where(best < len(self.class_weights), 0)
 
     def _add_loss(self, scores: Tensor, labels: Tensor) -> None:
