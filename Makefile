@@ -58,7 +58,7 @@ docs: install
 real: install
 	$(BIN)/tangent-transfer experiment=zero_shot name=real/$(basename $(notdir $(NETWORK))) checkpoint=$(NETWORK) \
 		data=zind data.root=$(ZIND) data.test_fraction=1 data.doors=ignore \
-		class_map=ade20k_to_zind_layout unmapped=never
+		label_map=ade20k_to_zind_layout unmapped=never
 	$(BIN)/tangent-keypoints data=zind_pairs data.root=$(ZIND) data.max_distance_m=3 \
 		output=runs/real/keypoints
 

@@ -10,13 +10,13 @@ import torch
 
 from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
-from datamodules.images.gpano import PanoramaArea
 from models import UNet
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
+from tangent_train.io.gpano import PanoramaArea
 
 WHOLE, PART = "whole panorama", "35° above and below the horizon"
 

@@ -22,9 +22,9 @@ _WIDTHS = "network.widths=[16,32,64,128,256,256]"  # as many parameters as the U
 METHODS = {
     "tangent images, b = 0": f"{_UNET} representation=tangent",
     "tangent images, b = 1": f"{_UNET} representation.base_level=1",
-    "level views": f"{_UNET} representation=ring",
+    "horizontal views": f"{_UNET} representation=horizontal",
     "ERP, whole": f"{_UNET} representation=erp",
-    "ERP, 90° crops": f"{_UNET} representation=erp_crops data.panoramas_per_step=4",
+    "ERP, 90° crops": f"{_UNET} representation=erp_crops data.batch_size=4",
     "ugscnn": f"network=ugscnn {_WIDTHS}",
     "hexrunet": f"network=hexrunet {_WIDTHS}",
     "spherephd": f"network=spherephd {_WIDTHS}",
@@ -78,7 +78,7 @@ def _time(call: Callable[[], object], times: list[float]) -> None:
 
 def _calls(settings: list[str], root: str, rows: int) -> tuple[Callable[[], object], ...]:
     """Return a training step on one panorama and the evaluation of one, rendering included."""
-    settings = ["experiment=rooms/methods", "data.panoramas_per_step=1", *settings]
+    settings = ["experiment=rooms/methods", "data.batch_size=1", *settings]
     data, task = built(settings, f"{root}/rooms", rows)
     data.setup("test")
     optimizer = torch.optim.AdamW(task.parameters())

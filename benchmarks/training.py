@@ -48,7 +48,7 @@ def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tup
     counts = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), 0) | {"1": rooms, "5a": 1}
     settings = [f"data.rooms.rooms.area_{area}={number}" for area, number in counts.items()]
     settings += [f"data.rooms.height={rows}", "data.rooms.supersample=1", f"data.root={root}"]
-    settings += ["data.validation_fraction=0", "trainer.accelerator=cpu", "seed=0"]
+    settings += ["data.val_fraction=0", "trainer.accelerator=cpu", "seed=0"]
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("train", ["data=synthrooms", *settings, *overrides])
     plain: Any = OmegaConf.to_container(config, resolve=True)
@@ -63,7 +63,7 @@ def loader(quick: bool) -> Iterator[Table]:
     """Load samples of 4 of 80 RGB-D images from the prepared store and from PNGs, with 1 worker."""
     level = 6 if quick else 10
     settings = [f"level={level}", "representation=tangent", "representation.base_level=1"]
-    settings += ["representation.faces_per_panorama=4", "data.panoramas_per_step=1"]
+    settings += ["representation.faces_per_panorama=4", "data.batch_size=1"]
     settings += ["data.num_workers=1", "data.in_memory=false"]
     with tempfile.TemporaryDirectory() as root, quiet():
         alternatives = []
@@ -98,7 +98,7 @@ def step(quick: bool) -> Iterator[Table]:
     both networks must have the same weights.
     """
     small = ["level=5", "network=unet_small"] if quick else []
-    settings = ["data.panoramas_per_step=3", "task.class_weights=none", "optimizer=adam"]
+    settings = ["data.batch_size=3", "task.class_weights=none", "optimizer=adam"]
     settings += [
         "representation.random_rotation=none"
     ]  # with rotations, they would share cached tables

@@ -12,7 +12,6 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 _TRIALS = list(product(("meta", "cpu"), (256, 224)))
 """Devices and sides of empty images to try: networks may depend on values, or have a fixed size."""
@@ -60,7 +59,6 @@ def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
     return features.shape[1]
 
 
-@registered
 class AuxiliaryHead(nn.Module):
     """Adds scores at an encoder stage to those of the network, in training only.
 

@@ -29,7 +29,6 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz
-from tangent_train.registry import registered
 
 _SAMPLES = 2**24
 """Most samples in memory at a time: taps of output pixels, times channels and images."""
@@ -136,7 +135,6 @@ def _framed(features: Tensor) -> Tensor:
     return torch.cat([tall, tall[..., :1]], dim=-1)
 
 
-@registered
 def make_distortion_aware(network: nn.Module) -> nn.Module:
     """Return a network with distortion-aware convolutions, which shares the tensors of a network.
 

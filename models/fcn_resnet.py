@@ -14,7 +14,6 @@ from torchvision.models import get_model, get_weight
 from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from models.stem import widen_stem
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 _PUBLISHED = {
     "coco": "FCN_ResNet{}_Weights.COCO_WITH_VOC_LABELS_V1",
@@ -25,7 +24,6 @@ _LAST = "classifier.4."
 _DROPPED = (_LAST, "aux_classifier.", "backbone.fc.")
 
 
-@registered
 class FCNResNet(nn.Module):
     """torchvision's FCN on a dilated ResNet, without its auxiliary classifier.
 

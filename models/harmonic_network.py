@@ -13,13 +13,11 @@ from torch import Tensor, nn
 
 from tangent_train.errors import SettingError, of_extra, width_height
 from tangent_train.geometry import equirect_shape
-from tangent_train.registry import registered
 
 _Value = bool | int | float | str | None
 _GRID = "legendre-gauss"
 
 
-@registered
 class HarmonicNetwork(nn.Module):
     """Segmentation network of torch-harmonics for whole equirectangular images.
 

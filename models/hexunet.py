@@ -7,7 +7,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.unet import check_sides
-from tangent_train.registry import registered
 
 _ENCODERS = (32, 64, 128, 256)
 _DECODERS = ((512, 256), (256, 128), (128, 64), (64, 32))
@@ -39,7 +38,6 @@ def _decoder(in_channels: int, neck: int, out_channels: int) -> nn.Sequential:
     )
 
 
-@registered
 class HexUNet(nn.Module):
     """UNet of the OmniSYNTHIA experiments (paper, table "transfer"; after Zhang et al. 2019).
 

@@ -13,9 +13,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.unet import check_sides
+from tangent_train.config.setting_rules import flat_settings
 from tangent_train.errors import SettingError, of_extra, width_height
-from tangent_train.registry import registered
-from tangent_train.setting_rules import flat_settings
 
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
@@ -152,7 +151,6 @@ def network_types(task: str) -> set[str]:
     return {made.model_type for made in getattr(transformers, f"MODEL_FOR_{task}_MAPPING")}
 
 
-@registered
 class HuggingFaceNetwork(_TransformersNetwork):
     """Network from transformers for semantic or universal segmentation, with random weights.
 
@@ -218,7 +216,6 @@ _BILINEAR = ("depth_pro", "tipsv2_dpt")
 ``post_process_depth_estimation`` of their image processors."""
 
 
-@registered
 class HuggingFaceDepthNetwork(_TransformersNetwork):
     """Network from transformers for depth of photos, with random weights.
 

@@ -17,7 +17,6 @@ from models.icosphere_unet import levels_of
 from models.unet import Convolution, ResidualUNet
 from tangent_train.geometry.icosphere import icosphere
 from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
-from tangent_train.registry import registered
 
 _CORNERS = 12
 """The vertices with five neighbors: those of the icosahedron, the first ones at every level."""
@@ -246,7 +245,6 @@ class _Block(nn.Module):
         return torch.relu(self.body(x) + self.shortcut(x))
 
 
-@registered
 class IcoCNN(ResidualUNet):
     """Residual U-Net of gauge equivariant convolutions (Cohen et al. 2019).
 

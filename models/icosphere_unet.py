@@ -14,7 +14,6 @@ from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere_signals import IcosphereElements
-from tangent_train.registry import registered
 
 Pooling = Literal["first", "mean", "max"]
 Unpooling = Literal["zeros", "ones", "mean", "repeat"]
@@ -75,7 +74,6 @@ def levels_of(widths: Sequence[int], level: int) -> range:
     return range(level, level - len(widths), -1)
 
 
-@registered
 class IcosphereUNet(ResidualUNet):
     """UNet of Jiang et al. (2019) on icospheres of decreasing levels, for any table.
 

@@ -6,13 +6,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from models.unet import Down, check_sides
-from tangent_train.registry import registered
 
 _WIDTHS = (1, 4, 16, 64)
 """Channels after the first convolution and after each residual block, in units of `width`."""
 
 
-@registered
 class ShapeClassifier(nn.Module):
     """Classifies a shape by all of its tangent images (paper, supplement, "Shape classification").
 

@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 _KAPPAS = (0.1, 30.0)
 """Initial concentrations, from heads that see the whole sphere to heads that see about 15°."""
@@ -19,7 +18,6 @@ _ALIGNMENT = 8
 """Memory-efficient kernels need head sizes that are multiples of this number."""
 
 
-@registered
 class SphereAttention(nn.Module):
     """Multi-head attention between the tokens of all images of a sphere, for `SphereContext`.
 

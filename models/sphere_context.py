@@ -15,14 +15,12 @@ from torch.utils.checkpoint import checkpoint
 
 from models.auxiliary_head import stage_channels
 from tangent_train.errors import SettingError, at_least
-from tangent_train.registry import registered
 
 
 class _ReachedError(Exception):
     """Ends a forward pass of the network at the stage; carries the features."""
 
 
-@registered
 class SphereContext(nn.Module):
     """Lets the images of a sphere exchange features inside a network of single images.
 
@@ -66,7 +64,7 @@ class SphereContext(nn.Module):
         self,
         images: Float[Tensor, "images channels height width"],
         rays: Float[Tensor, "spheres images_of_sphere 3 3"] | None = None,
-        images_per_chunk: int | None = None,
+        view_batch_size: int | None = None,
     ) -> Any:
         """Return the network's result for images with context.
 
@@ -76,7 +74,7 @@ class SphereContext(nn.Module):
                 sphere, of any length; x goes from −1 at the left edge to 1 at the right edge, y
                 from −1 at the top to 1 at the bottom. The first column of a mirrored image is
                 negated. None for images without context, e.g. photos.
-            images_per_chunk: Maximum number of images in the network at once, to limit memory; the
+            view_batch_size: Maximum number of images in the network at once, to limit memory; the
                 context and the gradients are the same. Each chunk runs up to the stage, then as a
                 whole, and both again in the backward pass, which takes about twice the time. Batch
                 normalization sees one chunk at a time. None for all images at once.
@@ -92,9 +90,9 @@ class SphereContext(nn.Module):
                 found=f"{rays.shape[0]} spheres of {rays.shape[1]} images",
                 expected=f"spheres of {images.shape[0]} images together",
             )
-        if images_per_chunk is None or images_per_chunk >= images.shape[0]:
+        if view_batch_size is None or view_batch_size >= images.shape[0]:
             return self._run(images, lambda x: _add(x, self.mix(rays, self._pooled(x))))
-        return self._in_chunks(images, rays, images_per_chunk)
+        return self._in_chunks(images, rays, view_batch_size)
 
     def encode(
         self, images: Float[Tensor, "images channels height width"]

@@ -8,12 +8,10 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 _RGB = 3
 
 
-@registered
 def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
     """Extend a network of RGB images to additional channels, such as depth.
 

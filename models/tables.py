@@ -12,10 +12,8 @@ from models.mapped import Table
 from tangent_train.geometry import icosphere, vertex_resolution
 from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions, locate
-from tangent_train.registry import registered
 
 
-@registered
 @cache
 def mesh_operators(level: int) -> Table:
     """Return the four rows of MeshConv (Jiang et al. 2019, equation 3): x, L x, ∂EW x, ∂NS x.
@@ -64,7 +62,6 @@ def mesh_operators(level: int) -> Table:
     return Table.of_operators([identity, *map(assembled, (laplacian / 12**0.5, *derivatives))])
 
 
-@registered
 @cache
 def hexagonal_rings(level: int) -> Table:
     """Return the seven rows of HexConv (Zhang et al. 2019, section 3.2): a vertex and its ring.
@@ -106,7 +103,6 @@ def hexagonal_rings(level: int) -> Table:
     return Table.of_operators(operators)
 
 
-@registered
 @cache
 def face_neighbors(level: int) -> Table:
     """Return the ten rows of SpherePHD (Lee et al. 2019, figure 5), for signals on faces.
@@ -149,7 +145,6 @@ def vertex_parents(level: int) -> Table:
     return Table.of_entries(parents[:, None], np.array(0.5), len(coarse.vertices))
 
 
-@registered
 @cache
 def gnomonic_taps(level: int) -> Table:
     """Return nine taps: a 3 × 3 grid on the tangent plane of each vertex, aligned to the north.

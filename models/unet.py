@@ -10,7 +10,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from tangent_train.errors import SettingError, width_height
-from tangent_train.registry import registered
 
 Convolution = Callable[[int, int], nn.Module]
 """Makes a layer from its numbers of input and output channels."""
@@ -142,7 +141,6 @@ def _transposed(channels: int) -> nn.Module:
     return nn.ConvTranspose2d(channels, channels, 4, stride=2, padding=1)
 
 
-@registered
 class UNet(ResidualUNet):
     """Residual UNet (paper, supplement, "Network training details"; after Jiang et al. 2019).
 

@@ -14,7 +14,6 @@ from torch.nn import functional
 from models.harmonic_network import check_shape, pixel_row_weights, use_pixel_rows
 from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
-from tangent_train.registry import registered
 
 _SLOPE = 0.1
 
@@ -69,7 +68,6 @@ class ZonalConvolution(nn.Module):
         return result
 
 
-@registered
 class ZonalClassifier(nn.Module):
     """Classifies a shape by the equirectangular image of its sphere (Esteves et al. 2018).
 

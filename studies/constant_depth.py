@@ -18,8 +18,8 @@ from torch import nn
 
 from datamodules.core.panoramas import STEPS_PER_M
 from tangent_train.cli.run import build_data
+from tangent_train.config.build import build_from_config
 from tangent_train.files import config_folder
-from tangent_train.registry import build_from_config
 from tangent_train.results.evaluation import summary_lines
 
 

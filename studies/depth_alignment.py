@@ -18,19 +18,19 @@ import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from datamodules.images.pixel_files import read_depth_m
 from studies.output import COLORS, Row, save, save_table
 from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import distance_of, from_distance
 from tangent_train.inference.alignment import align, sample_views, sphere_points
-from tangent_train.rendering import RingRepresentation
+from tangent_train.io.pixel_files import read_depth_m
+from tangent_train.rendering import HorizontalRepresentation
 
 _RINGS = (
     {"pitch": 0, "views": 6, "fov": 130},
     {"pitch": 40, "views": 5},
     {"pitch": -40, "views": 5},
 )
-"""Those of ``representation=ring_wide``."""
+"""Those of ``representation=horizontal_wide``."""
 
 _RINGS_BY_FOV = {
     60: {0: 10, 36: 10, -36: 10, 72: 6, -72: 6},
@@ -71,7 +71,7 @@ def depth_alignment(
     """
     known = torch.from_numpy(np.where(distance_m > 0, distance_m, np.nan)).float()
     shape, rng = (known.shape[0], known.shape[1]), np.random.default_rng(seed)
-    views = RingRepresentation(9, dim=dim, rings=rings, fov=fov).view_sets()
+    views = HorizontalRepresentation(9, dim=dim, rings=rings, fov=fov).view_sets()
     y, x = np.meshgrid(*[np.linspace(-1, 1, dim)] * 2, indexing="ij")
     truths, outputs = [], []
     for part in views:

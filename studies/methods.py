@@ -13,7 +13,7 @@ from matplotlib.ticker import LogLocator, MultipleLocator
 from studies.output import COLORS
 
 DOCS = Path(__file__).parents[1] / "docs"
-OURS = ("tangent images", "level views", "ERP")
+OURS = ("tangent images", "horizontal views", "ERP")
 """Beginnings of the names of methods that use ordinary networks; the others are dashed."""
 
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.pixel_files import read_depth_m
 from tangent_train.geometry import FLIP_Y, equirect_directions
+from tangent_train.io.pixel_files import read_depth_m
 
 SIDE = 320
 """Rows and columns of a view."""

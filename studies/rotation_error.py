@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from studies.output import Row, markdown
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.config.build import build_from_config
 from tangent_train.files import csv_text, write_text
 from tangent_train.geometry import (
     equirect_directions,
@@ -26,7 +27,6 @@ from tangent_train.geometry import (
     random_rotation,
 )
 from tangent_train.geometry.icosphere_signals import icosphere_directions
-from tangent_train.registry import build_from_config
 from tangent_train.rendering import IcosphereRepresentation, rotate_equirect
 from tangent_train.rendering.mosaic import ScoreMosaic
 

@@ -32,7 +32,7 @@ def fed(quick: bool) -> Iterator[Table]:
     """Train the paper's best network at level 10, FCN-ResNet101, in bf16 on 16 images per step."""
     level, rooms = (5, 4) if quick else (10, 32)
     settings = ["experiment=paper/semseg_s10_b1_rgbd", f"level={level}", "network.weights=null"]
-    settings += ["task.images_per_chunk=null", "task.channels_last=true", "data.in_memory=false"]
+    settings += ["task.view_batch_size=null", "task.channels_last=true", "data.in_memory=false"]
     settings += [f"task.class_weights={[1] * 13}"]
     with tempfile.TemporaryDirectory() as root:
         settings.append(f"data.store={root}/store")

@@ -19,12 +19,12 @@ from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, measure
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.processes import command_line, run_process
+from tangent_train.config.build import build_from_config
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.inference.engine import Predictor, view_scores, views_per_forward
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.photo_networks import PhotoNetwork, import_network
 from tangent_train.inference.representations import PanoramaViews
-from tangent_train.registry import build_from_config
+from tangent_train.photo_networks import PhotoNetwork, import_network
 
 
 def predict(quick: bool) -> Iterator[Table]:

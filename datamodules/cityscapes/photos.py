@@ -34,11 +34,11 @@ from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_image_size
+from tangent_train.config.build import check_fields
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
-from tangent_train.registry import check_fields, registered
+from tangent_train.io.pixel_files import read_image_size
 
 _GET_IT = (
     "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
@@ -90,7 +90,6 @@ class CityscapesReader(NumberedReader):
         return matrix
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Cityscapes(PhotoDataModule):
     """Cityscapes, 19 or 13 classes.
@@ -128,7 +127,7 @@ class Cityscapes(PhotoDataModule):
         for split, images in published.items():
             labels = (self.root / "gtFine" / split).glob("*/[!.]*_labelIds.png")
             problems.note_strays(labels, images)
-        splits = published_splits(published, "val", self.validation_fraction, self.seed)
+        splits = published_splits(published, "val", self.val_fraction, self.seed)
         return CityscapesReader(_TABLE, self.fov), splits
 
     def _list_images(self, split: str) -> list[ImageFiles]:

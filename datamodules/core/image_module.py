@@ -52,11 +52,11 @@ from datamodules.core.transforms import (
     masked,
     placed,
 )
-from datamodules.images.gpano import Fill, PanoramaArea, check_area_size
-from datamodules.images.masks import Mask, Masks
-from datamodules.images.png import check_panorama_size
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea, shift_range
+from tangent_train.io.gpano import Fill, PanoramaArea, check_area_size
+from tangent_train.io.masks import Mask, Masks
+from tangent_train.io.png import check_panorama_size
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 
@@ -212,7 +212,7 @@ class PanoramaDataModule(ImageDataModule):
     """Labeled panoramas of one data set, see `ImageDataModule`.
 
     Args:
-        panoramas_per_step: Panoramas per training step and process. Evaluation takes one at a time.
+        batch_size: Panoramas per training step and process. Evaluation takes one at a time.
         area: The part of the sphere that all files show: west, east, south and north in degrees,
             see `SphereArea`; None for the whole sphere.
         fill: Colors of the panorama outside the area, in views that leave it.
@@ -237,7 +237,7 @@ class PanoramaDataModule(ImageDataModule):
     noun: ClassVar[str] = "panoramas"
     fact_settings: ClassVar[tuple[str, ...]] = ("size", "area", "mask", "test_rotation")
 
-    panoramas_per_step: int = 4
+    batch_size: int = 4
     area: Sequence[float] | None = None
     fill: Fill = "mean"
     mask: Mask = None
@@ -353,7 +353,7 @@ class PhotoDataModule(ImageDataModule):
     The representation is the camera to which all photos are normalized.
 
     Args:
-        photos_per_step: Photos per training step and process. Evaluation takes one at a time.
+        batch_size: Photos per training step and process. Evaluation takes one at a time.
 
     Raises:
         SettingError: A setting is invalid.
@@ -362,7 +362,7 @@ class PhotoDataModule(ImageDataModule):
     noun: ClassVar[str] = "photos"
     fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
-    photos_per_step: int = 16
+    batch_size: int = 16
 
     def __post_init__(self) -> None:
         super().__post_init__()

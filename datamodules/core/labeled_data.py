@@ -21,9 +21,9 @@ from datamodules.core.inputs import Normalization
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.problems import Problems
 from datamodules.core.reading import SplitReader, Transform
+from tangent_train.config.build import is_class_name
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import is_class_name
 from tangent_train.threads import in_threads
 
 _Item = TypeVar("_Item", bound=Item)
@@ -46,7 +46,7 @@ class LabeledData(ABC, Generic[_Item]):
         root: Folder of the data set.
         representation: Representation of the images; by default `default_representation`.
         level: Level of the default representation.
-        validation_fraction: Share of the training data that is held out for validation; 0 for no
+        val_fraction: Share of the training data that is held out for validation; 0 for no
             validation.
         normalization: See `Normalization.of`; by default that of the data.
         seed: Seed of the splits, the order, the views and the augmentation, 0 or more.
@@ -75,7 +75,7 @@ class LabeledData(ABC, Generic[_Item]):
     root: Path = field(kw_only=False)
     representation: Any = field(kw_only=False, default=None)
     level: int | None = None
-    validation_fraction: float = 0.1
+    val_fraction: float = 0.1
     normalization: Normalization | str | Mapping[str, Sequence[float]] | None = None
     seed: int = 0
     sampling_seed: int = 0
@@ -93,8 +93,8 @@ class LabeledData(ABC, Generic[_Item]):
             self.representation = self.default_representation()
         else:
             self.require("level", self.level is None, "null: the representation has a level")
-        fine = 0 <= self.validation_fraction < 1
-        self.require("validation_fraction", fine, "0 to below 1")
+        fine = 0 <= self.val_fraction < 1
+        self.require("val_fraction", fine, "0 to below 1")
         for name in ("seed", "sampling_seed"):
             self.require(name, getattr(self, name) >= 0, "0 or more")
         self.label_counts: dict[Split, NDArray[np.int64]] = {}

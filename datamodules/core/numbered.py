@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles, PngReader, resize_nearest, units_to_steps
-from datamodules.images.pixel_files import read_image_size, read_pixels
 from tangent_train.errors import DataError
+from tangent_train.io.pixel_files import read_image_size, read_pixels
 
 _FORMATS = {"labels": (8, ("gray", "palette")), "depth": (16, ("gray",))}
 _STRANGE = 255

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.labeled_data import print_on_rank_zero
-from datamodules.images.gpano import read_area
-from datamodules.images.image_files import image_paths, short_names
-from datamodules.images.pixel_files import read_rgb
-from datamodules.images.png import check_panorama_size
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import PanoramaPose, SphereArea
+from tangent_train.io.gpano import read_area
+from tangent_train.io.image_files import image_paths, short_names
+from tangent_train.io.pixel_files import read_rgb
+from tangent_train.io.png import check_panorama_size
 
 
 class PairedPanorama(NamedTuple):

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from datamodules.core.labels import DISTANCE, ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
-from datamodules.images.pixel_files import read_rgb
-from datamodules.images.png import check_png
 from tangent_train.errors import DataError, width_height
 from tangent_train.geometry import PanoramaPose, SphereArea, ray_lengths
+from tangent_train.io.pixel_files import read_rgb
+from tangent_train.io.png import check_png
+from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.resampling import resize
-from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from tangent_train.rendering.representations.perspective import (

@@ -19,8 +19,8 @@ from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.reading import SplitReader
 from tangent_train.geometry import SphereArea, equirect_elevations
+from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.representations.views import Views
-from tangent_train.rendering.upright.gravity import upright_rotation
 
 Inputs = Sequence[Tensor]
 """Rendered RGB, optionally depth and elevation, see `TrainingSample`."""

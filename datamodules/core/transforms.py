@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from datamodules.images.gpano import Fill, PanoramaArea, black_outside, read_up
-from datamodules.images.masks import Masks
 from tangent_train.geometry import (
     SphereArea,
     random_rotation,
     rotation_about,
 )
+from tangent_train.io.gpano import Fill, PanoramaArea, black_outside, read_up
+from tangent_train.io.masks import Masks
+from tangent_train.orientation.gravity import estimate_up
+from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.rendering import rotate_equirect
-from tangent_train.rendering.upright.gravity import estimate_up
-from tangent_train.rendering.upright.manhattan import MOST_ROWS
 
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""

@@ -32,7 +32,6 @@ from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 
 _GET_IT = (
     "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
@@ -43,7 +42,6 @@ _HEIGHT, _WIDTH = 400, 2048
 _LABELS = "_labelTrainIds.png"
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class DensePASS(PanoramaDataModule):
     """DensePASS, 19 or 13 classes.

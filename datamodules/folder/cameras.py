@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.images.image_files import composed
-from datamodules.images.pixel_files import photo_fov_deg, read_image_size
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
+from tangent_train.io.image_files import composed
+from tangent_train.io.pixel_files import photo_fov_deg, read_image_size
 
 _MOST_FOV_DEG = 170  # above: K in other units, e.g. shares of the photo's width
 _LEAST_FOCAL = 0.5 / math.tan(math.radians(_MOST_FOV_DEG) / 2)

@@ -27,10 +27,9 @@ from datamodules.folder.cameras import read_folder_cameras
 from datamodules.folder.classes import NO_CLASSES, UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
-from datamodules.images.gpano import tagged_area
-from datamodules.images.image_files import image_paths
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
+from tangent_train.io.gpano import tagged_area
+from tangent_train.io.image_files import image_paths
 
 _TRIED = 4
 
@@ -41,7 +40,7 @@ class LabeledFolder(ImageDataModule):
 
     Args:
         test_fraction: Share of the scenes for the test, without lists, see `FolderSplits`;
-            `validation_fraction` is a share of the training scenes.
+            `val_fraction` is a share of the training scenes.
         split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
         depth_units_per_m: Units per meter of integer depth files, 1000 for millimeters.
@@ -77,9 +76,7 @@ class LabeledFolder(ImageDataModule):
             self.root, problems, with_labels=with_labels, with_depth=self.reads_depth
         )
         # Before broken images are left out, so that the splits do not depend on them.
-        division = FolderSplits(
-            self.root, self.test_fraction, self.validation_fraction, self.split_seed
-        )
+        division = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
         splits: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
         # The images are checked even if these checks fail.
         with problems.noted():
@@ -137,7 +134,6 @@ class LabeledFolder(ImageDataModule):
             )
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class FolderPanoramas(LabeledFolder, PanoramaDataModule):
     """User-defined panoramas, with the classes of ``classes.json``.
@@ -162,7 +158,6 @@ class FolderPanoramas(LabeledFolder, PanoramaDataModule):
                 )
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class FolderPhotos(LabeledFolder, PhotoDataModule):
     """User-defined photos, with the classes of ``classes.json``.

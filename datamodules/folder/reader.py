@@ -15,11 +15,11 @@ from datamodules.core.panoramas import ImageFiles, ImageReader, meters_to_steps,
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import FolderCameras
 from datamodules.folder.classes import FolderClasses, read_classes
-from datamodules.images import image_files
-from datamodules.images.masks import Masks
-from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
-from datamodules.images.png import PngHeader, read_png_header
 from tangent_train.errors import DataError, SettingError
+from tangent_train.io import image_files
+from tangent_train.io.masks import Masks
+from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
+from tangent_train.io.png import PngHeader, read_png_header
 
 # Allowed formats of label images. Gray of 1 to 4 bits is ambiguous: the stored numbers, or the gray
 # levels that they stand for. 16 bits with alpha cannot be decoded.

@@ -11,8 +11,8 @@ from lightning.pytorch.utilities import rank_zero_warn
 from datamodules.core.index import SPLITS, Split, draw_groups
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.images.image_files import composed
 from tangent_train.errors import DataError, counted
+from tangent_train.io.image_files import composed
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class FolderSplits:
             all other images are for training. Without ``val.txt``, the validation images are
             drawn from the training images.
         test_fraction: Share of the scenes to draw for the test: at least one, at most all but one.
-        validation_fraction: Share of the training scenes to draw for validation: at least one, at
+        val_fraction: Share of the training scenes to draw for validation: at least one, at
             most all but one; 0 for no validation, even with a list.
         seed: Seed of the draw.
     """
 
     root: Path
     test_fraction: float
-    validation_fraction: float
+    val_fraction: float
     seed: int
 
     def divide(
@@ -60,10 +60,10 @@ class FolderSplits:
             test = self._draw("test", images, rest, self.test_fraction)
         train = self._some("train", listed.get("train", rest - test))
         held: set[str] = set()
-        if self.validation_fraction and "val" in listed:
+        if self.val_fraction and "val" in listed:
             held = self._some("val", listed["val"])
-        elif self.validation_fraction:
-            held = self._draw("val", images, train, self.validation_fraction)
+        elif self.val_fraction:
+            held = self._draw("val", images, train, self.val_fraction)
         chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
         return {split: [f for f in images if f.name in chosen[split]] for split in SPLITS}
 
@@ -116,8 +116,7 @@ class FolderSplits:
                 self.root,
                 found=f"no images for {split}",
                 expected="one or more",
-                remedy=f"Name some in {split}.txt; without validation, set "
-                "data.validation_fraction=0.",
+                remedy=f"Name some in {split}.txt; without validation, set data.val_fraction=0.",
             )
         return names
 

@@ -39,7 +39,6 @@ from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 
 _HERE = Path(__file__).parent
 
@@ -89,7 +88,6 @@ _PUBLISHED = {"train": 7829, "val": 772, "test": 2014}
 _LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Matterport360(PanoramaDataModule):
     """Panoramas of Matterport3D, 20 classes, or 41 with ``release=sfss``.
@@ -147,7 +145,7 @@ class Matterport360(PanoramaDataModule):
             problems.compare_counts(splits, _PUBLISHED)
         else:
             self._compare_lists(splits, problems)
-        given = self.test_split, self.validation_fraction, self.seed
+        given = self.test_split, self.val_fraction, self.seed
         reader = NumberedReader(_TABLES[self.release], units_per_m=4000)
         return reader, published_splits(splits, *given)
 

@@ -34,13 +34,11 @@ from datamodules.modelnet40.shape_samples import (
     normalize_spheres,
 )
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 from tangent_train.rendering import TangentRepresentation
 
 _PER_PROCESS = 40
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class ModelNet40(SplitDataModule[ShapeFile]):
     """Shapes as spheres, for classification.
@@ -50,7 +48,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     Validation takes the same share of the training shapes of every class, drawn from the seed.
 
     Args:
-        shapes_per_step: Shapes per training step and process, and in every step of evaluation.
+        batch_size: Shapes per training step and process, and in every step of evaluation.
         test_rotation: Rotate the test shapes: `yaw` about the vertical, `so3` uniformly over all
             rotations; with the same seed, a shape is rotated equally in every run.
 
@@ -68,7 +66,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
-    shapes_per_step: int = 16
+    batch_size: int = 16
     test_rotation: TestRotation = None
 
     def __post_init__(self) -> None:
@@ -138,9 +136,9 @@ class ModelNet40(SplitDataModule[ShapeFile]):
         Broken meshes are included, so that the draw does not depend on them.
         """
         chosen: set[str] = set()
-        for number, label in enumerate(self.class_names if self.validation_fraction else ()):
+        for number, label in enumerate(self.class_names if self.val_fraction else ()):
             names = [m.name for m in meshes if m.label == label and m.part == "train"]
-            chosen |= draw_groups(names, self.validation_fraction, (self.seed, number))
+            chosen |= draw_groups(names, self.val_fraction, (self.seed, number))
         return chosen
 
 

@@ -26,10 +26,10 @@ from datamodules.core.panorama_pairs import (
 )
 from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
 from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
 from tangent_train.errors import DataError, SettingError
+from tangent_train.io.pixel_files import read_rgb
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _SHORT = 7  # number of hexadecimal digits of a camera printed in the paper

@@ -41,7 +41,6 @@ from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, CLASSES, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -109,8 +108,8 @@ class StanfordAreas(ImageDataModule):
         pictures = [picture for pictures in listed for picture in pictures]
         training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
         rooms: set[tuple[str, str, int]] = set()
-        if self.validation_fraction:
-            rooms = draw_groups((p.room for p in training), self.validation_fraction, self.seed)
+        if self.val_fraction:
+            rooms = draw_groups((p.room for p in training), self.val_fraction, self.seed)
         return self._reader(), {
             "train": [picture.image for picture in training if picture.room not in rooms],
             "val": [picture.image for picture in training if picture.room in rooms],
@@ -135,7 +134,6 @@ class StanfordAreas(ImageDataModule):
         return StanfordReader(LabelTable.from_json(table))
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     """Stanford2D3DS, 13 classes, in the three folds of its authors.
@@ -147,7 +145,6 @@ class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
     group = "pano"
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Stanford2D3DSPerspective(StanfordAreas, PhotoDataModule):
     """The photos of Stanford2D3DS, 13 classes, in the three folds of its authors.

@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panoramas import ImageFiles, PngReader, resize_nearest
-from datamodules.images.pixel_files import read_pixels, read_rgb
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import parse_json, read_json
 from tangent_train.geometry import PanoramaPose, is_camera_matrix
+from tangent_train.io.pixel_files import read_pixels, read_rgb
 
 UNKNOWN = 0
 """Label of pixels without a class, which are ignored in training and evaluation."""

@@ -41,10 +41,9 @@ from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_image_size
 from datamodules.structured3d.classes import CLASS_SETS, CLASSES
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
+from tangent_train.io.pixel_files import read_image_size
 
 INVALID = ("01155", "01192", "01714", "01816", "01852", "03398")
 """Scenes that the errata of the release call invalid; published lists of images hold them."""
@@ -157,11 +156,10 @@ class Structured3DRooms(ImageDataModule):
             )
         if isinstance(self, PanoramaDataModule) and self.invalid_scenes == "keep":
             problems.compare_counts(splits, _PUBLISHED)
-        given = self.test_split, self.validation_fraction, self.seed
+        given = self.test_split, self.val_fraction, self.seed
         return Structured3DReader(_TABLE, units_per_m=1000), published_splits(splits, *given)
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Structured3D(Structured3DRooms, PanoramaDataModule):
     """The panoramas of Structured3D, 40 or 8 classes.
@@ -173,7 +171,6 @@ class Structured3D(Structured3DRooms, PanoramaDataModule):
     place = "panorama/{}"
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Structured3DPerspective(Structured3DRooms, PhotoDataModule):
     """The photos of Structured3D, 40 or 8 classes.

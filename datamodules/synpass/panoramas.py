@@ -36,7 +36,6 @@ from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 
 CLASSES: tuple[str, ...] = (
     *("building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk"),
@@ -63,7 +62,6 @@ _POINT = re.compile(r"MAP_\d+_point\d+")
 _TABLE = number_table(range(1, 1 + len(CLASSES)), [0, 255])
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynPASS(PanoramaDataModule):
     """SynPASS, 22 or 13 classes, with the splits of its folders.
@@ -113,7 +111,7 @@ class SynPASS(PanoramaDataModule):
             known = {_point(files) for images in splits.values() for files in images}
             for time, points in self._times.items():
                 problems.note_absent(f"all_map_{time}_val.txt", points - known)
-        given = self.test_split, self.validation_fraction, self.seed
+        given = self.test_split, self.val_fraction, self.seed
         splits = published_splits(splits, *given)
         if self.time != "all":
             named = self._times[self.time]

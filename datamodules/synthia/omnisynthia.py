@@ -28,7 +28,6 @@ from datamodules.core.problems import Problems
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
 from tangent_train.errors import DataError
-from tangent_train.registry import registered
 
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
 """Available sequences; OmniSYNTHIA uses the summer versions."""
@@ -105,14 +104,14 @@ class SynthiaSequences(ImageDataModule):
                         expected="000000.png and others",
                         remedy=self.remedy,
                     )
-        splits = divide(found, self.test_sequences, self.validation_fraction)
+        splits = divide(found, self.test_sequences, self.val_fraction)
         return reader.SynthiaReader(self.formats), splits
 
 
 def divide(
     frames: Mapping[str, Sequence[Sequence[ImageFiles]]],
     test: Sequence[str],
-    validation_fraction: float,
+    val_fraction: float,
 ) -> dict[Split, list[ImageFiles]]:
     """Assign frames to splits.
 
@@ -122,7 +121,7 @@ def divide(
     Args:
         frames: Images of each frame, by sequence and in order.
         test: Sequences for the test; all others are for training.
-        validation_fraction: Share of each training sequence for validation: at least one frame,
+        val_fraction: Share of each training sequence for validation: at least one frame,
             at most all but one; 0 for no validation.
     """
     splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
@@ -131,14 +130,13 @@ def divide(
         if sequence in test:
             splits["test"] += chain.from_iterable(found)
             continue
-        held = min(max(1, round(validation_fraction * count)), count - 1)
-        last = count - held if validation_fraction else count
+        held = min(max(1, round(val_fraction * count)), count - 1)
+        last = count - held if val_fraction else count
         splits["train"] += chain.from_iterable(found[:last])
         splits["val"] += chain.from_iterable(found[last:])
     return splits
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
@@ -194,7 +192,6 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         ]
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
     """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA.

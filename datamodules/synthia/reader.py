@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
-from datamodules.images.pixel_files import read_pixels
 from tangent_train.errors import DataError, at_least, width_height
+from tangent_train.io.pixel_files import read_pixels
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
 """Front, right, back, left: each rotated by 90° to the right of the previous one."""

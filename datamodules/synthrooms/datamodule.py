@@ -19,7 +19,6 @@ from datamodules.stanford2d3ds.panoramas import (
 )
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import SettingError
-from tangent_train.registry import registered
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -48,7 +47,6 @@ class SynthRoomsAreas(StanfordAreas):
         return super().find(problems)
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
     """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
@@ -58,7 +56,6 @@ class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
     """
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
     """Photos of synthetic rooms, read as those of Stanford2D3DS.

@@ -12,10 +12,8 @@ from datamodules.core.problems import Problems
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.shape_files import ShapeFile
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
-from tangent_train.registry import registered
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class SynthShapes(ModelNet40):
     """Synthetic shapes, generated on first use and read as ModelNet40: no download.

@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
+from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
-from tangent_train.registry import Text, check_fields
 
 _GET_IT = (
     "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "

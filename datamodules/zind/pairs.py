@@ -13,9 +13,9 @@ import numpy as np
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
 from datamodules.core.panoramas import resize_area
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_rgb
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError
+from tangent_train.io.pixel_files import read_rgb
 
 
 @dataclass(eq=False)

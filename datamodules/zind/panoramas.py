@@ -47,12 +47,12 @@ from datamodules.core.index import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Input
 from datamodules.core.panoramas import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_image_size, read_rgb
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
+from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.registry import Text, check_fields, registered
+from tangent_train.io.pixel_files import read_image_size, read_rgb
 
 Doors = Literal["class", "ignore"]
 """Labels of doors: a class, or unknown."""
@@ -91,7 +91,6 @@ class ZindReader(ImageReader):
         return labels
 
 
-@registered
 @dataclass(kw_only=True, eq=False, repr=False)
 class Zind(PanoramaDataModule):
     """ZInD, 5 classes.
@@ -136,7 +135,7 @@ class Zind(PanoramaDataModule):
                 layouts[panorama.name] = panorama.layout()
                 files = ImageFiles(panorama.name, panorama.image(), panorama.file)
                 splits[split].append(files)
-        if not self.validation_fraction:
+        if not self.val_fraction:
             splits["val"] = []
         return ZindReader(layouts, self.doors), splits
 
@@ -153,14 +152,14 @@ class Zind(PanoramaDataModule):
             test = draw_groups(groups, self.test_fraction, [self.split_seed, 0])
         rest = [group for group in groups if group not in test]
         held: set[str] = set()
-        if self.validation_fraction:
-            held = draw_groups(rest, self.validation_fraction, [self.split_seed, 1])
-        if not test or (rest and self.validation_fraction and not held):
+        if self.val_fraction:
+            held = draw_groups(rest, self.val_fraction, [self.split_seed, 1])
+        if not test or (rest and self.val_fraction and not held):
             raise DataError(
                 self.root,
                 found=f"{len(set(groups))} rooms or homes to draw from",
                 expected="some for training, validation and test each",
-                remedy="data.test_fraction=1 takes all for test, data.validation_fraction=0 none "
+                remedy="data.test_fraction=1 takes all for test, data.val_fraction=0 none "
                 "for validation.",
             )
         return ["test" if g in test else "val" if g in held else "train" for g in groups]

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
+from tangent_train.config.build import Text, check_fields, check_plain
 from tangent_train.errors import DataError, first_line
 from tangent_train.files import load_plain, write_text
-from tangent_train.registry import Text, check_fields, check_plain
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """Inputs of a network; equal to `datamodules.core.inputs.Input`, which is slow to import."""

@@ -19,7 +19,6 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.images.gpano import Fill
 from models.onnx_network import OnnxNetwork, graph_checksum
 from tangent_train.checkpoints.content import (
     GROUPS,
@@ -31,9 +30,16 @@ from tangent_train.checkpoints.content import (
 )
 from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
+from tangent_train.config.build import (
+    SettingsFile,
+    Text,
+    build_from_config,
+    check_fields,
+    check_plain,
+)
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import check_sum, crc32_of, load_plain, parse_json
-from tangent_train.registry import SettingsFile, Text, build_from_config, check_fields, check_plain
+from tangent_train.io.gpano import Fill
 
 METADATA_KEY = "tangent_train"
 """Key of the JSON text in an ONNX file's ``metadata_props`` or safetensors' ``__metadata__``."""

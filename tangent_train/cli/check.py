@@ -9,9 +9,9 @@ from typing import Any
 
 from datamodules.core.class_weights import label_doubts
 from tangent_train.cli.run import open_data
+from tangent_train.config.build import build_from_config
 from tangent_train.console import print_text
 from tangent_train.errors import counted
-from tangent_train.registry import build_from_config
 from tangent_train.results.tables import Table, percent
 
 

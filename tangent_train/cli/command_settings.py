@@ -68,14 +68,14 @@ def _check_pattern(name: str, value: Any) -> None:
         raise DataError(value, found="nothing", expected=expected)
 
 
-def _check_class_map(name: str, value: Any) -> None:
+def _check_label_map(name: str, value: Any) -> None:
     if str(value).lower().endswith(".json"):
         _check_exists(name, Path(value))
 
 
 _EXISTS = {"check": _check_exists}
 _IMAGES = {"check": _check_pattern}
-_CLASS_MAP = {"check": _check_class_map}
+_CLASS_MAP = {"check": _check_label_map}
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class InputSettings:
     """Settings of a command that takes images and videos.
 
     Attributes:
-        input: Images, see `datamodules.images.image_files.image_paths`.
+        input: Images, see `tangent_train.io.image_files.image_paths`.
         area: Part of the sphere that panoramas show, see `area_of_angles`; None for the part that
             their GPano tags name.
         every: Step between the frames of a video: 1 for all, n for the first and every n-th one.
@@ -101,7 +101,7 @@ class PredictSettings(InputSettings):
     checkpoint: Path = field(metadata=_EXISTS)
     input: str | Path = field(metadata=_IMAGES)
     output: Path
-    class_map: str | Path | None = field(metadata=_CLASS_MAP)
+    label_map: str | Path | None = field(metadata=_CLASS_MAP)
     unmapped: Literal["unknown", "never"]
     depth: Path | None = field(metadata=_EXISTS)
     depth_scale: float
@@ -126,7 +126,7 @@ class PredictSettings(InputSettings):
     overwrite: bool
     resume: bool
     shard: str | int | None
-    images_per_forward: int | None
+    view_batch_size: int | None
     device: str
     trust: tuple[str, ...]
 
@@ -237,20 +237,20 @@ class TrainSettings(RunSettings):
 
 
 @dataclass(frozen=True)
-class ClassMapSettings:
-    """Class map of an evaluation, see ``configs/evaluate.yaml``."""
+class LabelMapSettings:
+    """Label map of an evaluation, see ``configs/evaluate.yaml``."""
 
-    class_map: str | Path
+    label_map: str | Path
     unmapped: Literal["unknown", "never"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class EvaluateSettings(RunSettings):
-    """See ``configs/evaluate.yaml``; a stage of a transfer may lack a class map."""
+    """See ``configs/evaluate.yaml``; a stage of a transfer may lack a label map."""
 
     network: dict[str, Any] | None = None  # type: ignore[assignment]
     checkpoint: Path = field(metadata=_EXISTS)
-    class_map: str | Path | None = field(default=None, metadata=_CLASS_MAP)
+    label_map: str | Path | None = field(default=None, metadata=_CLASS_MAP)
 
 
 @dataclass(frozen=True, kw_only=True)

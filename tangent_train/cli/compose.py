@@ -16,8 +16,8 @@ from hydra.core.override_parser.types import Quote, QuotedString
 from hydra.errors import HydraException
 
 from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.config.build import without_interpolation
 from tangent_train.files import config_folder
-from tangent_train.registry import without_interpolation
 
 _PLAIN = re.compile(r"(?!(null|true|false|inf|nan)$)[a-z_/][a-z0-9_/.-]*", re.IGNORECASE | re.ASCII)
 """Text that Hydra reads literally without quotes."""

@@ -10,7 +10,7 @@ from tangent_train.cli.command_settings import EvaluateSettings
 from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import run_settings
-from tangent_train.registry import SettingsFile
+from tangent_train.config.build import SettingsFile
 
 
 def evaluate(
@@ -21,16 +21,16 @@ def evaluate(
     """Evaluate a checkpoint on the test fold of its data.
 
     Args:
-        settings: Settings of the run, and ``checkpoint``, ``class_map`` and ``unmapped``. A stage
+        settings: Settings of the run, and ``checkpoint``, ``label_map`` and ``unmapped``. A stage
             of a transfer may lack the last two.
-        source: File that settings come from, see `registry.build_from_config`.
+        source: File that settings come from, see `build_from_config`.
         trained: Network of a file without settings of a run, if it has been loaded.
 
     Raises:
         SettingError: The checkpoint does not fit the data.
     """
     checkpoint = parse_settings(EvaluateSettings, settings).checkpoint
-    mapped = settings.get("class_map") is not None
+    mapped = settings.get("label_map") is not None
     if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}
     if trained is None and (mapped or run_settings(checkpoint) is None):

@@ -24,14 +24,14 @@ from tangent_train.imports import elsewhere
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.trained import TrainedNetwork
-    from tangent_train.inference.photo_networks import PhotoNetwork
+    from tangent_train.photo_networks import PhotoNetwork
 
 
 _OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
 """Settings that only some of the functions `load` take."""
 
 _LIBRARIES = ("torchvision", "huggingface", "smp")
-"""Each a file of `tangent_train.inference.photo_networks` with a function `load`."""
+"""Each a file of `tangent_train.photo_networks` with a function `load`."""
 
 
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
@@ -65,7 +65,7 @@ def import_network(config: Mapping[str, Any]) -> None:
     settings = parse_settings(ImportSettings, config)
     output = settings.output
     with elsewhere():
-        from tangent_train.inference import photo_networks
+        from tangent_train import photo_networks
 
     suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
@@ -110,12 +110,12 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
 def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
     """The network, from the library that the settings name."""
     with elsewhere():
-        from tangent_train.inference.photo_networks import own_files
+        from tangent_train.photo_networks import own_files
 
         name = settings.network
         load: Callable[..., PhotoNetwork] = own_files.load_onnx
         if name in _LIBRARIES:
-            load = import_module(f"tangent_train.inference.photo_networks.{name}").load
+            load = import_module(f"tangent_train.photo_networks.{name}").load
     if name not in (*_LIBRARIES, "onnx"):
         try:
             config: Any = compose("import", [f"+network@section={name}"])

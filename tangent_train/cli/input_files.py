@@ -6,12 +6,12 @@ from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from datamodules.images.image_files import IMAGE_SUFFIXES, image_paths, short_names
-from datamodules.images.videos import VIDEO_SUFFIXES, read_frames, read_video_size
 from tangent_train.cli.command_settings import InputSettings
 from tangent_train.cli.jobs import Job, Shard
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, at_least
+from tangent_train.io.image_files import IMAGE_SUFFIXES, image_paths, short_names
+from tangent_train.io.videos import VIDEO_SUFFIXES, read_frames, read_video_size
 from tangent_train.results.predictions import frame_name
 
 

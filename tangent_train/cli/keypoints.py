@@ -13,17 +13,17 @@ from typing import Any
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
-from datamodules.images.pixel_files import read_image_size
 from tangent_train.cli.command_settings import KeypointSettings
 from tangent_train.cli.settings import parse_settings
+from tangent_train.config.build import build_from_config, check_fields, resolve_target
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import read_json, write_bytes
+from tangent_train.io.pixel_files import read_image_size
 from tangent_train.keypoints.colmap import add_pair
+from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
+from tangent_train.keypoints.report import KeypointReport, matches_png
 from tangent_train.keypoints.two_view import colmap
-from tangent_train.registry import build_from_config, check_fields, resolve_target
-from tangent_train.results.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
-from tangent_train.results.keypoints.report import KeypointReport, matches_png
 
 _IMAGE_SETTINGS = ("left", "right", "input", "pairing")
 

@@ -131,7 +131,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from tangent_train.cli.run_folder import folder_settings
     from tangent_train.cli.setting_names import check_names, declared_settings
     from tangent_train.cli.sweep import in_sweep, run_job
-    from tangent_train.registry import check_arguments
+    from tangent_train.config.build import check_arguments
 
     composed: Any = OmegaConf.to_container(config)
     hydra_settings = OmegaConf.to_container(HydraConfig.instance().cfg)

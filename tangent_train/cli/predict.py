@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.images.masks import Masks
-from datamodules.images.tangent_folders import panorama_area
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
@@ -27,6 +25,8 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.io.masks import Masks
+from tangent_train.io.tangent_folders import panorama_area
 from tangent_train.results.html import EncodedImage
 from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
@@ -37,7 +37,7 @@ from tangent_train.results.predictions import (
 )
 
 _DECISIVE = (
-    "checkpoint", "class_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
+    "checkpoint", "label_map", "unmapped", "depth_scale", "projection", "area", "fov", "views",
     "levels", "base_level", "blend", "rotations", "fill", "upright", "max_tilt_deg", "mask",
     "min_confidence", "min_share", "align", "depth_format", "points", "every",
 )  # fmt: skip
@@ -283,8 +283,8 @@ def _check_unread(settings: PredictSettings) -> None:
         check_unread(settings, "without projection=perspective", fov=None)
     if settings.upright != "auto":
         check_unread(settings, "without upright=auto", max_tilt_deg=60)
-    if settings.class_map is None:
-        check_unread(settings, "without class_map", unmapped="unknown")
+    if settings.label_map is None:
+        check_unread(settings, "without label_map", unmapped="unknown")
 
 
 def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:

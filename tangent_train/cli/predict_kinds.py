@@ -18,19 +18,19 @@ from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.confidences import class_thresholds, count_confidences
 from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage, with_up
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.depth_results import DepthResults
 from tangent_train.results.label_results import LabelResults
 from tangent_train.results.predictions import PredictedImage
 
-_OF_CLASSES = {"class_map": None, "unmapped": "unknown", "min_confidence": 0, "min_share": 0}
+_OF_CLASSES = {"label_map": None, "unmapped": "unknown", "min_confidence": 0, "min_share": 0}
 _OF_DEPTH = {"align": None, "depth_format": None, "points": None}
 
 
@@ -40,7 +40,7 @@ class LabelPrediction:
     Args:
         settings: Settings of the command.
         original: Network with its original classes, which estimates the up direction. The network
-            of `class_map` predicts the labels.
+            of `label_map` predicts the labels.
         views: Views of an image.
 
     Attributes:
@@ -60,14 +60,14 @@ class LabelPrediction:
             check_unread(settings, "without depth files", depth_scale=1000)
         _check_confidence(settings)
         self._settings, self._trained = settings, original
-        if settings.class_map is not None:
-            class_map = load_class_map(settings.class_map)
-            mapped = map_classes(original, class_map, settings.unmapped)
-            print_text(f"Class map {class_map.name}: {mapped}.")
+        if settings.label_map is not None:
+            label_map = load_label_map(settings.label_map)
+            mapped = map_classes(original, label_map, settings.unmapped)
+            print_text(f"Label map {label_map.name}: {mapped}.")
             self._trained = mapped.trained
         # With `min_share`, a threshold of each class replaces it.
         least = 0.0 if settings.min_share else settings.min_confidence
-        how = settings.device, settings.images_per_forward, least
+        how = settings.device, settings.view_batch_size, least
         self._predictor = Predictor(self._trained, views, *how)
         self._judge = NetworkJudge(original, self._predictor.device)
         self._thresholds: NDArray[np.float64] | None = None
@@ -151,7 +151,7 @@ class DepthPrediction:
             check_unread(settings, "without depth files of integers", depth_scale=1000)
         if "points" not in written:
             check_unread(settings, "without points in write", points=None)
-        how = settings.device, settings.images_per_forward, settings.align
+        how = settings.device, settings.view_batch_size, settings.align
         self._predictor = DepthPredictor(trained, views, *how)
 
     def prepare(self, examples: Iterable[Callable[[], InputImage]]) -> None:

@@ -19,9 +19,9 @@ from tangent_train.checkpoints.trained import (
 )
 from tangent_train.cli.run import Run
 from tangent_train.cli.settings import Trust, parse_settings
+from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
-from tangent_train.registry import SettingsFile, build_from_config
 
 _RGB = 3
 _TYPED = re.compile(r"[+~]*network[.@=]")

@@ -11,34 +11,16 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.reader import class_masks
-from datamodules.images.colmap_project import ColmapProject, flat_names
-from datamodules.images.masks import Masks
-from datamodules.images.pixel_files import (
-    LOSSY_SUFFIXES,
-    PIXEL_SUFFIXES,
-    read_image_size,
-    write_pixels,
-)
-from datamodules.images.tangent_folders import (
-    face_name,
-    panorama_area,
-    read_placed,
-    replaced_folder,
-    shrink_to_level,
-    write_tangent_folder,
-)
-from datamodules.images.tangent_results import TangentResults, result_files
 from tangent_train.cli.command_settings import RenderSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, run_jobs
 from tangent_train.cli.settings import check_new, check_unread, parse_settings
+from tangent_train.config.build import build_from_config
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
 from tangent_train.inference.representations import view_settings
-from tangent_train.keypoints.colmap import panorama_poses
-from tangent_train.registry import build_from_config
-from tangent_train.rendering.camera_files import (
+from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,
     CameraFile,
@@ -46,6 +28,24 @@ from tangent_train.rendering.camera_files import (
     read_rig,
     write_poses,
 )
+from tangent_train.io.colmap_project import ColmapProject, flat_names
+from tangent_train.io.masks import Masks
+from tangent_train.io.pixel_files import (
+    LOSSY_SUFFIXES,
+    PIXEL_SUFFIXES,
+    read_image_size,
+    write_pixels,
+)
+from tangent_train.io.tangent_folders import (
+    face_name,
+    panorama_area,
+    read_placed,
+    replaced_folder,
+    shrink_to_level,
+    write_tangent_folder,
+)
+from tangent_train.io.tangent_results import TangentResults, result_files
+from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.rendering.figure import tangent_figure
 
 _Work = Callable[[Job, Callable[[float], object]], Path]

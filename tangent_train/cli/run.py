@@ -24,18 +24,24 @@ from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
-from tangent_train.cli.command_settings import ClassMapSettings
+from tangent_train.cli.command_settings import LabelMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
 from tangent_train.cli.trainer import build_trainer
 from tangent_train.cli.trials import try_network, try_training
+from tangent_train.config.build import (
+    SettingsFile,
+    build_from_config,
+    named_arguments,
+    resolve_target,
+)
+from tangent_train.config.setting_rules import flat_settings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import no_room
-from tangent_train.inference.class_maps import load_class_map, map_classes
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.representations import check_size
-from tangent_train.registry import SettingsFile, build_from_config, named_arguments, resolve_target
 from tangent_train.results.evaluation import (
     confusion_table,
     plain_scores,
@@ -46,7 +52,6 @@ from tangent_train.results.evaluation import (
 from tangent_train.results.html import write_report
 from tangent_train.results.published import Comparison
 from tangent_train.results.record import Record
-from tangent_train.setting_rules import flat_settings
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -64,7 +69,7 @@ class Run:
         data: Data module.
         task: Task.
         trained: Network from a file; None if the network is built from the settings.
-        notes: Notes on the class map of that network.
+        notes: Notes on the label map of that network.
     """
 
     folder: Path
@@ -196,7 +201,7 @@ class Run:
             record,
             protocol={**self.data.facts, **self.task.facts},
             checkpoint=name,
-            class_map=self.settings.get("class_map"),
+            label_map=self.settings.get("label_map"),
             settings=dict(flat_settings(self.settings)),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
@@ -227,7 +232,7 @@ def build(
 
     Args:
         settings: Settings of the run.
-        source: File that settings come from, see `registry.build_from_config`.
+        source: File that settings come from, see `build_from_config`.
         trains: True if the task is trained; else its optimizer and scheduler are not built.
 
     Returns:
@@ -275,7 +280,7 @@ def open_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -
 
     Args:
         settings: Settings of the run.
-        source: File that settings come from, see `registry.build_from_config`.
+        source: File that settings come from, see `build_from_config`.
     """
     representation = build_from_config(settings["representation"], "representation", source)
     task, data_set = (resolve_target(settings[s], s, source) for s in ("task", "data"))
@@ -292,26 +297,26 @@ def build_trained(
     """Build the data module and the task that evaluate a network from a file.
 
     Args:
-        settings: Settings of the evaluation; ``class_map`` and ``unmapped`` are optional.
+        settings: Settings of the evaluation; ``label_map`` and ``unmapped`` are optional.
         trained: Network to evaluate.
-        source: File that settings come from, see `registry.build_from_config`.
+        source: File that settings come from, see `build_from_config`.
 
     Returns:
-        Data module, task, and notes on the class map.
+        Data module, task, and notes on the label map.
 
     Raises:
-        SettingError: The network does not fit the data, or the class map fits neither of them.
+        SettingError: The network does not fit the data, or the label map fits neither of them.
     """
     task = resolve_target(settings["task"], "task", source)
     remedy = "Choose the task of the network: task=segmentation for classes, task=depth for depth."
     trained.check_predicts(getattr(task, "predicts", ""), remedy)
     data = build_data(settings, source)
     notes = []
-    if settings.get("class_map") is not None:
-        parsed = parse_settings(ClassMapSettings, settings)
-        class_map = load_class_map(parsed.class_map)
-        mapped = map_classes(trained, class_map, parsed.unmapped, data.class_names[1:])
-        trained, notes = mapped.trained, [f"Class map {class_map.name}: {mapped}."]
+    if settings.get("label_map") is not None:
+        parsed = parse_settings(LabelMapSettings, settings)
+        label_map = load_label_map(parsed.label_map)
+        mapped = map_classes(trained, label_map, parsed.unmapped, data.class_names[1:])
+        trained, notes = mapped.trained, [f"Label map {label_map.name}: {mapped}."]
     check_fits(data, inputs_and_classes(trained), settings["checkpoint"])
     check_size(trained, data.representation.image_size)
     task = _build_task(settings, data, trained.network, source, trains=False)
@@ -335,7 +340,7 @@ def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
                 f"data, for {name}",
                 found=f"{field.replace('_', ' ')} {value}",
                 expected=f"{network[field]}, which the network was trained with",
-                remedy="Map classes with class_map=." if field == "class_names" else "",
+                remedy="Map classes with label_map=." if field == "class_names" else "",
             )
 
 

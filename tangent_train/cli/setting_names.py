@@ -12,9 +12,9 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 
 from tangent_train.cli.command_settings import SETTINGS
+from tangent_train.config.build import nearest
 from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
-from tangent_train.registry import nearest
 
 _COMPLETED = "fine_tuning.optimizer"
 """A section that is completed with the settings of ``optimizer`` and may have any of these."""

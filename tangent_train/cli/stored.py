@@ -18,10 +18,10 @@ from tangent_train.cli.command_settings import RunSettings
 from tangent_train.cli.compose import path_text, quoted, values_of_sweep
 from tangent_train.cli.remembered import remembered_settings
 from tangent_train.cli.settings import Trust, names_of, parse_settings
+from tangent_train.config.build import SettingsFile, Text, check_fields
+from tangent_train.config.setting_rules import from_file
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import config_folder
-from tangent_train.registry import SettingsFile, Text, check_fields
-from tangent_train.setting_rules import from_file
 
 _DECLARED = get_type_hints(RunSettings)
 _SECTIONS = {
@@ -198,9 +198,11 @@ class StoredNetwork:
         if "inputs" in composed["data"]:  # images, not shapes
             known = {name: v for name, v in of_network.items() if f"data.{name}" not in typed}
             settings["data"] = dict(composed["data"]) | known
-        if "task.images_per_forward" not in typed:  # photo networks have many classes, large images
+        if (
+            "task.eval_view_batch_size" not in typed
+        ):  # photo networks have many classes, large images
             count = views_per_forward(trained.image_size)
-            settings["task"] = dict(composed["task"]) | {"images_per_forward": count}
+            settings["task"] = dict(composed["task"]) | {"eval_view_batch_size": count}
         of_user = (composed.keys() - {"network", "representation"}) | typed
         return settings, SettingsFile(self.path, trust, of_user), trained
 
@@ -303,11 +305,11 @@ def _check_evaluation(path: Path, typed: set[str], *, is_run: bool) -> None:
             "data",
             found=f"none, and {path} has no settings of a run",
             expected="the data set to evaluate it on: data=stanford2d3ds data.root=…",
-            remedy="Map the network's classes to those of the data with class_map=.",
+            remedy="Map the network's classes to those of the data with label_map=.",
         )
     for name in sorted(typed):
         section = name.partition(".")[0]
-        if section == "network" and (not is_run or "class_map" in typed):
+        if section == "network" and (not is_run or "label_map" in typed):
             raise SettingError(name, found="a value", expected=f"none: the network is in {path}")
         if section in _NOT_EVALUATED:
             expected = "none: tangent-evaluate does not train"

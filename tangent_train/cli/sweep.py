@@ -17,10 +17,10 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.processes import command_line, run_process
+from tangent_train.config.build import resolve_target
 from tangent_train.errors import SettingError
 from tangent_train.files import parse_json
 from tangent_train.imports import elsewhere
-from tangent_train.registry import resolve_target
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
@@ -54,9 +54,9 @@ def run_job(
     """
     hydra = HydraConfig.get()
     searches = not hydra.sweeper["_target_"].endswith("BasicSweeper")
-    if searches and not config.get("data", {}).get("validation_fraction"):
+    if searches and not config.get("data", {}).get("val_fraction"):
         raise SettingError(
-            "data.validation_fraction",
+            "data.val_fraction",
             found="no validation split, in a sweep that searches the best validation score",
             expected="more than 0: runs are not compared on the test fold",
         )

@@ -31,11 +31,11 @@ from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.cli.stored import is_own_option
 from tangent_train.cli.sweep import OBJECTIVE_FILE
+from tangent_train.config.build import SettingsFile
+from tangent_train.config.setting_rules import differing_settings, flat_settings, from_file
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import atomic_path, write_text
-from tangent_train.registry import SettingsFile
-from tangent_train.setting_rules import differing_settings, flat_settings, from_file
 
 
 def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> float | None:
@@ -45,7 +45,7 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
 
     Args:
         settings: Composed ``train.yaml``, or the settings of a resumed run.
-        source: File that settings come from, see `registry.build_from_config`.
+        source: File that settings come from, see `build_from_config`.
 
     Returns:
         Best validation score, which sweeps compare; None without a validation split.

@@ -15,9 +15,9 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointCo
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.pictures import ValidationPictures
 from tangent_train.callbacks.progress import ProgressBar
+from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.setting_rules import flat_settings
 from tangent_train.errors import SettingError, at_least
-from tangent_train.registry import SettingsFile, build_from_config
-from tangent_train.setting_rules import flat_settings
 
 _SET_ELSEWHERE = {
     "callbacks": "Use the group of callbacks: '+callbacks.mine={_target_: my.Callback}'.",

@@ -18,10 +18,10 @@ from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
 from tangent_train.cli.transfer_views import views_of
+from tangent_train.config.build import check_fields, without_interpolation
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.imports import elsewhere
-from tangent_train.registry import check_fields, without_interpolation
 
 _ONLY_FOR_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
 

@@ -12,7 +12,7 @@ S-level-n    P, tested on panoramas of level n (study of the angular resolution)
 
 Besides the files of a run, a stage's folder contains ``stage.yaml``, its config for
 ``tangent-train`` or ``tangent-evaluate``, and ``stage.digest``, a digest of the checkpoint that it
-starts from and of its class map.
+starts from and of its label map.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.cli.setting_names import declared_settings
 from tangent_train.cli.transfer_views import conditions_of, numbers
+from tangent_train.config.build import without_interpolation
+from tangent_train.config.setting_rules import differing_settings
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import write_text
-from tangent_train.registry import without_interpolation
-from tangent_train.setting_rules import differing_settings
 
 State = Literal["new", "begun", "finished"]
 """Progress of a stage. A stage that only evaluates is either new or finished."""
@@ -82,10 +82,10 @@ def plan(config: DictConfig, folder: Path, views: Mapping[str, Mapping[str, Any]
     Raises:
         SettingError: A setting of the transfer is invalid.
     """
-    if config.class_map is not None and config.checkpoint is None:
+    if config.label_map is not None and config.checkpoint is None:
         raise SettingError(
-            "class_map",
-            found=config.class_map,
+            "label_map",
+            found=config.label_map,
             expected="null for a network that is trained here, on the classes of the data",
         )
     fold = config.data.get("fold")
@@ -173,8 +173,8 @@ class _Planner:
         command: Literal["train", "evaluate"] = "evaluate",
     ) -> Stage:
         declared = declared_settings(command).keys() - {"checkpoint"}
-        if settings["class_map"] is None:
-            declared -= {"class_map", "unmapped"}
+        if settings["label_map"] is None:
+            declared -= {"label_map", "unmapped"}
         config = {key: value for key, value in settings.items() if key in declared}
         config |= {"name": f"{settings['name']}/{name}", "init_from": None, "resume": None}
         if name[0] == "P":
@@ -229,8 +229,8 @@ def stage_state(stage: Stage) -> State:
     if weights and weights.is_file() and known != _digest(weights, stage.config).encode():
         raise SettingError(
             stage.folder,
-            found=f"stage {stage.name} of another network, or with another class map",
-            expected=f"the network in {weights} and this class map",
+            found=f"stage {stage.name} of another network, or with another label map",
+            expected=f"the network in {weights} and this label map",
             remedy=_REMEDY,
         )
     return "finished" if finished else "begun"
@@ -288,9 +288,9 @@ def stage_command(stage: Stage) -> list[str]:
 
 
 def _digest(weights: Path, config: Mapping[str, Any]) -> str:
-    """Hash the network's file and, if there is one, the file of the class map."""
-    class_map = str(config.get("class_map") or "")
-    map_files = [Path(class_map)] if class_map.lower().endswith(".json") else []
+    """Hash the network's file and, if there is one, the file of the label map."""
+    label_map = str(config.get("label_map") or "")
+    map_files = [Path(label_map)] if label_map.lower().endswith(".json") else []
     digest = hashlib.blake2b()
     for path in (weights, *map_files):
         with path.open("rb") as file:

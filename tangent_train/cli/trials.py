@@ -101,12 +101,12 @@ def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
         per_step = f"data.{data.noun}_per_step"
         is_whole = len(chunk) == len(step)
         raise SettingError(
-            per_step if is_whole else "task.images_per_chunk",
-            found=f"{data.per_step if is_whole else probe.images_per_chunk}, so that in a step of "
+            per_step if is_whole else "task.view_batch_size",
+            found=f"{data.per_step if is_whole else probe.view_batch_size}, so that in a step of "
             f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {shape}, on which "
             f"it cannot be trained ({fault})",
             expected="more images at a time, including the last step of an epoch",
-            remedy=f"Change {per_step} or task.images_per_chunk, or choose a network without batch "
+            remedy=f"Change {per_step} or task.view_batch_size, or choose a network without batch "
             "normalization.",
         )
 

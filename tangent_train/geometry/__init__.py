@@ -36,10 +36,10 @@ from tangent_train.geometry.equirect import (
     nearest_level,
 )
 from tangent_train.geometry.grid import TangentGrid
+from tangent_train.geometry.horizontal import RingGrid
 from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
 from tangent_train.geometry.panorama_pose import PanoramaPose
 from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.ring import RingGrid
 from tangent_train.geometry.sphere import (
     FLIP_Y,
     checked_rotation,

@@ -1,4 +1,4 @@
-"""Pinhole images around a common center: the base of tangent images, cube faces and level views."""
+"""Pinhole images around a common center: base of tangent images, cube faces and rings."""
 
 from __future__ import annotations
 

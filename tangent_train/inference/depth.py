@@ -142,7 +142,7 @@ class DepthPredictor(ViewPredictor):
         trained: See `ViewPredictor`; a depth network.
         view_sets: Selects the views of an image.
         device: See `ViewPredictor`.
-        images_per_forward: See `ViewPredictor`.
+        view_batch_size: See `ViewPredictor`.
         align: See `combine_depth`.
 
     Raises:
@@ -154,11 +154,11 @@ class DepthPredictor(ViewPredictor):
         trained: TrainedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
-        images_per_forward: int | None = None,
+        view_batch_size: int | None = None,
         align: Align | None = None,
     ) -> None:
         check_align("align", align, getattr(view_sets, "representation", None))
-        super().__init__(trained, view_sets, device, images_per_forward)
+        super().__init__(trained, view_sets, device, view_batch_size)
         self._kind: Any = trained.depth_kind
         self._align = align
 

@@ -212,7 +212,7 @@ class ViewPredictor:
         trained: The network; it is moved to the device.
         view_sets: Selects the views of an image.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
-        images_per_forward: Number of views per call of the network, which limits memory; None for
+        view_batch_size: Number of views per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
             a panorama at once, and their scores are kept in memory.
 
@@ -220,7 +220,7 @@ class ViewPredictor:
         device: Device of the network, the views and the mosaic.
 
     Raises:
-        SettingError: The device does not exist, or `images_per_forward` is less than 1.
+        SettingError: The device does not exist, or `view_batch_size` is less than 1.
     """
 
     def __init__(
@@ -228,7 +228,7 @@ class ViewPredictor:
         trained: TrainedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
-        images_per_forward: int | None = None,
+        view_batch_size: int | None = None,
     ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -240,13 +240,13 @@ class ViewPredictor:
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
             ) from error
         self._per_forward = views_per_forward(view_sets.image_size)
-        if images_per_forward is not None:
-            self._per_forward = at_least("images_per_forward", images_per_forward, 1)
+        if view_batch_size is not None:
+            self._per_forward = at_least("view_batch_size", view_batch_size, 1)
         aware = getattr(view_sets, "distortion_aware", None)
         network: Any = network_for_views(trained.network, aware)
         self._sees_rays = sees_rays(network)
         if self._sees_rays:
-            network = partial(network, images_per_chunk=self._per_forward)
+            network = partial(network, view_batch_size=self._per_forward)
         self._network, self._trained, self._view_sets = network, trained, view_sets
 
     def _sets(self, image: InputImage) -> list[ViewSet]:
@@ -277,7 +277,7 @@ class Predictor(ViewPredictor):
         trained: See `ViewPredictor`.
         view_sets: Selects the views of an image.
         device: See `ViewPredictor`.
-        images_per_forward: See `ViewPredictor`.
+        view_batch_size: See `ViewPredictor`.
         min_confidence: Pixels with a lower confidence, from 0 to 1, are unknown.
 
     Raises:
@@ -289,12 +289,12 @@ class Predictor(ViewPredictor):
         trained: TrainedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
-        images_per_forward: int | None = None,
+        view_batch_size: int | None = None,
         min_confidence: float = 0.0,
     ) -> None:
         if not 0 <= min_confidence <= 1:
             raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
-        super().__init__(trained, view_sets, device, images_per_forward)
+        super().__init__(trained, view_sets, device, view_batch_size)
         self._min_confidence = min_confidence
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
 

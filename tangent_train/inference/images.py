@@ -13,14 +13,14 @@ from PIL import Image
 from torch import Tensor
 
 from datamodules.core.panoramas import meters_to_steps, resize_depth, resize_nearest
-from datamodules.images.gpano import PanoramaArea, read_up, whole_area
-from datamodules.images.image_files import NamedFiles, find_depth
-from datamodules.images.pixel_files import photo_fov_deg, read_depth_m, read_rgb
-from datamodules.images.tangent_folders import panorama_area
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.io.gpano import PanoramaArea, read_up, whole_area
+from tangent_train.io.image_files import NamedFiles, find_depth
+from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
+from tangent_train.io.tangent_folders import panorama_area
+from tangent_train.orientation.gravity import estimate_up
 from tangent_train.rendering.resampling import resize
-from tangent_train.rendering.upright.gravity import estimate_up
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -20,8 +20,8 @@ from tangent_train.inference.engine import (
 )
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
+from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
-from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -84,7 +84,7 @@ class NetworkJudge:
         if not self._takes_own_views:
             views = views[:4]  # of a cube, without up and down
         if sees_rays(network):
-            network = partial(network, images_per_chunk=per_forward)
+            network = partial(network, view_batch_size=per_forward)
             rays = torch.from_numpy(representation.view_sets()[0].rays()).to(self.device)
         found = [
             1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))

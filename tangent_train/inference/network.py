@@ -15,13 +15,9 @@ from torch import Tensor
 from datamodules.core.image_module import Upright
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.panoramas import meters_to_steps
-from datamodules.images.gpano import Fill
-from datamodules.images.masks import Mask, Masks
-from datamodules.images.palette import class_colors
 from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
 from tangent_train.errors import SettingError, width_height
-from tangent_train.inference.class_maps import Unmapped, load_class_map, map_classes
 from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import (
@@ -33,7 +29,11 @@ from tangent_train.inference.images import (
     with_up,
 )
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
 from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews, ViewChoice
+from tangent_train.io.gpano import Fill
+from tangent_train.io.masks import Mask, Masks
+from tangent_train.io.palette import class_colors
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 
@@ -46,7 +46,7 @@ _SHOWN = 6
 def load(
     path: str | Path,
     *,
-    class_map: str | Path | None = None,
+    label_map: str | Path | None = None,
     unmapped: Unmapped = "unknown",
     device: str = "cpu",
     levels: Levels = None,
@@ -55,7 +55,7 @@ def load(
     rotations: int = 1,
     views: ViewChoice = None,
     fill: Fill | None = None,
-    images_per_forward: int | None = None,
+    view_batch_size: int | None = None,
     min_confidence: float = 0.0,
     align: Align | None = None,
     trust: str | Sequence[str] = (),
@@ -66,8 +66,8 @@ def load(
 
     Args:
         path: A checkpoint, or a file written by ``tangent-export`` or ``tangent-import``.
-        class_map: Map to the classes of another data set: its name or a JSON file, see
-            `class_maps.load_class_map`.
+        label_map: Map to the classes of another data set: its name or a JSON file, see
+            `label_maps.load_label_map`.
         unmapped: Treatment of classes that are not in the map: ``unknown`` gives label 0 where they
             win; with ``never`` they cannot win.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
@@ -76,12 +76,12 @@ def load(
         base_level: Base level b of the tangent images; None as trained.
         blend: Blending of overlapping images.
         rotations: Number of rotations about the vertical to average over; 1 for photos.
-        views: Views of panoramas: an option of ``representation=``, such as ``ring``; or with
-            changed settings, ``{"option": "ring", "fov": 110}``. None as trained.
+        views: Views of panoramas: an option of ``representation=``, such as ``horizontal``; or with
+            changed settings, ``{"option": "horizontal", "fov": 110}``. None as trained.
         fill: Colors outside the area of a partial panorama, in views that leave it: black, the mean
             color (``mean``), the nearest pixel (``edge``) or the mirrored image (``reflect``). None
             as trained.
-        images_per_forward: Number of images per call of the network, which limits memory; None for
+        view_batch_size: Number of images per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels.
         min_confidence: Pixels with a lower confidence get the label 0.
         align: Correction of the views of a depth network: ``none``, ``scale``, ``affine`` (a scale
@@ -98,12 +98,12 @@ def load(
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
-    if class_map is None:
-        _check_unset("unmapped", unmapped, "unknown", "without class_map")
+    if label_map is None:
+        _check_unset("unmapped", unmapped, "unknown", "without label_map")
     else:
-        trained = map_classes(original, load_class_map(class_map), unmapped).trained
+        trained = map_classes(original, load_label_map(label_map), unmapped).trained
     chosen = trained, levels, base_level, blend, rotations
-    how = device, images_per_forward
+    how = device, view_batch_size
     predictor: Any
     if trained.predicts == DISTANCE:
         _check_unset("min_confidence", min_confidence, 0, "for depth networks")

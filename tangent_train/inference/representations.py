@@ -12,11 +12,12 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
+from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
 from tangent_train.geometry import PinholeGrid, SphereArea, TangentGrid
 from tangent_train.inference.images import InputImage
-from tangent_train.registry import SettingsFile, build_from_config
+from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import (
     EquirectRepresentation,
     IcosphereRepresentation,
@@ -25,13 +26,12 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
 from tangent_train.rendering.representations.views import PinholeViews
-from tangent_train.rendering.upright.gravity import upright_rotation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from datamodules.images.gpano import Fill
     from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.io.gpano import Fill
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
 
@@ -39,8 +39,8 @@ Levels = int | Sequence[int] | None
 """A level s, which sets the angular resolution, or several to average over; None as trained."""
 
 ViewChoice = str | Mapping[str, Any] | None
-"""Views of panoramas: an option of the configs of representations, such as ``ring``; or its name as
-``option``, with changed settings of the representation. None as trained."""
+"""Views of panoramas: an option of the configs of representations, such as ``horizontal``; or its name
+as ``option``, with changed settings of the representation. None as trained."""
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
@@ -50,7 +50,7 @@ _ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
 _NOT_VIEWS = "icosphere", "perspective"
 """Options of the configs of representations that are not views for networks of photos."""
 
-_VIEWS = "ring_wide"
+_VIEWS = "horizontal_wide"
 """Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
 
 _BASE_LEVEL = 1
@@ -284,8 +284,8 @@ def photo_network_settings(
         levels: See `Levels`; None for `wide_levels` of tangent images, and for the first of these
             of other views.
         base_level: Base level b of tangent images; None for the fewest images.
-        views: See `ViewChoice`; None for `ring_wide`, or tangent images if levels or base level are
-            given.
+        views: See `ViewChoice`; None for `horizontal_wide`, or tangent images if levels or base
+            level are given.
 
     Raises:
         SettingError: The views do not have these settings.

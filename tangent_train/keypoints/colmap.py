@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from tangent_train.io.camera_files import RigFile
     from tangent_train.keypoints.spherical import SphericalKeypoints
     from tangent_train.keypoints.two_view import TwoView
-    from tangent_train.rendering import RigFile
 
 
 def add_pair(

@@ -1,52 +1,36 @@
-"""Render equirectangular panoramas to tangent images, level views or cube faces, and back.
+"""Render equirectangular panoramas to tangent images, horizontal views or cube faces, and back.
 
 NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on any device, labels
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
 from tangent_train.rendering.backward import tangent_to_equirect, tangent_to_labels
-from tangent_train.rendering.camera_files import (
-    CameraFile,
-    RigFile,
-    read_cameras,
-    read_rig,
-    write_cameras,
-    write_poses,
-    write_rig,
-)
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, equirect_to_tangent, rotate_equirect
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
+from tangent_train.rendering.representations.horizontal import HorizontalRepresentation
 from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
     TangentRepresentation,
 )
-from tangent_train.rendering.representations.ring import RingRepresentation
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [
     "Blend",
-    "CameraFile",
     "CubemapRepresentation",
     "EquirectRepresentation",
+    "HorizontalRepresentation",
     "IcosphereRepresentation",
     "Interpolation",
     "PerspectiveRepresentation",
     "Representation",
-    "RigFile",
-    "RingRepresentation",
     "TangentRepresentation",
     "equirect_to_tangent",
-    "read_cameras",
-    "read_rig",
     "rotate_equirect",
     "set_table_cache_limit",
     "tangent_to_equirect",
     "tangent_to_labels",
-    "write_cameras",
-    "write_poses",
-    "write_rig",
 ]

@@ -137,8 +137,8 @@ def _facts(records: Sequence[Record], shown: Sequence[str] = ()) -> dict[str, st
         facts["rotated in training / test"] = " / ".join(
             _ROTATIONS.get(r, str(r)) for r in rotations
         )
-    if record.class_map is not None:
-        facts["class map"] = record.class_map
+    if record.label_map is not None:
+        facts["label map"] = record.label_map
     folds = [str(fold) for fold in dict.fromkeys(r.fold for r in records) if fold is not None]
     return facts | {"folds": ", ".join(folds) or "–", "runs": str(len(records))}
 

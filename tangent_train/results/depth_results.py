@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
 from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
 from tangent_train.results.pictures import colorize_distance, distance_limits, distance_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
 from tangent_train.results.tables import Table

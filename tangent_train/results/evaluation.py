@@ -189,7 +189,7 @@ def write_results(
         published: Tables of published scores in ``results.md``.
     """
     write_text(folder / RESULTS_FILE, record.json())
-    network = {"checkpoint": record.checkpoint, "class_map": record.class_map}
+    network = {"checkpoint": record.checkpoint, "label_map": record.label_map}
     lines = [{**entry, **network} for entry in record.classes or [record.means]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in (*result_tables(record), *published))

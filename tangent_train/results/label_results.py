@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from datamodules.images.pixel_files import array_file, read_pixels, write_pixels
+from tangent_train.io.pixel_files import array_file, read_pixels, write_pixels
 from tangent_train.results.pictures import colorize, mixed_picture, overlay_picture
 from tangent_train.results.predictions import Entry, ImageResults, PredictedImage, solid_angles
 from tangent_train.results.tables import Table, percent
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from datamodules.images.gpano import PanoramaArea
+    from tangent_train.io.gpano import PanoramaArea
     from tangent_train.rendering.mosaic import ScoreMosaic
     from tangent_train.results.predictions import Painter
 

@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import PanoramaArea, black_outside
-from datamodules.images.palette import class_colors, distance_colors
+from tangent_train.io.gpano import PanoramaArea, black_outside
+from tangent_train.io.palette import class_colors, distance_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]

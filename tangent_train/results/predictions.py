@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 
 from datamodules.folder.classes import UNKNOWN_NAME
-from datamodules.images.image_files import composed
-from datamodules.images.videos import write_video
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
+from tangent_train.io.image_files import composed
+from tangent_train.io.videos import write_video
 from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.tables import Table
 

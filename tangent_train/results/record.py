@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from tangent_train.checkpoints.content import INPUTS, read_settings
+from tangent_train.config.build import Text, check_fields
+from tangent_train.config.setting_rules import flat_settings
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.metrics.segmentation import Interval
-from tangent_train.registry import Text, check_fields
-from tangent_train.setting_rules import flat_settings
 
 RESULTS_FILE = "results.json"
 
@@ -102,7 +102,7 @@ _FIELDS = {
     "intervals": dict[str, list[float]],
     "protocol": dict[str, Text],
     "checkpoint": Text,
-    "class_map": Text | None,
+    "label_map": Text | None,
 }
 _HEADING: dict[str, Any] = dict.fromkeys(Heading._fields, Text) | {"is_main": bool}
 _EXPECTED = "results written by tangent-train or tangent-evaluate"
@@ -126,7 +126,7 @@ class Record:
         intervals: 95 % bootstrap intervals over the images, for means that have one.
         protocol: Facts that make scores comparable, see `results.published`.
         checkpoint: File of the network, relative to the run folder if it is inside.
-        class_map: File or name of the map to the classes of the data; None without a map.
+        label_map: File or name of the map to the classes of the data; None without a map.
         settings: Resolved config of the run, with names ``section.setting``.
         folder: Run folder.
     """
@@ -142,7 +142,7 @@ class Record:
     intervals: Mapping[str, Interval] = field(default_factory=dict)
     protocol: Mapping[str, str] = field(default_factory=dict)
     checkpoint: str = ""
-    class_map: str | None = None
+    label_map: str | None = None
     settings: Mapping[str, Any] = field(default_factory=dict)
     folder: Path = Path()
 

@@ -15,10 +15,10 @@ from dataclasses import dataclass, field, replace
 from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
+from tangent_train.config.setting_rules import may_differ
 from tangent_train.errors import DataError
 from tangent_train.metrics.segmentation import Interval
 from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Band, Record
-from tangent_train.setting_rules import may_differ
 
 
 class Statistic(NamedTuple):

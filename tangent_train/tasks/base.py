@@ -50,7 +50,7 @@ class Task(lightning.LightningModule, ABC):
         scheduler: `Schedule`, or a function that builds a learning rate scheduler from the
             optimizer, stepped every epoch; None for a constant rate.
         label_smoothing: Fraction of the target that is spread over all classes.
-        images_per_chunk: Largest number of images per forward pass in training, which bounds
+        view_batch_size: Largest number of images per forward pass in training, which bounds
             memory; None for the whole batch. Batch normalization uses one chunk at a time; chunks
             are even.
         channels_last: True to store network and images channels last, often faster.
@@ -93,7 +93,7 @@ class Task(lightning.LightningModule, ABC):
         optimizer: Callable[..., Optimizer] | None,
         scheduler: Schedule | Callable[..., LRScheduler] | None = None,
         label_smoothing: float = 0.0,
-        images_per_chunk: int | None = None,
+        view_batch_size: int | None = None,
         channels_last: bool = False,
         compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
         frozen: Sequence[str] = (),
@@ -102,8 +102,8 @@ class Task(lightning.LightningModule, ABC):
         super().__init__()
         if not 0 <= label_smoothing < 1:
             raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
-        if images_per_chunk is not None:
-            at_least("task.images_per_chunk", images_per_chunk, 1)
+        if view_batch_size is not None:
+            at_least("task.view_batch_size", view_batch_size, 1)
         if not (isinstance(backbone_lr_factor, int | float) and 0 < backbone_lr_factor < math.inf):
             raise SettingError(
                 "task.backbone_lr_factor",
@@ -122,7 +122,7 @@ class Task(lightning.LightningModule, ABC):
         is_complete = scheduler is None or isinstance(scheduler, Schedule)
         self.schedule: Any = scheduler if is_complete else Schedule(scheduler)  # type: ignore[arg-type]
         self.label_smoothing = label_smoothing
-        self.images_per_chunk = images_per_chunk
+        self.view_batch_size = view_batch_size
         self.backbone_lr_factor = backbone_lr_factor
         self.fresh: Collection[str] | None = None
         # A tuple: in a `ModuleList`, their tensors would have second names.
@@ -283,14 +283,14 @@ class Task(lightning.LightningModule, ABC):
         return [((chunk,), labels) for chunk, labels in zip(chunks, chunk_labels, strict=True)]
 
     def chunks(self, inputs: Tensor) -> tuple[Tensor, ...]:
-        """Divide inputs into even chunks of at most `images_per_chunk` images, at least one input.
+        """Divide inputs into even chunks of at most `view_batch_size` images, at least one input.
 
         Batch normalization fails on a single value per channel: 20 images in chunks of at most 19
         are divided into 10 and 10, not 19 and 1.
         """
-        if self.images_per_chunk is None:
+        if self.view_batch_size is None:
             return (inputs,)
-        size = max(1, self.images_per_chunk // inputs.shape[1:-3].numel())
+        size = max(1, self.view_batch_size // inputs.shape[1:-3].numel())
         return torch.tensor_split(inputs, -(-len(inputs) // size))
 
     def on_train_start(self) -> None:

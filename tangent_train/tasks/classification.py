@@ -13,18 +13,16 @@ from torch.nn import functional
 
 from datamodules.core.labels import IMAGE_CLASS
 from tangent_train.metrics.classification import ClassificationMetric, classification_scores
-from tangent_train.registry import registered
 from tangent_train.results.evaluation import class_entries
 from tangent_train.results.record import Heading, Record
 from tangent_train.tasks.base import Task
 
 
-@registered
 class ClassificationTask(Task):
     """Trains a network that classifies a shape by all views of its sphere (paper, section 4.1).
 
     The loss is the mean cross-entropy over the shapes of the batch on all processes; with
-    `images_per_chunk`, in chunks of whole shapes. The arguments are those of `Task`; the network is
+    `view_batch_size`, in chunks of whole shapes. The arguments are those of `Task`; the network is
     a module ``(B, N, C, h, w) -> (B, K)`` that takes N views of each of B shapes.
 
     Attributes:

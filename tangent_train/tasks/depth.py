@@ -39,7 +39,6 @@ from tangent_train.metrics.depth import (
     mean_depth_scores,
     scaled_and_shifted,
 )
-from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.results.evaluation import latitude_entries
 from tangent_train.results.html.page import EncodedImage, encode_image
@@ -53,7 +52,6 @@ _LEAST = 1e-3
 """Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
 
 
-@registered
 class DepthTask(ViewsTask):
     """Trains a network that predicts distances, and scores whole panoramas or photos.
 
@@ -209,7 +207,7 @@ class DepthTask(ViewsTask):
         if truth.ndim == 2:
             return self.protocol.aligned(self._of_panorama(sample, truth), truth), truth
         lengths = sample.ray_lengths
-        parts = view_scores(self, sample.images.__getitem__, len(truth), self.images_per_forward)
+        parts = view_scores(self, sample.images.__getitem__, len(truth), self.eval_view_batch_size)
         depth = torch.cat([scores for _, scores in parts])
         if not self.is_tested:
             self._add_loss(depth, truth, lengths)
@@ -225,7 +223,7 @@ class DepthTask(ViewsTask):
         """Predict the distances of a panorama from its views, which are aligned with each other."""
         area = SphereArea.of_numbers(sample.area.cpu().numpy())
         sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area)
-        outputs = list(scored_views(self, sets, self.images_per_forward))
+        outputs = list(scored_views(self, sets, self.eval_view_batch_size))
         for views, depth in [] if self.is_tested else outputs:
             lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
             self._add_loss(depth, labels_of_views(truth, views), lengths)

@@ -17,7 +17,6 @@ from torch.optim.lr_scheduler import (
 )
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.registry import registered
 from tangent_train.tasks.parameter_groups import rates_of
 
 
@@ -162,7 +161,6 @@ class Schedule:
         return getattr(self.build, "keywords", {}).get(name, "") is None
 
 
-@registered
 def warmup_cosine(
     optimizer: Any,
     total_steps: int,

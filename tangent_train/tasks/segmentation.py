@@ -28,7 +28,6 @@ from tangent_train.metrics.segmentation import (
     mean_scores,
     segmentation_scores,
 )
-from tangent_train.registry import registered
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.evaluation import class_entries, latitude_entries
@@ -41,7 +40,6 @@ from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_
 from tangent_train.tasks.views import ViewsTask, labels_of_views
 
 
-@registered
 class SegmentationTask(ViewsTask):
     """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
 
@@ -142,7 +140,7 @@ class SegmentationTask(ViewsTask):
         if len(shape) > 2:  # crops, each separately
             best = images.new_empty(shape, dtype=torch.int64)
             for part, scores in view_scores(
-                self, images.__getitem__, len(images), self.images_per_forward
+                self, images.__getitem__, len(images), self.eval_view_batch_size
             ):
                 best[part] = scores.argmax(dim=1)
                 if target is not None:
@@ -151,7 +149,7 @@ class SegmentationTask(ViewsTask):
             sets, blend = self.view_sets(images, rotation, area), self.representation.blend
             how: Any = {"averaged": len(sets) > 1, "device": images.device}
             mosaic = ScoreMosaic((shape[0], shape[1]), self.num_scores, blend, **how)
-            for views, scores in scored_views(self, sets, self.images_per_forward):
+            for views, scores in scored_views(self, sets, self.eval_view_batch_size):
                 mosaic.add(scores, views)
                 if target is not None:
                     self._add_loss(scores, labels_of_views(target, views))

@@ -34,12 +34,12 @@ class ViewsTask(Task):
     Args:
         network: Module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with this
             output under ``"out"`` and optionally that of an auxiliary head under ``"aux"``. A
-            network whose `forward` also takes ``rays`` and ``images_per_chunk`` gets the viewing
+            network whose `forward` also takes ``rays`` and ``view_batch_size`` gets the viewing
             rays of its images and bounds its memory (`models.SphereContext`).
         representation: Representation of the images.
         *arguments: Class names, optimizer and scheduler, see `Task`.
         auxiliary_weight: Weight of the loss of the auxiliary output.
-        images_per_forward: Number of images per forward pass in evaluation, which bounds memory.
+        eval_view_batch_size: Number of images per forward pass in evaluation, which bounds memory.
         **settings: Further arguments of `Task`.
     """
 
@@ -49,7 +49,7 @@ class ViewsTask(Task):
         representation: Any,
         *arguments: Any,
         auxiliary_weight: float = 0.4,
-        images_per_forward: int = 32,
+        eval_view_batch_size: int = 32,
         **settings: Any,
     ) -> None:
         super().__init__(network, representation, *arguments, **settings)
@@ -66,7 +66,7 @@ class ViewsTask(Task):
                 remedy="Use the network without context.",
             )
         self.auxiliary_weight = auxiliary_weight
-        self.images_per_forward = at_least("task.images_per_forward", images_per_forward, 1)
+        self.eval_view_batch_size = at_least("task.eval_view_batch_size", eval_view_batch_size, 1)
 
     @property
     @abstractmethod
@@ -95,7 +95,7 @@ class ViewsTask(Task):
         if rays is None:
             returned = self.network(images)
         else:
-            count = self.images_per_chunk if self.training else self.images_per_forward
+            count = self.view_batch_size if self.training else self.eval_view_batch_size
             returned = self.network(images, rays, count)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
         expected = (len(images), self.num_scores, *images.shape[-2:])

@@ -65,8 +65,8 @@ def trained(
 
     folder = tmp_path_factory.mktemp("trained")
     # Validation: 3 panoramas of 2 rooms.
-    split: Any = {"validation_fraction": 0.35, "seed": 3}
-    data = Stanford2D3DS(stanford_root, TANGENT, panoramas_per_step=2, **split)
+    split: Any = {"val_fraction": 0.35, "seed": 3}
+    data = Stanford2D3DS(stanford_root, TANGENT, batch_size=2, **split)
     torch.manual_seed(0)
     sgd = partial(torch.optim.SGD, lr=0.1)
     task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)

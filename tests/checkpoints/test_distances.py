@@ -24,7 +24,7 @@ from tangent_train.checkpoints.scores import size_multiple_of
 from tangent_train.checkpoints.trained import describe_network, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
-from tangent_train.inference.class_maps import load_class_map, map_classes
+from tangent_train.inference.label_maps import load_label_map, map_classes
 from tests.inference.trained import write_checkpoint
 
 
@@ -139,8 +139,8 @@ def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path:
     assert trained.depth_kind == described.depth_kind == (kind or "log_distance")
     assert (trained.predicts, trained.class_names, trained.size_multiple) == (DISTANCE, (), 1)
     assert trained.network(torch.zeros(2, 3, 16, 16)).shape == (2, 1, 16, 16)
-    with pytest.raises(SettingError, match=r"found a network that predicts distance.*class_map"):
-        map_classes(trained, load_class_map("ade20k_to_stanford2d3ds"), "unknown")
+    with pytest.raises(SettingError, match=r"found a network that predicts distance.*label_map"):
+        map_classes(trained, load_label_map("ade20k_to_stanford2d3ds"), "unknown")
     path = write_depth_checkpoint(tmp_path / "wrong.ckpt", depth_kind="inverse")
     with pytest.raises(DataError, match="depth_kind='inverse'"):
         load_trained(path)

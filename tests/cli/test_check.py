@@ -16,7 +16,7 @@ from tests.running import Capture, composed_settings
 
 
 def _checked(root: Path, capsys: Capture, *changes: str) -> tuple[str, str]:
-    settings = ["data=folder", "level=4", f"data.root='{root}'", "data.validation_fraction=0"]
+    settings = ["data=folder", "level=4", f"data.root='{root}'", "data.val_fraction=0"]
     check(composed_settings("check", *settings, *changes))
     return capsys.readouterr()
 
@@ -88,7 +88,7 @@ def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> No
     (warning,) = (line for line in err.splitlines() if line.startswith("Warning: "))
     assert f"{tmp_path}/depth/test.png: median distance 0.00391 m" in warning
     stores = tmp_path / "stores"
-    settings = ["data=folder", "level=4", f"data.root='{tmp_path}'", "data.validation_fraction=0"]
+    settings = ["data=folder", "level=4", f"data.root='{tmp_path}'", "data.val_fraction=0"]
     prepare(composed_settings("prepare", *settings, f"data.store='{stores}'", "task=depth"))
     stored = np.load(next(stores.glob("32x64_*/a.npy")))
     assert stored.dtype.names == ("rgb", "labels")

@@ -129,7 +129,7 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
         pass
 
     monkeypatch.setattr(SegmentationTask, "training_step", kept)
-    typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.panoramas_per_step=1")
+    typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.batch_size=1")
     with pytest.raises(CutError):
         run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
     content = torch.load(tmp_path / "run" / "checkpoints" / "last.ckpt", weights_only=True)
@@ -146,7 +146,7 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
 
 def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path, run: Run) -> None:
     checkpoints = tmp_path / "run" / "checkpoints"
-    typed = ("scheduler=constant", "data.validation_fraction=0", "trainer.max_epochs=1")
+    typed = ("scheduler=constant", "data.val_fraction=0", "trainer.max_epochs=1")
     run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
     first = (checkpoints / "best.ckpt").read_bytes()
     assert first == (checkpoints / "last.ckpt").read_bytes()
@@ -272,11 +272,9 @@ def test_the_last_step_of_an_epoch_is_tried_before_training(
 
     monkeypatch.setattr(SplitDataModule, "class_weights", begin)  # reads the labels
     settings = [text for text in SETTINGS if not text.startswith("network.")]
-    settings += ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "data.validation_fraction=0"]
+    settings += ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "data.val_fraction=0"]
     settings += [f"representation.faces_per_panorama={faces}", "scheduler=constant"]
-    message = (
-        r"data.panoramas_per_step: found 2, so that in a step of 1 panorama .*\(1, 3, 16, 16\)"
-    )
+    message = r"data.batch_size: found 2, so that in a step of 1 panorama .*\(1, 3, 16, 16\)"
     refused = pytest.raises(SystemExit, match=message)
     with refused if faces == 1 else pytest.raises(BegunError):
         run("train", *settings, rooms, "hydra.run.dir=run")
@@ -287,7 +285,11 @@ def test_level_views_are_trained_evaluated_and_predicted(
 ) -> None:
     """With attention between views; rows unlike columns; evaluated with and without the whole."""
     network = ("network=unet_small_context", "network.network.network.widths=[4,8,8,8,8]")
-    views = ["representation=ring_wide", "representation.dim=[32,48]", "representation.mirror=true"]
+    views = [
+        "representation=horizontal_wide",
+        "representation.dim=[32,48]",
+        "representation.mirror=true",
+    ]
     views += ["representation.faces_per_panorama=4", "representation.random_rotation=yaw"]
     small = (
         *SMALL_ROOMS,
@@ -322,7 +324,7 @@ def test_settings_of_an_evaluation(run_folder: Path, rooms: str, run: Run) -> No
         assert confusion not in confusions
         confusions.append(confusion)
     config = read_settings(Path("2/config.yaml"))
-    assert config["data"]["panoramas_per_step"] == 4, "the option's own, not the run's"
+    assert config["data"]["batch_size"] == 4, "the option's own, not the run's"
     assert "base_level" not in config["representation"]
     assert config["representation"]["level"] == 4
 
@@ -351,11 +353,11 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
         (["hydra.run.dir=file/run"], "file/run: found not a directory"),
         (
-            ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.images_per_chunk=1"],
-            r"task.images_per_chunk: found 1, .* DeepLabV3 gets \(1, 3, .*more than 1 value",
+            ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "task.view_batch_size=1"],
+            r"task.view_batch_size: found 1, .* DeepLabV3 gets \(1, 3, .*more than 1 value",
         ),
         (["data=folder"], "data: found rooms for datamodules.FolderPanoramas; .*recipe=small"),
-        (["data=synthshapes"], "data: found panoramas_per_step, rooms for .*SynthShapes"),
+        (["data=synthshapes"], "data: found batch_size, rooms for .*SynthShapes"),
         (["data=zind_pairs"], "data: found ZindPairs; expected labeled images"),
         (
             ["scheduler=step", f"{_SCHEDULER}.ExponentialLR"],
@@ -440,7 +442,7 @@ def test_missing_inputs_are_refused_before_anything_heavy_is_imported(tmp_path: 
         f"predict checkpoint=there input={name}/*.jpg output=out",
         f"predict checkpoint=there input=there output=out depth={name}",
         f"predict checkpoint=there input=there output=out mask={name}",
-        f"predict checkpoint=there input=there output=out class_map={name}.json",
+        f"predict checkpoint=there input=there output=out label_map={name}.json",
         f"render input={name} output=out",
         f"render back={name} output=out",
         f"render poses={name} output=out",
@@ -489,7 +491,7 @@ def test_output_of_any_encoding(
         assert stream.buffer.getvalue()
     code = "import sys; from tangent_train.cli import main; sys.argv = ['x', '-h']; main.predict()"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
-    assert b"class_map: null" in done.stdout
+    assert b"label_map: null" in done.stdout
 
 
 @pytest.mark.parametrize("number", [errno.EROFS, errno.ENOSPC])

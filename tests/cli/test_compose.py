@@ -72,7 +72,7 @@ _ODD = (
 )
 _WITH_PATHS = {
     "check": "data.root data.store +data.label_table",
-    "predict": "input output checkpoint depth mask class_map",
+    "predict": "input output checkpoint depth mask label_map",
     "render": "input output figure back poses cameras mask",
     "import": "model weights file classes output",
     "keypoints": "left right input output data.root",

@@ -1,4 +1,4 @@
-"""`tangent-evaluate` of networks whose files know no run, and with class maps."""
+"""`tangent-evaluate` of networks whose files know no run, and with label maps."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.registry import build_from_config
+from tangent_train.config.build import build_from_config
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import ERP, TANGENT, write_checkpoint
 
@@ -32,7 +32,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 def _written(path: Path, content: Any) -> str:
     path.write_text(json.dumps(content))
-    return f"class_map={path}"
+    return f"label_map={path}"
 
 
 def _confusion(folder: Path) -> Any:
@@ -67,7 +67,7 @@ def test_classes_that_a_map_lacks_are_missed_or_never_win(
     assert (never[:, 1:] >= unknown[:, 1:]).all(), "pixels of green go to what is left"
     assert unknown[1:, 0].any()
     config = read_settings(tmp_path / "never" / "config.yaml")
-    assert (config["class_map"], config["unmapped"]) == (str(tmp_path / "my map.json"), "never")
+    assert (config["label_map"], config["unmapped"]) == (str(tmp_path / "my map.json"), "never")
     assert config["network"]["_target_"] == "torch.nn.Conv2d"
     assert not {"network", "representation"} & config["choices"].keys(), "they are the file's"
     assert config["choices"]["data"] == "synthrooms"
@@ -80,7 +80,7 @@ def test_classes_that_a_map_lacks_are_missed_or_never_win(
         assert "never win: green" in text
     content = json.loads((tmp_path / "never" / "results.json").read_text())
     assert content["checkpoint"] == network.partition("=")[2]
-    assert content["class_map"] == str(tmp_path / "my map.json")
+    assert content["label_map"] == str(tmp_path / "my map.json")
     assert len(list((tmp_path / "unknown" / "panels").glob("*.png"))) == 1
 
 
@@ -172,7 +172,7 @@ def test_an_exported_network_has_the_figures_of_its_run(
     assert f"net.{suffix}" in (tmp_path / "exported" / "report.html").read_text()
 
 
-def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run: Run) -> None:
+def test_a_label_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run: Run) -> None:
     """One that changes nothing but the order."""
     arguments = [f"checkpoint={run_folder / 'checkpoints' / 'best.ckpt'}", rooms]
     same = _written(tmp_path / "same.json", {"classes": {n: [n] for n in reversed(CLASSES)}})
@@ -184,8 +184,8 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
     ("changes", "message"),
     [
         ({"data": None}, r"data: found none, and .*photo\.ckpt has no settings of a run.*data="),
-        ({"class_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*class_map="),
-        ({"class_map": {"classes": {"floor": ["pink"]}}}, "found no class of the map in a network"),
+        ({"label_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*label_map="),
+        ({"label_map": {"classes": {"floor": ["pink"]}}}, "found no class of the map in a network"),
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
@@ -196,9 +196,9 @@ def test_a_class_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
 def test_impossible_evaluations_are_refused(
     changes: dict[str, Any], message: str, network: str, rooms: str, tmp_path: Path, run: Run
 ) -> None:
-    given = {"checkpoint": network, "data": rooms, "class_map": MAP} | changes
-    if given["class_map"]:
-        given["class_map"] = _written(tmp_path / "map.json", given["class_map"])
+    given = {"checkpoint": network, "data": rooms, "label_map": MAP} | changes
+    if given["label_map"]:
+        given["label_map"] = _written(tmp_path / "map.json", given["label_map"])
     arguments = [*filter(None, given.values()), *(ROOMS if given["data"] == rooms else [])]
     with pytest.raises(SystemExit, match=message):
         run("evaluate", *arguments)

@@ -83,7 +83,7 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     if command == "transfer":
         photos = folders[_class_of(settings["photos"]["data"])]
         arguments += [f"photos.data.root={photos}", "photos.data.num_workers=0"]
-        arguments += ["photos.data.photos_per_step=2"]
+        arguments += ["photos.data.batch_size=2"]
     run(command, *arguments)
     pattern = "S/results.json" if command == "transfer" else "results.json"
     (path,) = (tmp_path / "runs").rglob(pattern)

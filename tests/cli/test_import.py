@@ -29,8 +29,8 @@ from tangent_train.inference.representations import (
     wide_levels,
 )
 from tests.cli.tiny_runs import Predict, Run
-from tests.inference.photo_networks.huggingface_networks import saved, segformer
 from tests.models.onnx_files import write_linear
+from tests.photo_networks.huggingface_networks import saved, segformer
 from tests.running import Capture, Patch
 from tests.tasks.small_networks import with_statistics
 
@@ -305,7 +305,7 @@ def test_an_onnx_file_of_any_size_gets_wide_views(
     run: Run,
     capsys: Capture,
 ) -> None:
-    """With the longer side of its images: level views, or tangent images of two levels."""
+    """With the longer side of its images: horizontal views, or tangent images of two levels."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
     assert f"panoramas: 16 views of {side} × {side} (130° wide" in capsys.readouterr().out
@@ -347,23 +347,25 @@ def _write_room() -> NDArray[np.uint8]:
 def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys: Capture) -> None:
     """Stored by the import, or chosen later: in a command and in Python, with the same labels."""
     run("import", *OF_ONNX, "output=plain.onnx")
-    run("import", *OF_ONNX, "output=level.onnx", "views=ring_economy")
+    run("import", *OF_ONNX, "output=level.onnx", "views=horizontal_economy")
     assert "panoramas: 12 views of 32 × 32 (130° wide, 0.1 pixels" in capsys.readouterr().out
     trained = load_trained(here / "level.onnx")
     assert (trained.level, trained.photo_side, trained.image_size) == (5, 32, (32, 32))
     assert trained.representation["dim"] == 32
     rgb = _write_room()
     expected = tt.load("level.onnx").labels(rgb)
-    predict(checkpoint="plain.onnx", input="room.png", output="out", views="ring_economy")
+    predict(checkpoint="plain.onnx", input="room.png", output="out", views="horizontal_economy")
     assert "labeled in 12 views of 32 × 32" in capsys.readouterr().out
     found = cv2.imread("out/labels/room.png", cv2.IMREAD_UNCHANGED)
     np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(tt.load("plain.onnx", views="ring_economy").labels(rgb), expected)
+    np.testing.assert_array_equal(
+        tt.load("plain.onnx", views="horizontal_economy").labels(rgb), expected
+    )
     assert (tt.load("level.onnx", views="tangent").labels(rgb) != expected).any()
     both = (tt.load(name, views="tangent").labels(rgb) for name in ("level.onnx", "plain.onnx"))
     np.testing.assert_array_equal(*both)
     sizes = {
-        "ring": (18, (32, 32)),
+        "horizontal": (18, (32, 32)),
         "erp": (1, (32, 64)),
         "cubemap": (6, (32, 32)),
         "tangent": (40, (32, 32)),
@@ -372,7 +374,7 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
     for option, (count, size) in sizes.items():
         views = PanoramaViews(load_trained(here / "plain.onnx"), views=option)
         assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
-    twice = PanoramaViews(trained, rotations=2, views={"option": "ring", "fov": [110, 100]})
+    twice = PanoramaViews(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
     assert twice.description().startswith("36 views of 32 × 32 (110° wide")
 
 
@@ -382,10 +384,10 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         ({"views": "rings"}, r"views: found rings; expected an option: cubemap, erp, .*, ring, "),
         ({"views": "perspective"}, "views: found perspective"),
         ({"views": {"fov": 90}}, "views: found"),
-        ({"views": {"option": "ring", "fow": 90}}, r"representation.*fow"),
-        ({"views": {"option": "ring", "fov": 80}}, "18 views that miss"),
-        ({"views": "ring", "base_level": 1}, "base_level: found 1"),
-        ({"views": "ring", "levels": [5, 4]}, "levels: found"),
+        ({"views": {"option": "horizontal", "fow": 90}}, r"representation.*fow"),
+        ({"views": {"option": "horizontal", "fov": 80}}, "18 views that miss"),
+        ({"views": "horizontal", "base_level": 1}, "base_level: found 1"),
+        ({"views": "horizontal", "levels": [5, 4]}, "levels: found"),
         ({"views": "erp_distortion_aware"}, "distortion-aware convolutions: found a network"),
     ],
 )
@@ -480,7 +482,7 @@ def test_labels_without_settings_are_those_of_wide_rings(
     labels: dict[str, Any] = {}
     settings: dict[str, dict[str, Any]] = {
         "default": {},
-        "wide": {"views": "ring_wide", "blend": "feather", "rotations": 1},
+        "wide": {"views": "horizontal_wide", "blend": "feather", "rotations": 1},
         "both": {"views": "tangent", "levels": "[5,4]", "base_level": 0},
         "two": {"views": "tangent"},
         "half": {"views": "tangent", "levels": 5},

@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 import pytest
 
-from tangent_train.results.keypoints.compare import Comparer, Comparison
+from tangent_train.keypoints.compare import Comparer, Comparison
 from tests.cli.tiny_runs import Run, results
-from tests.results.keypoints.ball_room import ball_pair
+from tests.keypoints.ball_room import ball_pair
 from tests.running import Capture, Patch
 
 pycolmap = pytest.importorskip("pycolmap")

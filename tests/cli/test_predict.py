@@ -17,11 +17,11 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import rotation_about
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
+from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
 from tests.inference.trained import PERSPECTIVE, sphere, write_checkpoint
@@ -210,7 +210,7 @@ def test_the_network_estimates_the_up_direction(
     tmp_path: Path, predict: Predict, monkeypatch: Patch
 ) -> None:
     even = np.full(6, 1 / 6)
-    monkeypatch.setattr("tangent_train.rendering.upright.gravity.up_probabilities", lambda *_: even)
+    monkeypatch.setattr("tangent_train.orientation.gravity.up_probabilities", lambda *_: even)
     tilt = rotation_about((1, 0, 0), math.radians(100))
     room = draw_room((128, 256), tilt)
     write_pixels(tmp_path / "in" / "a.png", room)
@@ -284,7 +284,7 @@ def test_a_share_of_each_class_is_kept_below_the_least_confidence(
         ({"min_share": 0.5}, "min_confidence: found 0.0; expected above 0 to 1 with min_share"),
         ({"fov": 70}, "fov: found 70.0; expected null without projection=perspective"),
         ({"max_tilt_deg": 90}, "max_tilt_deg: found 90.0; expected 60 without upright=auto"),
-        ({"unmapped": "never"}, "unmapped: found never; expected unknown without class_map"),
+        ({"unmapped": "never"}, "unmapped: found never; expected unknown without label_map"),
         ({"depth_scale": 512}, "depth_scale: found 512.0; expected 1000 without depth files"),
         *(
             ({"projection": "perspective", **of_panoramas}, f"{next(iter(of_panoramas))}: found")
@@ -296,7 +296,7 @@ def test_a_share_of_each_class_is_kept_below_the_least_confidence(
                 {"rotations": 2},
             )
         ),
-        ({"class_map": "night"}, "class_map: found night; expected ade20k_to_cityscapes"),
+        ({"label_map": "night"}, "label_map: found night; expected ade20k_to_cityscapes"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(

@@ -15,8 +15,8 @@ import trimesh
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGB_NORMALIZATION
-from datamodules.images.pixel_files import read_depth_m, write_pixels
 from tangent_train.geometry import equirect_directions
+from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
@@ -162,7 +162,7 @@ _OF_CLASSES = "expected null for networks of classes"
 @pytest.mark.parametrize(
     ("settings", "refused"),
     [
-        ({"class_map": "ade20k_to_stanford2d3ds"}, "class_map: found .*expected null for depth"),
+        ({"label_map": "ade20k_to_stanford2d3ds"}, "label_map: found .*expected null for depth"),
         ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0 for depth networks"),
         ({"upright": "auto"}, "upright: found auto; expected pose or null"),
         ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.images.palette import class_colors
-from datamodules.images.videos import read_frames
+from tangent_train.io.palette import class_colors
+from tangent_train.io.videos import read_frames
 from tangent_train.results.pictures import colorize_distance
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Predict, predicted

@@ -15,10 +15,10 @@ from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.cli.pretrained import with_pretrained_network
 from tangent_train.cli.run import build
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import export_network
-from tangent_train.inference.photo_networks import PhotoNetwork, import_network
-from tangent_train.registry import build_from_config
+from tangent_train.photo_networks import PhotoNetwork, import_network
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import Capture, Patch, composed, composed_settings
 from tests.tasks.small_networks import with_statistics

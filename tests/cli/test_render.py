@@ -11,14 +11,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import TangentGrid, equirect_directions
-from tangent_train.rendering import (
-    equirect_to_tangent,
-    read_cameras,
-    read_rig,
-    tangent_to_equirect,
-)
+from tangent_train.io.camera_files import read_cameras, read_rig
+from tangent_train.io.pixel_files import read_pixels, write_pixels
+from tangent_train.rendering import equirect_to_tangent, tangent_to_equirect
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents
 from tests.running import Patch
@@ -168,7 +164,7 @@ def test_features_of_another_resolution(
     rendered: Path, tmp_path: Path, dim: int, blend: str, monkeypatch: Patch
 ) -> None:
     """Features that are the directions of their pixels, written by hand, come back in place."""
-    monkeypatch.setattr("datamodules.images.tangent_results._GROUP_BYTES", 200_000)
+    monkeypatch.setattr("tangent_train.io.tangent_results._GROUP_BYTES", 200_000)
     content = json.loads((rendered / "cameras.json").read_text())
     (tmp_path / "features").mkdir()
     edge = np.tan(np.radians(content["camera"]["fov_deg"] / 2))
@@ -194,7 +190,7 @@ def test_features_of_another_resolution(
 def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Refused) -> None:
     """Rows unlike columns; results of half the size, and directions computed from the file."""
     write_pixels(tmp_path / "room.png", smooth(64))
-    views = {"option": "ring_economy", "fov": [110, 90], "dim": [40, 56]}
+    views = {"option": "horizontal_economy", "fov": [110, 90], "dim": [40, 56]}
     render_with(input=tmp_path / "room.png", output=tmp_path / "level", views=views)
     render_with(back=tmp_path / "level", output=tmp_path / "colors", blend=blend)
     colors = _read(tmp_path / "colors" / "room.png").astype(int)

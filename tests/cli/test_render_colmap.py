@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.images.pixel_files import read_pixels, write_pixels
 from tangent_train.geometry import FLIP_Y, PinholeGrid, RingGrid, TangentGrid, random_rotation
+from tangent_train.io.camera_files import read_rig
+from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.keypoints.colmap import panorama_poses
-from tangent_train.rendering import read_rig
 from tests.cli.rendering import Refused, render_with, smooth
 from tests.datamodules.data_files import contents, gpano_xmp
 from tests.geometry.directions import angle_deg, random_directions
@@ -35,8 +35,8 @@ def panoramas(tmp_path: Path) -> Path:
 
 VIEWS: dict[str, tuple[dict[str, Any], PinholeGrid]] = {
     "tangent": ({"base_level": 0}, TangentGrid(0, 5)),
-    "ring": (
-        {"views": {"option": "ring", "fov": [110, 100]}},
+    "horizontal": (
+        {"views": {"option": "horizontal", "fov": [110, 100]}},
         RingGrid([{"pitch": p, "views": n} for p, n in RINGS], (110, 100), (40, 40)),
     ),
 }

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.images.pixel_files import write_pixels
 from tangent_train.inference.images import read_panorama
+from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import contents
 from tests.inference.trained import sphere

@@ -61,7 +61,7 @@ def test_finished_stages_are_not_run_again(runs: PretendedRuns, capsys: Capture)
     run_transfer(*SHORT)
     runs.started.clear()
     capsys.readouterr()
-    free = ("panels=9", "trainer.strategy=ddp", "data.root=other", "task.images_per_forward=3")
+    free = ("panels=9", "trainer.strategy=ddp", "data.root=other", "task.eval_view_batch_size=3")
     run_transfer(*SHORT, *free)
     assert not runs.started
     assert capsys.readouterr().out.count("finished before") == 2
@@ -125,11 +125,11 @@ def test_stages_of_a_network_that_was_trained_again_are_refused(runs: PretendedR
 
 def test_a_network_without_a_run_is_only_evaluated(runs: PretendedRuns, tmp_path: Path) -> None:
     network = write_checkpoint(tmp_path / "photo.ckpt")
-    class_map = tmp_path / "map.json"
-    class_map.write_text('{"classes": {"floor": ["dark"]}}')
+    label_map = tmp_path / "map.json"
+    label_map.write_text('{"classes": {"floor": ["dark"]}}')
     wide = "{name: wide, level: 3, blend: feather}"
     arguments = (
-        *(f"checkpoint={network}", f"class_map={class_map}", f"compare=[erp,{wide}]"),
+        *(f"checkpoint={network}", f"label_map={label_map}", f"compare=[erp,{wide}]"),
         "conditions=[upright,{name: tilted, test_rotation: 30}]",
         *("unmapped=never", "representation.erp_height=20"),
     )
@@ -138,7 +138,7 @@ def test_a_network_without_a_run_is_only_evaluated(runs: PretendedRuns, tmp_path
     assert runs.started == [("evaluate", name) for name in ("P", *views)]
     for (_, name), config in zip(runs.started, runs.configs, strict=True):
         assert (config.checkpoint, config.network) == (str(network), None)
-        assert (config.class_map, config.unmapped) == (str(class_map), "never")
+        assert (config.label_map, config.unmapped) == (str(label_map), "never")
         assert config.data.inputs == ["rgb"]
         assert tuple(config.data.normalization.mean) == RGB_NORMALIZATION.mean
         assert config.level == config.representation.level == (3 if "wide" in name else 4)
@@ -154,8 +154,8 @@ def test_a_network_without_a_run_is_only_evaluated(runs: PretendedRuns, tmp_path
     (OF_SEED_0 / "S-erp-tilted" / "results.json").unlink()
     run_transfer(*arguments)
     assert runs.started == [("evaluate", "S-erp-tilted")]
-    class_map.write_text('{"classes": {"floor": ["bright"]}}')
-    with pytest.raises(REFUSED, match=r"seed_0/P: found stage P of another .* class map; expected"):
+    label_map.write_text('{"classes": {"floor": ["bright"]}}')
+    with pytest.raises(REFUSED, match=r"seed_0/P: found stage P of another .* label map; expected"):
         run_transfer(*arguments)
     for typed in ("optimizer.lr=1", "network.widths=[4]", "fine_tuning.epochs=[1]"):
         with pytest.raises(REFUSED, match=f"{typed.split('=')[0]}=.*a setting of training with"):

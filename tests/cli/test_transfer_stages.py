@@ -13,10 +13,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.transfer_stages import Stage, plan
 from tangent_train.cli.transfer_views import views_of
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
 from tangent_train.inference.representations import check_size
-from tangent_train.registry import build_from_config
 from tests.inference.trained import trained_network
 from tests.running import composed
 
@@ -95,14 +95,19 @@ def test_all_views_see_the_same_panoramas(rooms: DictConfig) -> None:
         "erp",
         {"name": "fine", "option": "erp", "rows": 400},
         {"name": "cube", "option": "cubemap", "dim": "${level}"},
-        "ring_economy",
+        "horizontal_economy",
         {"name": "wide", "level": 6, "base_level": 0, "blend": "feather"},
     ]
     stages = _stages(rooms, compare=views, representation__erp_height=200)
     assert _seen(stages, "S-erp", "level", "rows", "base_level") == ["Equi", 7, None, None]
     assert _seen(stages, "S-fine", "level", "rows") == ["Equi", 7, 400]
     assert _seen(stages, "S-cube", "level", "dim") == ["Cube", 7, 7]
-    assert _seen(stages, "S-ring_economy", "level", "dim", "rotations") == ["Ring", 7, None, 1]
+    assert _seen(stages, "S-horizontal_economy", "level", "dim", "rotations") == [
+        "Ring",
+        7,
+        None,
+        1,
+    ]
     assert _seen(stages, "S-wide", "level", "base_level", "blend") == ["Tang", 6, 0, "feather"]
     assert [stages[f"S-{name}"].config["level"] for name in ("fine", "wide")] == [7, 6]
     rows = {s.config["representation"].get("erp_height") for n, s in stages.items() if n[0] == "S"}
@@ -177,7 +182,7 @@ def test_data_without_folds() -> None:
         ("compare", ["../erp"]),
         ("conditions", []),
         ("conditions", [3]),
-        ("class_map", "my_map.json"),
+        ("label_map", "my_map.json"),
     ],
 )
 def test_impossible_settings_are_refused(rooms: DictConfig, setting: str, value: Any) -> None:

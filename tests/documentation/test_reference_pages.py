@@ -11,8 +11,8 @@ from pathlib import Path
 
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.geometry import TangentGrid
-from tangent_train.inference.class_maps import __file__ as class_maps
-from tangent_train.rendering.camera_files import CameraFile, write_cameras
+from tangent_train.inference.label_maps import __file__ as label_maps
+from tangent_train.io.camera_files import CameraFile, write_cameras
 from tangent_train.results.record import Heading, Record
 
 ROOT = Path(__file__).parents[2]
@@ -68,6 +68,6 @@ def test_file_formats_names_every_field_of_cameras(tmp_path: Path) -> None:
     assert not missing(names, "file_formats.md")
 
 
-def test_file_formats_names_every_class_map() -> None:
-    maps = {path.stem for path in Path(class_maps).with_suffix("").glob("*.json")}
+def test_file_formats_names_every_label_map() -> None:
+    maps = {path.stem for path in Path(label_maps).with_suffix("").glob("*.json")}
     assert not missing(maps, "file_formats.md")

@@ -68,7 +68,7 @@ def _sets(name: str) -> list[PinholeViews]:
         "rotated": [PinholeViews(TangentGrid(0, 5).with_rotation(rotation))],
         "levels": [PinholeViews(TangentGrid(0, 5)), PinholeViews(TangentGrid(0, 4, 32))],
         "cube": [PinholeViews(TangentGrid(0, 5)), PinholeViews(CubeGrid(32))],
-        "ring": [PinholeViews(wide)],
+        "horizontal": [PinholeViews(wide)],
     }[name]
 
 
@@ -116,7 +116,7 @@ def _errors(found: Alignment, samples: ViewSamples, distance: NDArray[np.float64
     return errors - np.nanmedian(errors)
 
 
-CASES = [*((kind, "ring") for kind in KINDS), ("relative_disparity", "levels")]
+CASES = [*((kind, "horizontal") for kind in KINDS), ("relative_disparity", "levels")]
 
 
 def test_meters_remain_meters_with_a_shift_of_each_view() -> None:
@@ -151,7 +151,7 @@ def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> Non
 
 
 def test_order_of_views_and_rotation_of_the_grid_do_not_matter() -> None:
-    truth, rng = _truth("ring"), np.random.default_rng(6)
+    truth, rng = _truth("horizontal"), np.random.default_rng(6)
     samples = _corrupted(truth, "relative_disparity", rng)
     noisy = samples._replace(value=samples.value * np.exp(rng.normal(0, 0.02, len(samples.value))))
     found = align([noisy], "relative_disparity")
@@ -245,7 +245,7 @@ def test_noise_does_not_shrink_scales(noise: float) -> None:
 
 def test_unobservable_shifts_remain_small() -> None:
     """Without different ray lengths, only the prior determines the shift of all views."""
-    truth, rng = _truth("ring"), np.random.default_rng(3)
+    truth, rng = _truth("horizontal"), np.random.default_rng(3)
     samples = truth.samples._replace(ray_length=np.ones(len(truth.distance)))
     scale = np.exp(rng.normal(0, 0.5, samples.num_views))[samples.view]
     noise = np.exp(rng.normal(0, 0.01, len(scale)))
@@ -290,7 +290,7 @@ def _first_view(samples: ViewSamples) -> ViewSamples:
 
 @pytest.mark.parametrize("mode", [None, "scale", "affine", "grid"])
 def test_one_view_and_no_valid_view(mode: Any) -> None:
-    samples = _truth("ring").samples
+    samples = _truth("horizontal").samples
     nothing = samples._replace(value=np.full(len(samples.value), np.nan))
     found = align([nothing], "relative_disparity", mode)
     assert len(found.report.empty) == samples.num_views
@@ -397,7 +397,7 @@ def test_a_grid_removes_smooth_errors_of_views() -> None:
 def test_sky_and_invalid_pixels_after_the_alignment() -> None:
     raw = torch.tensor([2.0, 0.0, -1.0, math.nan, math.inf])[None, None, None]
     lengths = torch.full((1, 1, 5), 2.0)
-    report = align([_first_view(_truth("ring").samples)], "metric_z", "none").report
+    report = align([_first_view(_truth("horizontal").samples)], "metric_z", "none").report
     for kind, scale, shift, expected in (
         ("relative_disparity", 1.0, 0.0, [1, 0, 0]),
         ("relative_disparity", 2.0, 3.0, [3.5, 0, 0.5]),

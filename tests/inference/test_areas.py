@@ -13,12 +13,12 @@ from torch import nn
 
 from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
-from datamodules.images.gpano import PanoramaArea
+from tangent_train.config.build import build_from_config
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
-from tangent_train.registry import build_from_config
+from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.datamodules.folder.folder_format import save, write_classes
@@ -38,7 +38,7 @@ SGD = functools.partial(torch.optim.SGD, lr=1.0)
 ROWS = 64
 AREA = (150, 60, -50.625, 61.875)
 RING: dict[str, Any] = {
-    "_target_": "tangent_train.rendering.RingRepresentation",
+    "_target_": "tangent_train.rendering.HorizontalRepresentation",
     "level": 5,
     "rings": [{"pitch": 0, "views": 6}, {"pitch": 45, "views": 4}, {"pitch": -45, "views": 4}],
     "fov": 100,
@@ -47,7 +47,7 @@ KINDS = {
     "tangent": TANGENT | {"level": 5},
     "nearest": TANGENT | {"level": 5, "blend": "nearest", "rotations": 2},
     "cube map": CUBE | {"level": 5},
-    "ring": RING,
+    "horizontal": RING,
     "equirectangular": ERP | {"level": 5, "rotations": 2},
     "icosphere": ICOSPHERE | {"level": 5},
 }
@@ -78,7 +78,7 @@ def _task(kind: str, network: nn.Module | None = None) -> SegmentationTask:
 
 def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanoramas:
     area = AREA if root.name == "part" else None
-    chosen: Any = {"area": area, "fill": "edge", "validation_fraction": 0, "seed": 3, **settings}
+    chosen: Any = {"area": area, "fill": "edge", "val_fraction": 0, "seed": 3, **settings}
     return FolderPanoramas(root, task.representation, **chosen)
 
 
@@ -121,7 +121,7 @@ def test_the_validation_loss_is_that_of_the_labels_in_the_area(tmp_path: Path) -
     logged = []
     for root in write_both(tmp_path):
         task = _task("equirectangular")
-        data = _data(root, task, validation_fraction=0.5)
+        data = _data(root, task, val_fraction=0.5)
         logged.append(quiet_trainer().validate(task, data, verbose=False)[0])
     assert logged[0] == pytest.approx(logged[1], rel=1e-6)
     assert {"val/loss", "val/miou"} < logged[0].keys()
@@ -206,7 +206,7 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
     task.representation = TangentRepresentation(0, 5, random_rotation=rotation)
     losses = []
     for fill in ("black", "reflect"):
-        data = _data(write_both(tmp_path)[1], task, fill=fill, panoramas_per_step=2)
+        data = _data(write_both(tmp_path)[1], task, fill=fill, batch_size=2)
         batch: Any = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
         assert batch.images.shape[:2] == batch.labels.shape[:2]
         assert batch.images.shape[:2] == (2, len(data.representation.view_sets()[0]))
@@ -224,6 +224,6 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
 
 
 def test_the_description_has_the_kinds_of_views_that_see_the_area() -> None:
-    views = PanoramaViews(trained_network(RING), views="ring_wide")
+    views = PanoramaViews(trained_network(RING), views="horizontal_wide")
     assert views.description().count("° wide") == 2
     assert views.description((-180, 180, -30, 30)).count("° wide") == 1

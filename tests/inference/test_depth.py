@@ -18,6 +18,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import from_distance, is_metric
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     SphereArea,
@@ -32,16 +33,15 @@ from tangent_train.inference.depth import DepthPredictor, combine_depth
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.network import Network
 from tangent_train.inference.representations import PanoramaViews, PhotoViews, view_settings
-from tangent_train.registry import build_from_config
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.datamodules.data_files import gpano_xmp
 from tests.inference.trained import CUBE, ERP, ICOSPHERE, TANGENT, trained_network
 
 SHAPE = 96, 192
-RING = view_settings("ring") | {"level": 5}
+RING = view_settings("horizontal") | {"level": 5}
 VIEWS: dict[str, dict[str, Any]] = {
     "tangent": TANGENT | {"level": 5, "levels": [5, 4], "rotations": 2},
-    "ring": RING,
+    "horizontal": RING,
     "cube": CUBE | {"level": 5, "margin": 3},
     "equirectangular": ERP | {"level": 5, "rotations": 2},
     "icosphere": ICOSPHERE,
@@ -74,7 +74,7 @@ def _true_depth(representation: dict[str, Any], kind: DepthKind) -> list[tuple[A
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        *(("ring", kind) for kind in get_args(DepthKind)),
+        *(("horizontal", kind) for kind in get_args(DepthKind)),
         ("tangent", "relative_depth"),
         ("cube", "metric_z"),
         ("equirectangular", "canonical_inverse"),
@@ -103,7 +103,7 @@ def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind)
 
 def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
     outputs = []
-    for views, depth in _true_depth(VIEWS["ring"], "relative_disparity"):
+    for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, 17 * depth.where(up.abs() < 0.6, depth / 4)))  # farther at the poles
     for shape, area in (
@@ -122,7 +122,7 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
 def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
     """A third of the sphere is 10⁴ times as far, and becomes unknown; z-depth of a photo."""
     outputs = []
-    for views, depth in _true_depth(VIEWS["ring"], "relative_disparity"):
+    for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, depth.where(up < 1 / 3, depth / 1e4)))
     found = combine_depth(outputs, SHAPE, "relative_disparity", "nearest", "none").distance.numpy()
@@ -145,7 +145,7 @@ def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
 def test_the_sky_and_unknown_pixels_are_unknown() -> None:
     """Disparity 0 is infinitely far, and is not mixed into the depth beside it."""
     outputs = []
-    for views, depth in _true_depth(VIEWS["ring"], "relative_disparity"):
+    for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, depth.where(up < 0.6, 0).where(up > -0.8, torch.nan)))
     found = combine_depth(outputs, SHAPE, "relative_disparity", "feather").distance.numpy()
@@ -201,9 +201,7 @@ def test_a_predictor_aligns_what_its_network_scales(kind: DepthKind) -> None:
     shares: list[float] = []
     found = {}
     for align in ("none", None):
-        predictor = DepthPredictor(
-            trained, PanoramaViews(trained), images_per_forward=3, align=align
-        )
+        predictor = DepthPredictor(trained, PanoramaViews(trained), view_batch_size=3, align=align)
         result = predictor.predict(image, shares.append)
         ratio = result.distance.numpy() / _truth()
         found[align] = np.log(ratio / np.median(ratio)).std()

@@ -211,7 +211,7 @@ def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> Non
 
 
 def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
-    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=7)
+    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), view_batch_size=7)
     counts: list[int] = []
     network.trained.network.register_forward_pre_hook(
         lambda _, images: counts.append(len(images[0]))
@@ -242,15 +242,15 @@ def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
 
 
 @pytest.mark.parametrize("unmapped", ["unknown", "never"])
-def test_class_maps_convert_labels_and_scores(
+def test_label_maps_convert_labels_and_scores(
     tmp_path: Path, predicted: Predicted, unmapped: Any
 ) -> None:
     checkpoint = write_checkpoint(tmp_path / "net.ckpt")
     (tmp_path / "map.json").write_text('{"classes": {"light": ["bright"], "shade": ["dark"]}}')
-    network = tt.load(checkpoint, class_map=tmp_path / "map.json", unmapped=unmapped)
+    network = tt.load(checkpoint, label_map=tmp_path / "map.json", unmapped=unmapped)
     assert network.class_names == ("unknown", "light", "shade")
     assert len(network.palette) == 3
-    expected, probabilities = predicted(sphere(32), "class_map=map.json", f"unmapped={unmapped}")
+    expected, probabilities = predicted(sphere(32), "label_map=map.json", f"unmapped={unmapped}")
     labels, scores = network.labels(sphere(32)), network.scores(sphere(32))
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_allclose(scores, probabilities, atol=1e-3)
@@ -281,8 +281,8 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
 
 @pytest.mark.parametrize("count", [0, -1, 1.5])
 def test_images_per_forward_is_at_least_one(count: Any, tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=f"images_per_forward: found {count}; .* 1 or more"):
-        tt.load(write_checkpoint(tmp_path / "net.ckpt"), images_per_forward=count)
+    with pytest.raises(SettingError, match=f"view_batch_size: found {count}; .* 1 or more"):
+        tt.load(write_checkpoint(tmp_path / "net.ckpt"), view_batch_size=count)
 
 
 def test_photos_have_no_rotations(tmp_path: Path) -> None:
@@ -319,12 +319,12 @@ def test_settings_that_do_not_suit_the_image_are_refused(
     ("settings", "message"),
     [
         ({"unmapped": "0"}, "unmapped: found '0'; expected 'unknown' or 'never'"),
-        ({"unmapped": "never"}, "unmapped: found never; expected unknown without class_map"),
+        ({"unmapped": "never"}, "unmapped: found never; expected unknown without label_map"),
         ({"blend": "0"}, "blend: found '0'; expected 'nearest' or 'feather'"),
         ({"levels": []}, r"levels: found \[\]; expected a level, or several"),
-        ({"views": "ring", "base_level": 1}, "base_level: found 1; expected tangent images"),
+        ({"views": "horizontal", "base_level": 1}, "base_level: found 1; expected tangent images"),
         (
-            {"views": {"option": "ring", "dim": [1, 2, 3]}},
+            {"views": {"option": "horizontal", "dim": [1, 2, 3]}},
             r"dim: .* expected columns, or",
         ),
     ],

@@ -22,12 +22,12 @@ from datamodules.core.samples import render_inputs
 from models import make_distortion_aware
 from tangent_train.checkpoints.scores import size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
-from tangent_train.registry import build_from_config
 from tangent_train.rendering import rotate_equirect
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.inference.trained import (
@@ -350,7 +350,7 @@ def test_a_network_of_whole_spheres_takes_only_those_of_its_training(
     trained = trained_network(representation, fixed_size=size)
     expected = f"expected {size[1]} × {size[0]} .* labels whole panoramas: leave"
     changes: dict[str, Any]
-    for changes in ({"levels": 5}, {"views": "ring"}, {"base_level": 1}):
+    for changes in ({"levels": 5}, {"views": "horizontal"}, {"base_level": 1}):
         with pytest.raises(SettingError, match=expected):
             PanoramaViews(trained, **changes)
     with pytest.raises(SettingError, match=expected):

@@ -13,8 +13,8 @@ from torch import nn
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.cli.run import inputs_and_classes
+from tangent_train.config.build import build_from_config
 from tangent_train.geometry import equirect_directions
-from tangent_train.registry import build_from_config
 
 CLASS_NAMES = ("unknown", "dark", "green", "bright")
 

@@ -112,7 +112,7 @@ def _gradients(
 ) -> tuple[Any, dict[str, Tensor]]:
     """Scores, and gradients of a function of them that no two pixels have the same share in."""
     context.zero_grad()
-    scores = context(images, rays, images_per_chunk=size)
+    scores = context(images, rays, view_batch_size=size)
     named = scores if isinstance(scores, dict) else {"out": scores}
     generator = torch.Generator().manual_seed(0)
     loss: Any = 0
@@ -129,7 +129,7 @@ def test_chunks_are_even() -> None:
     context = small_context(small_unet()).eval()
     sizes = []
     context.network.register_forward_pre_hook(lambda _, images: sizes.append(len(images[0])))
-    context(torch.randn(5, 3, 16, 16), sphere_rays(5), images_per_chunk=4)
+    context(torch.randn(5, 3, 16, 16), sphere_rays(5), view_batch_size=4)
     assert set(sizes) == {3, 2}
 
 

@@ -1,4 +1,4 @@
-"""A slow float64 reference for tangent images (paper, section 3.2) and level views.
+"""A slow float64 reference for tangent images (paper, section 3.2) and horizontal views.
 
 It shares no code with the library, which is tested against it. The mesh comes from trimesh. Instead
 of camera matrices it uses longitude, latitude and the textbook formulas of the gnomonic projection

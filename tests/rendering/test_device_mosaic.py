@@ -14,8 +14,8 @@ from tangent_train.rendering import (
     Blend,
     CubemapRepresentation,
     EquirectRepresentation,
+    HorizontalRepresentation,
     PerspectiveRepresentation,
-    RingRepresentation,
     TangentRepresentation,
     device_mosaic,
 )
@@ -49,7 +49,7 @@ SETS: dict[str, tuple[Callable[[Blend], Any], tuple[int, int]]] = {
     ),
     "rings": (
         lambda blend: (
-            RingRepresentation(
+            HorizontalRepresentation(
                 5,
                 [{"pitch": k, "views": 6} for k in (0, 45, -45)],
                 (90, 80),

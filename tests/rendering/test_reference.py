@@ -50,7 +50,7 @@ class Case(NamedTuple):
 
 
 class RingCase(NamedTuple):
-    """A set of level views, by pitch and number, and a panorama size."""
+    """A set of horizontal views, by pitch and number, and a panorama size."""
 
     rings: tuple[tuple[float, int], ...]
     size: tuple[int, int]

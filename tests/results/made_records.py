@@ -9,9 +9,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from tangent_train.config.setting_rules import flat_settings
 from tangent_train.results.published import facts
 from tangent_train.results.record import Record
-from tangent_train.setting_rules import flat_settings
 from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")

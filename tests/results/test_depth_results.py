@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.images.gpano import area_of_angles, whole_area
-from datamodules.images.palette import distance_colors
-from datamodules.images.pixel_files import most_depth_m, read_depth_m, write_depth_m
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
 from tangent_train.inference.images import InputImage
+from tangent_train.io.gpano import area_of_angles, whole_area
+from tangent_train.io.palette import distance_colors
+from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 from tangent_train.results.depth_results import DepthResults, points_of, spread_pixels
 from tangent_train.results.pictures import colorize_distance, distance_picture
 from tangent_train.results.predictions import PredictedImage

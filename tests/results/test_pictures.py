@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from datamodules.core.panoramas import Panorama
-from datamodules.images.palette import class_colors
 from tangent_train.geometry import SphereArea, equirect_directions, rotation_about
+from tangent_train.io.palette import class_colors
 from tangent_train.results.pictures import (
     colorize,
     mixed_picture,

@@ -10,11 +10,11 @@ import pytest
 
 from datamodules.folder.classes import read_classes
 from datamodules.folder.reader import class_masks
-from datamodules.images.gpano import area_of_angles, whole_area
-from datamodules.images.image_files import short_names
-from datamodules.images.pixel_files import write_pixels
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.images import InputImage
+from tangent_train.io.gpano import area_of_angles, whole_area
+from tangent_train.io.image_files import short_names
+from tangent_train.io.pixel_files import write_pixels
 from tangent_train.results.label_results import LabelResults, class_shares
 from tangent_train.results.predictions import PredictedImage, PredictionFolder
 

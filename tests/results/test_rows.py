@@ -71,7 +71,7 @@ def test_other_settings_make_other_groups_named_by_what_differs() -> None:
         for rate, fold in [(0.01, 1), (0.01, 2), (0.02, 1), (0.02, 2)]
     ]
     # As of tangent-evaluate: null is what is not there.
-    records[1] = replace(records[1], settings={**records[1].settings, "class_map": None})
+    records[1] = replace(records[1], settings={**records[1].settings, "label_map": None})
     records.append(made_record([0.1, 0.2, 0.3], name="other", optimizer__lr=0.03))
     assert [(row.label, len(row.records)) for row in group_runs(records)] == [
         ("mine (optimizer.lr=0.01)", 2),

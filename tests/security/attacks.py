@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from tangent_train import registry
+from tangent_train.config import build as registry
 
 CANARY = "attack_canary"
 """A module that only attacks name; it does not exist, and asking for it is seen."""

@@ -9,7 +9,7 @@ import torch
 
 from tangent_train.cli.compose import literal_paths
 from tangent_train.cli.stored import StoredRun, stored_run
-from tangent_train.registry import SettingsFile
+from tangent_train.config.build import SettingsFile
 from tests.cli import tiny_runs
 from tests.running import composed_settings
 

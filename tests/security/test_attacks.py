@@ -20,9 +20,9 @@ from tangent_train.checkpoints.trained import METADATA_KEY, describe_network, lo
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.run import build
 from tangent_train.cli.stored import StoredRun, stored_run
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import DataError, SettingError
-from tangent_train.registry import build_from_config
-from tangent_train.rendering.camera_files import read_cameras
+from tangent_train.io.camera_files import read_cameras
 from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
 from tests.security.attacks import (

@@ -11,9 +11,9 @@ import cv2
 import pytest
 from PIL import Image, ImageFile
 
-from datamodules.images.gpano import read_area
-from datamodules.images.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from tangent_train.errors import DataError
+from tangent_train.io.gpano import read_area
+from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
 from tests.slow.fuzz.mutation import sealed_png
 
 Read = Callable[[Path], Any]

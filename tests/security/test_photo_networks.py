@@ -14,10 +14,10 @@ import torch
 from transformers import quantizers
 
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.photo_networks import smp
-from tangent_train.registry import SettingsFile, build_from_config
-from tests.inference.photo_networks import huggingface_networks as networks
+from tangent_train.photo_networks import smp
+from tests.photo_networks import huggingface_networks as networks
 from tests.security.attacks import CANARY, undeclared_settings
 from tests.security.watch import watched
 

@@ -18,12 +18,12 @@ from hypothesis import strategies as st
 from torch import nn
 
 from datamodules.core.store import Store
-from datamodules.images.image_files import short_names
-from datamodules.images.pixel_files import read_array, write_pixels
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
 from tangent_train.errors import DataError
+from tangent_train.io.image_files import short_names
+from tangent_train.io.pixel_files import read_array, write_pixels
 from tangent_train.results.label_results import LabelResults
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command

@@ -13,14 +13,14 @@ from rich.console import Console
 from torch import nn
 
 from models import initialize
-from tangent_train import registry
 from tangent_train.callbacks.checkpoints import BestCheckpoint
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.cli.run import build
+from tangent_train.config import build as registry
+from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import config_folder
-from tangent_train.registry import SettingsFile, build_from_config
 from tests.cli.tiny_runs import results, run_command
 from tests.running import Patch
 from tests.security.attacks import CANARY

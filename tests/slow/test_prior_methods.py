@@ -101,7 +101,7 @@ def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> No
     pytest.importorskip("torch_harmonics")
     settings = (
         *("experiment=shapes/default", "network=zonal_classifier", "network.widths=[4,8]"),
-        *("data.shapes.train=3", "data.shapes.test=2", "data.validation_fraction=0", "level=4"),
+        *("data.shapes.train=3", "data.shapes.test=2", "data.val_fraction=0", "level=4"),
         *("trainer.max_epochs=1", "scheduler=constant", "hydra.run.dir=run"),
     )
     run_in(tmp_path, "train", *settings, "representation=erp")

@@ -13,7 +13,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.run import build, inputs_and_classes
-from tangent_train.registry import SettingsFile, build_from_config
+from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings

@@ -21,13 +21,13 @@ def _expected(count: int, smoothing: float = 0.1) -> tuple[list[Tensor], Tensor]
 
 
 @pytest.mark.parametrize(
-    ("images_per_chunk", "chunks"), [(None, [4]), (1, [1] * 4), (15, [2, 2]), (1000, [4])]
+    ("view_batch_size", "chunks"), [(None, [4]), (1, [1] * 4), (15, [2, 2]), (1000, [4])]
 )
 def test_chunks_of_whole_shapes_give_the_gradient_of_the_batch(
-    images_per_chunk: int | None, chunks: list[int]
+    view_batch_size: int | None, chunks: list[int]
 ) -> None:
     seen: list[int] = []
-    task = shape_task(images_per_chunk=images_per_chunk, label_smoothing=0.1)
+    task = shape_task(view_batch_size=view_batch_size, label_smoothing=0.1)
     task.network.register_forward_pre_hook(lambda _, images: seen.append(len(images[0])))
     gradients = gradients_of(task, Shapes(4, 4))
     assert seen == chunks

@@ -40,7 +40,7 @@ def _task(**settings: Any) -> SegmentationTask:
 
 
 def _trained(accelerator: str, **settings: Any) -> SegmentationTask:
-    task, data = _task(images_per_chunk=17), Data()
+    task, data = _task(view_batch_size=17), Data()
     quiet = {"max_steps": 2, "max_epochs": 2, "limit_val_batches": 0, "devices": 1}
     trainer = quiet_trainer(accelerator=accelerator, **quiet, **settings)
     trainer.fit(task, datamodule=data)
@@ -79,8 +79,8 @@ def test_cuda_graphs_in_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     # The checks of shapes while tests run cannot be compiled by torch 2.11.
     monkeypatch.setattr(UNet, "forward", inspect.unwrap(UNet.forward))
     images = torch.randn(20, 2, 16, 16, device="cuda")
-    plain = _task(images_per_forward=5).cuda().eval()
-    graphs = _task(images_per_forward=5, compile={"mode": "reduce-overhead"}).cuda().eval()
+    plain = _task(eval_view_batch_size=5).cuda().eval()
+    graphs = _task(eval_view_batch_size=5, compile={"mode": "reduce-overhead"}).cuda().eval()
     labels = [task.predict_labels(images, (32, 64)) for task in (plain, graphs, graphs)]
     for found in labels[1:]:
         assert (found == labels[0]).double().mean() > 0.99

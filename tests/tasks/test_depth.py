@@ -91,7 +91,7 @@ def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) ->
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None:
     """Within the limits, in training and evaluation; unknown truth counts for nothing."""
-    task, data = _task(Right(kind), images_per_forward=7, max_distance=5.0), Data()
+    task, data = _task(Right(kind), eval_view_batch_size=7, max_distance=5.0), Data()
     (batch,) = data.train_dataloader()
     images, truth = task.training_pairs(batch)
     near = (batch.labels > 0) & (batch.labels <= 5 * 512)
@@ -196,7 +196,7 @@ def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
     expected = torch.autograd.grad(mean, list(network.parameters()))
     whole = torch.cat([part.flatten() for part in expected])
     for size, batch_size in ((None, 3), (7, 3), (7, 1)):
-        trained = _task(_network(), images_per_chunk=size, **settings)
+        trained = _task(_network(), view_batch_size=size, **settings)
         kept = gradients_of(trained, Data(batch_size), accumulate_grad_batches=3 // batch_size)
         found = torch.cat([gradient.flatten() for gradient in kept.found])
         assert float((found - whole).norm() / whole.norm()) < 1e-4

@@ -74,7 +74,7 @@ def _task(network: nn.Module, **settings: Any) -> SegmentationTask:
 
 
 def test_evaluation_scores_every_panorama_against_its_own_labels() -> None:
-    task = _task(SignNetwork(), images_per_forward=7)
+    task = _task(SignNetwork(), eval_view_batch_size=7)
     trainer = quiet_trainer()
     (figures,) = trainer.test(task, datamodule=Data(), verbose=False)
     assert task.evaluated == 3
@@ -118,11 +118,11 @@ class Looking(nn.Module):
         self.received: list[tuple[tuple[int, ...], int | None]] = []
 
     def forward(
-        self, images: Tensor, rays: Tensor | None = None, images_per_chunk: int | None = None
+        self, images: Tensor, rays: Tensor | None = None, view_batch_size: int | None = None
     ) -> Tensor:
         if rays is None:
             rays = torch.eye(3).expand(len(images), 1, 3, 3)
-        self.received.append((tuple(rays.shape), images_per_chunk))
+        self.received.append((tuple(rays.shape), view_batch_size))
         height, width = images.shape[-2:]
         y, x = torch.meshgrid(_centers(height), _centers(width), indexing="ij")
         pixels = torch.stack([x, y, torch.ones_like(x)], dim=-1)
@@ -136,7 +136,7 @@ def _centers(count: int) -> Tensor:
 
 def test_such_a_network_gets_viewing_rays_and_divides_its_images() -> None:
     network = Looking()
-    task = _task(network, class_weights=[1.0, 1.0], images_per_chunk=3, images_per_forward=7)
+    task = _task(network, class_weights=[1.0, 1.0], view_batch_size=3, eval_view_batch_size=7)
     quiet_trainer(max_steps=1, limit_val_batches=0).fit(task, datamodule=Data(2))
     assert network.received == [((2, 20, 3, 3), 3)]
     network.received.clear()
@@ -164,8 +164,8 @@ def test_scores_that_do_not_fit_are_refused() -> None:
     ("name", "value"),
     [
         ("label_smoothing", 1.0),
-        ("images_per_chunk", 0),
-        ("images_per_forward", 0),
+        ("view_batch_size", 0),
+        ("eval_view_batch_size", 0),
         ("absent_class", "drop"),
         ("auxiliary_weight", float("nan")),
         ("class_weights", "logg"),

@@ -29,7 +29,7 @@ def _network() -> nn.Module:
     )
 
 
-def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationTask:
+def _task(view_batch_size: int | None = None, **settings: Any) -> SegmentationTask:
     return SegmentationTask(
         _network(),
         TANGENT,
@@ -37,17 +37,17 @@ def _task(images_per_chunk: int | None = None, **settings: Any) -> SegmentationT
         settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1)),
         class_weights=WEIGHTS.tolist(),
         label_smoothing=0.1,
-        images_per_chunk=images_per_chunk,
+        view_batch_size=view_batch_size,
         **settings,
     )
 
 
 def _gradients(
-    images_per_chunk: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
+    view_batch_size: int | None, batch_size: int = 3, trainer: Any = None, **settings: Any
 ) -> tuple[list[Tensor], Tensor]:
     """Return the gradients of the last step of an epoch of three spheres, and its last loss."""
     given = {"accumulate_grad_batches": 3 // batch_size} | (trainer or {})
-    kept = gradients_of(_task(images_per_chunk, **settings), Data(batch_size=batch_size), **given)
+    kept = gradients_of(_task(view_batch_size, **settings), Data(batch_size=batch_size), **given)
     return kept.found, kept.loss
 
 

@@ -19,7 +19,6 @@ from tangent_train.geometry import (
     equirect_shape,
     random_rotation,
 )
-from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, check_choice
 from tangent_train.rendering.forward import Interpolation, Pixels, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
@@ -107,7 +106,6 @@ class EquirectViews(Views):
         return scores[..., down[:, None], across.clamp(0, width - 1)]
 
 
-@registered
 class EquirectRepresentation:
     """The baseline without tangent images: the equirectangular image, or random crops of it.
 

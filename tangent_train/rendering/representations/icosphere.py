@@ -36,7 +36,6 @@ from tangent_train.geometry.icosphere_signals import (
     nearest_vertices,
     sampling_points,
 )
-from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, check_choice, check_panorama
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.representations.perspective import PhotoCrops
@@ -207,7 +206,6 @@ def _at_vertices(values: Tensor, level: int) -> Tensor:
     return sample(values, Taps(around.clamp(min=0), weight))
 
 
-@registered
 class IcosphereRepresentation:
     """A signal on the vertices or faces of an icosphere, for networks on its mesh.
 

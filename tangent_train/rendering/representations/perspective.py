@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import lengths_of_rays, shift_range
-from tangent_train.registry import registered
 from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import CanvasGeometry
 from tangent_train.rendering.representations.views import Views
@@ -234,7 +233,6 @@ class PhotoSampler:
         return PhotoCrops(inside, size, mirrored, camera_matrix=matrix)
 
 
-@registered
 class PerspectiveRepresentation:
     """Crops of photos, normalized to one camera. Evaluation covers the photo and counts it once.
 

@@ -23,7 +23,6 @@ from tangent_train.geometry import (
 )
 from tangent_train.geometry.area_views import best_views, views_of_area
 from tangent_train.geometry.coverage import check_coverage
-from tangent_train.registry import registered
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
@@ -31,7 +30,7 @@ _Grid = TypeVar("_Grid", bound=PinholeGrid)
 
 
 class PinholeRepresentation:
-    """Pinhole images around the center: base of tangent images, level views and cube maps.
+    """Pinhole images around the center: base of tangent images, horizontal views and cube maps.
 
     Args:
         grid: Images of `level`, not rotated.
@@ -189,7 +188,6 @@ class PinholeRepresentation:
         return [PinholeViews(grid) for grid, _ in pairs]
 
 
-@registered
 class TangentRepresentation(PinholeRepresentation):
     """Tangent images (paper, section 3.2).
 
@@ -252,7 +250,6 @@ class TangentRepresentation(PinholeRepresentation):
         )
 
 
-@registered
 class CubemapRepresentation(PinholeRepresentation):
     """Cube-map baseline: the six faces of a cube, all used in training and evaluation.
 

@@ -15,9 +15,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.images.palette import class_colors, distance_colors
 from tangent_train.files import atomic_path
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.io.palette import class_colors, distance_colors
 from tangent_train.results.html.distances import DistanceScale, camera_in_sides, pack_distances
 from tangent_train.results.tables import Table
 

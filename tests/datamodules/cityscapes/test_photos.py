@@ -65,8 +65,8 @@ def test_validation_takes_whole_training_cities(shared: Path) -> None:
     assert len(cities["val"]) == 1
     assert cities["val"] | cities["train"] == set(streets.CITIES["train"])
     assert len(names_of(photos(shared), "train")) == 4
-    assert "ulm/000000_000001" in names_of(photos(shared, validation_fraction=0), "train")
-    assert not names_of(photos(shared, validation_fraction=0), "val")
+    assert "ulm/000000_000001" in names_of(photos(shared, val_fraction=0), "train")
+    assert not names_of(photos(shared, val_fraction=0), "val")
 
 
 def test_a_check_counts_and_finds_strays_and_missing_labels(root: Path) -> None:

@@ -13,9 +13,9 @@ from PIL import Image
 from datamodules import FolderPanoramas
 from datamodules.core.panoramas import ImageFiles, Panorama
 from datamodules.core.transforms import EstimatedUp, RotatedPanoramas, placed
-from datamodules.images.gpano import Fill, PanoramaArea
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import SphereArea, equirect_directions
+from tangent_train.io.gpano import Fill, PanoramaArea
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, read_png
 from tests.datamodules.folder.folder_format import save, write_strips

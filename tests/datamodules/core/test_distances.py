@@ -28,10 +28,10 @@ from datamodules import (
 )
 from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.images.pixel_files import write_depth_m
 from datamodules.synthia.omnisynthia import SEQUENCES
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
+from tangent_train.io.pixel_files import write_depth_m
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import read_png, write_png
@@ -209,7 +209,7 @@ def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> No
         save(tmp_path / "images" / f"{name}.png", np.zeros((32, 64, 3), np.uint8))
         write_depth_m(tmp_path / "depth" / f"{name}{suffix}", meters, 1)
     representation: Any = EquirectRepresentation(4)
-    data = _data(SOURCES["folder"], tmp_path, representation, validation_fraction=0)
+    data = _data(SOURCES["folder"], tmp_path, representation, val_fraction=0)
     labels = data.dataset("test")[0].target.numpy()
     assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
     np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
@@ -252,7 +252,7 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
         stored = np.full((32, 64), meters * 250, np.uint16)
         stored[:8] = 0
         write_png(tmp_path / "depth" / name / "view.0.png", stored)
-    data = _data(SOURCES["folder"], tmp_path, validation_fraction=0, labels=DISTANCE)
+    data = _data(SOURCES["folder"], tmp_path, val_fraction=0, labels=DISTANCE)
     problems, _ = data.check()
     near, none, far = sorted(problems.warnings)
     assert near.startswith(str(tmp_path / "depth/scene_0/view.0.png: median distance 0.00"))

@@ -67,7 +67,7 @@ def test_data_are_generated_then_read_like_the_real_set(
     of: _Generated, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("os.cpu_count", lambda: 1)  # in this process
-    settings = {of.setting: vars(of.settings), "validation_fraction": 0.5}
+    settings = {of.setting: vars(of.settings), "val_fraction": 0.5}
     module = of.module(tmp_path / "data", TangentRepresentation(0, 2), **settings)
     with pytest.raises(DataError, match="no such folder"):
         module.setup()

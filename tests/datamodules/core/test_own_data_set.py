@@ -16,8 +16,8 @@ from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.index import Split
 from datamodules.core.panoramas import ImageFiles, PngReader
 from datamodules.core.problems import Problems
-from datamodules.images.pixel_files import read_pixels
 from tangent_train.errors import DataError, SettingError
+from tangent_train.io.pixel_files import read_pixels
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png, write_png
 
@@ -53,7 +53,7 @@ def _write(root: Path, largest: int) -> None:
 
 
 def _toy(root: Path) -> Toy:
-    return Toy(root, EquirectRepresentation(level=4), inputs=["rgb"], validation_fraction=0)
+    return Toy(root, EquirectRepresentation(level=4), inputs=["rgb"], val_fraction=0)
 
 
 def test_a_data_set_is_a_reader_and_its_files(tmp_path: Path) -> None:

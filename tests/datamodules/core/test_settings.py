@@ -35,7 +35,7 @@ CROPS: Any = PerspectiveRepresentation(level=5)
 @pytest.mark.parametrize(
     ("data", "settings", "name"),
     [
-        (Stanford2D3DS, {"panoramas_per_step": 0}, "panoramas_per_step"),
+        (Stanford2D3DS, {"batch_size": 0}, "batch_size"),
         (Stanford2D3DS, {"normalization": RGB_NORMALIZATION}, "normalization"),
         (Stanford2D3DS, {"color_jitter": 1.1}, "color_jitter"),
         (Stanford2D3DS, {"inputs": "rgb"}, "inputs: found rgb; expected a list"),
@@ -46,7 +46,7 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (Stanford2D3DS, {"test_rotation": 200}, "test_rotation"),
         (Stanford2D3DS, {"fold": 4}, "fold"),
         (Stanford2D3DS, {"unknown": "black"}, "unknown"),
-        (Stanford2D3DS, {"validation_fraction": 1.0}, "validation_fraction"),
+        (Stanford2D3DS, {"val_fraction": 1.0}, "val_fraction"),
         (Stanford2D3DS, {"areas": ("5a", "5b")}, "areas"),
         (OmniSynthia, {"train_sequences": ("03",)}, "train_sequences"),
         (OmniSynthia, {"test_sequences": ()}, "test_sequences"),
@@ -87,7 +87,7 @@ CROPS: Any = PerspectiveRepresentation(level=5)
         (SynPASS, {"time": "dawn"}, "time"),
         (SynPASS, {"test_split": "train"}, "test_split"),
         (Matterport360, {"release": "sfss", "classes": "360bev"}, "classes: .*expected 41"),
-        (ModelNet40, {"shapes_per_step": 0}, "shapes_per_step"),
+        (ModelNet40, {"batch_size": 0}, "batch_size"),
         (ModelNet40, {"test_rotation": "z"}, "test_rotation"),
     ],
     ids=lambda value: value.__name__ if isinstance(value, type) else str(value),

@@ -21,10 +21,10 @@ from datamodules.core.class_weights import class_weights
 from datamodules.core.index import SPLITS
 from datamodules.core.loading import EpochSampler, sample_rng
 from datamodules.core.panoramas import ImageFiles
-from datamodules.images.pixel_files import read_rgb
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import SettingError
+from tangent_train.io.pixel_files import read_rgb
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
@@ -173,7 +173,7 @@ def test_processes_take_the_index_of_the_first_which_has_read_everything_once(
 
     names = []
     for rank in range(2):
-        module = Stanford2D3DS(root, erp, skip_broken=True, validation_fraction=0)
+        module = Stanford2D3DS(root, erp, skip_broken=True, val_fraction=0)
         for stage in ("fit", "test"):
             state = SimpleNamespace(fn=TrainerFn.FITTING if stage == "fit" else TrainerFn.TESTING)
             strategy = SimpleNamespace(broadcast=broadcast)
@@ -218,7 +218,7 @@ def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
         "use_distributed_sampler": False,
         "num_sanity_val_steps": 0,
     }
-    task, module = Seen(), make_module(panoramas_per_step=1)
+    task, module = Seen(), make_module(batch_size=1)
 
     def save(trainer: Trainer, *_: Any) -> None:
         if trainer.global_step == 1:
@@ -232,7 +232,7 @@ def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
     assert task.batches["val"][:1] == task.batches["val"][-1:]
     resumed, trainer = Seen(), Trainer(max_epochs=2, overfit_batches=2, **quiet)
     path = tmp_path / "within.ckpt"
-    trainer.fit(resumed, datamodule=make_module(panoramas_per_step=1), ckpt_path=path)
+    trainer.fit(resumed, datamodule=make_module(batch_size=1), ckpt_path=path)
     assert resumed.batches["train"] == [second, first, second]
     task = Seen()
     limits: dict[str, Any] = {"limit_train_batches": 3, "limit_val_batches": 1}

@@ -49,7 +49,7 @@ def test_the_representation_is_tangent_images_of_a_level(rooms: Path) -> None:
 
 def test_samples_have_an_index_or_an_epoch_and_an_index(rooms: Path) -> None:
     representation = TangentRepresentation(0, 5, faces_per_panorama=2)
-    data = Stanford2D3DS(rooms, representation, areas=("1", "5a"), validation_fraction=0)
+    data = Stanford2D3DS(rooms, representation, areas=("1", "5a"), val_fraction=0)
     for split, count in (("train", 2), ("test", 1)):
         samples: Any = data.dataset(split)  # type: ignore[arg-type]
         assert [sample.index for sample in samples] == list(range(count)) == list(range(count))

@@ -19,7 +19,7 @@ K: list[list[float]] = [[70, 0, 30.5], [0, 72, 20], [0, 0, 1]]
 
 
 def _photos(root: Path, **settings: Any) -> FolderPhotos:
-    return FolderPhotos(root, CROPS, validation_fraction=0, **settings)
+    return FolderPhotos(root, CROPS, val_fraction=0, **settings)
 
 
 def _only(root: Path, name: str, **settings: Any) -> Photo:

@@ -34,7 +34,7 @@ def test_whole_scenes_are_drawn_by_share_and_seed(tmp_path: Path, erp: Any) -> N
     other = _all_names(FolderPanoramas(root, erp, split_seed=1))
     assert other["test"] != names["test"]
     assert other["val"] != names["val"]
-    settings: dict[str, Any] = {"test_fraction": 0.5, "validation_fraction": 0}
+    settings: dict[str, Any] = {"test_fraction": 0.5, "val_fraction": 0}
     half = _all_names(FolderPanoramas(root, erp, **settings))
     assert [len(half[split]) for split in SPLITS] == [20, 0, 20]
     assert FolderPanoramas(root, erp, **settings).val_dataloader() == []
@@ -54,7 +54,7 @@ def test_lists_of_all_splits(own_root: Path, erp: Any) -> None:
         "val": ["scene_1/view.1"],
         "test": ["scene_0/view.1", "scene_3/view.0"],
     }
-    assert names_of(FolderPanoramas(own_root, erp, validation_fraction=0), "val") == []
+    assert names_of(FolderPanoramas(own_root, erp, val_fraction=0), "val") == []
 
 
 def test_lists_of_some_splits(own_root: Path, erp: Any) -> None:
@@ -103,7 +103,7 @@ def test_data_sets_of_few_scenes_train(tmp_path: Path, erp: Any) -> None:
         ({"test": "scene_9/view.0"}, r"test\.txt: found 'scene_9/view\.0', which is not an image"),
         ({"test": "scene_0/view.0", "train": "scene_0/view.0"}, r"also in .*train\.txt"),
         ({"test": ""}, r"found no images for test; .* Name some in test\.txt"),
-        ({"val": "# none"}, r"no images for val; .*data\.validation_fraction=0"),
+        ({"val": "# none"}, r"no images for val; .*data\.val_fraction=0"),
         ({"test": b"\xff\xfe"}, r"test\.txt: found .*UTF-8"),
     ],
 )

@@ -85,19 +85,19 @@ def _labels(module: ModelNet40, split: Split) -> list[int]:
 def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> None:
     drawn = set()
     for seed in range(4):
-        module = make_module(validation_fraction=0.34, seed=seed)
+        module = make_module(val_fraction=0.34, seed=seed)
         labels = _labels(module, "val")
         # A third of 6, 4 and 5.
         assert [labels.count(k) for k in range(3)] == [2, 1, 2]
         drawn.add(tuple(names_of(module, "val")))
-        again = make_module(validation_fraction=0.34, seed=seed)
+        again = make_module(val_fraction=0.34, seed=seed)
         assert names_of(again, "val") == names_of(module, "val")
         names = {name for split in SPLITS for name in names_of(module, split)}
         assert len(names) == sum(len(_labels(module, split)) for split in SPLITS) == TRAINING + TEST
         assert all("/test/" in name for name in names_of(module, "test"))
     assert len(drawn) > 1
-    assert len(make_module(validation_fraction=0).source("val")) == 0
-    assert make_module(validation_fraction=0).val_dataloader() == []
+    assert len(make_module(val_fraction=0).source("val")) == 0
+    assert make_module(val_fraction=0).val_dataloader() == []
 
 
 def test_classes_before_there_are_files(tmp_path: Path) -> None:
@@ -112,7 +112,7 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
 
 
 def test_batches_have_the_documented_shapes(make_module: MakeModule) -> None:
-    module = make_module(shapes_per_step=4, validation_fraction=0)
+    module = make_module(batch_size=4, val_fraction=0)
     batches = list(module.train_dataloader())
     assert [len(batch.label) for batch in batches] == [4, 4, 4, 3]
     assert batches[0].images.shape == (4, 20, 8, 8, CHANNELS)
@@ -164,7 +164,7 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
     root = write_tree(tmp_path, counts={"bottle": (1, 2)})
     for path in (root / "bottle/test").iterdir():
         ball.export(path)
-    module = ModelNet40(root, representation, test_rotation=rotation, validation_fraction=0)
+    module = ModelNet40(root, representation, test_rotation=rotation, val_fraction=0)
     module.prepare_data()
     samples = module.dataset("test")
     assert isinstance(samples, ShapeViews)

@@ -46,7 +46,7 @@ def test_instances_past_the_end_are_counted_and_listed_by_the_check(
     known = int((colors != 13).any(-1).sum())
     colors[20:22, 30:32] = (0xAB, 0xCD, 0xEF)
     write_png(file, colors)
-    data = Stanford2D3DS(root, level=3, validation_fraction=0)
+    data = Stanford2D3DS(root, level=3, val_fraction=0)
     data.prepare_data()
     problems, _ = data.check()
     (warning,) = problems.warnings
@@ -81,7 +81,7 @@ def test_other_file_names_are_refused(name: str) -> None:
 def test_folds_are_disjoint_and_rooms_stay_whole(
     stanford_root: Path, erp: Any, fold: int, seed: int
 ) -> None:
-    module = Stanford2D3DS(stanford_root, erp, fold=fold, seed=seed, validation_fraction=0.3)
+    module = Stanford2D3DS(stanford_root, erp, fold=fold, seed=seed, val_fraction=0.3)
     module.setup("fit")
     splits = {split: names_of(module, split) for split in ("train", "val", "test")}
     names = [name for split in splits.values() for name in split]
@@ -199,9 +199,9 @@ def test_distances_saturate_and_holes_stay_holes() -> None:
 
 
 def test_photos_are_split_as_the_panoramas(photo_root: Path) -> None:
-    photos = Stanford2D3DSPerspective(photo_root, CROPS, fold=2, seed=3, validation_fraction=0.3)
+    photos = Stanford2D3DSPerspective(photo_root, CROPS, fold=2, seed=3, val_fraction=0.3)
     panoramas = Stanford2D3DS(
-        photo_root, TangentRepresentation(0, 4), fold=2, seed=3, validation_fraction=0.3
+        photo_root, TangentRepresentation(0, 4), fold=2, seed=3, val_fraction=0.3
     )
     for split in SPLITS:
         shown, whole = names_of(photos, split), names_of(panoramas, split)
@@ -214,7 +214,7 @@ def test_photos_are_split_as_the_panoramas(photo_root: Path) -> None:
 
 def test_samples_of_photos(photo_root: Path) -> None:
     module = Stanford2D3DSPerspective(
-        photo_root, CROPS, photos_per_step=3, validation_fraction=0, in_memory=True
+        photo_root, CROPS, batch_size=3, val_fraction=0, in_memory=True
     )
     batch = next(iter(module.train_dataloader()))
     assert [part.shape for part in batch.images] == [(3, 2, 16, 16, 3), (3, 2, 16, 16)]

@@ -51,7 +51,7 @@ def test_splits_are_those_of_the_scenes(root: Path, erp: Any) -> None:
     tested = Structured3D(root, erp, test_split="val", configuration="empty")
     assert [n[6:11] for n in names_of(tested, "test")] == found["val"]
     assert sorted(n[6:11] for s in ("train", "val") for n in names_of(tested, s)) == found["train"]
-    assert names_of(Structured3D(root, erp, validation_fraction=0), "val") == []
+    assert names_of(Structured3D(root, erp, val_fraction=0), "val") == []
 
 
 @pytest.mark.parametrize("invalid_scenes", ["keep", "leave_out"])

@@ -45,11 +45,11 @@ def test_splits_are_those_of_the_folders(shared: Path) -> None:
     names = {split: names_of(panoramas(shared), split) for split in SPLITS}
     assert names["test"] == ["MAP_8_point1/sun/000000", "MAP_8_point1/sun/000001"]
     assert [len(names[split]) for split in SPLITS] == [6, 4, 2]
-    assert not names_of(panoramas(shared, validation_fraction=0), "val")
+    assert not names_of(panoramas(shared, val_fraction=0), "val")
 
 
 def test_a_test_on_val_takes_whole_training_points_for_validation(shared: Path) -> None:
-    data = panoramas(shared, test_split="val", validation_fraction=0.4)
+    data = panoramas(shared, test_split="val", val_fraction=0.4)
     points = {s: {name.split("/")[0] for name in names_of(data, s)} for s in SPLITS}
     assert points["test"] == {"MAP_6_point10", "MAP_6_point11"}
     assert not points["train"] & points["val"]
@@ -60,7 +60,7 @@ def test_weather_and_time_are_settings_and_groups(shared: Path) -> None:
     data = panoramas(shared, test_split="val")
     files = data.index().splits["test"]
     assert [data.groups(f) for f in files] == [["fog", "day"]] * 2 + [["sun", "night"]] * 2
-    sun = panoramas(shared, weather=["sun"], test_split="val", validation_fraction=0)
+    sun = panoramas(shared, weather=["sun"], test_split="val", val_fraction=0)
     assert {name.split("/")[1] for s in SPLITS for name in names_of(sun, s)} == {"sun"}
     night = names_of(panoramas(shared, time="night", test_split="val"), "test")
     assert {name.split("/")[0] for name in night} == {"MAP_6_point11"}
@@ -83,7 +83,7 @@ def test_a_check_names_what_lists_and_files_disagree_on(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("settings", "listed"), [({"validation_fraction": 0}, 1), ({"weather": "fog"}, 0)]
+    ("settings", "listed"), [({"val_fraction": 0}, 1), ({"weather": "fog"}, 0)]
 )
 def test_points_outside_the_chosen_splits_and_weathers_are_not_missing(
     shared: Path, settings: dict[str, Any], listed: int

@@ -52,8 +52,8 @@ def test_splits_follow_the_authors(root: Path, erp: Any) -> None:
     assert len(splits["train"]) == 14 - 4
     assert len({name for split in splits.values() for name in split}) == sum(FRAMES.values())
     assert not list(root.rglob("*.json"))
-    assert len(names_of(OmniSynthia(root, erp, validation_fraction=0.99), "train")) == 4
-    assert not names_of(OmniSynthia(root, erp, validation_fraction=0), "val")
+    assert len(names_of(OmniSynthia(root, erp, val_fraction=0.99), "train")) == 4
+    assert not names_of(OmniSynthia(root, erp, val_fraction=0), "val")
 
 
 # --- reading -------------------------------------------------------------------------------------

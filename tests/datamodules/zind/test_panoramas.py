@@ -66,11 +66,11 @@ def test_labels_are_cast_at_the_size_of_the_run(
 
 
 def test_no_room_is_in_two_splits(root: Path) -> None:
-    data = _zind(root, test_fraction=0.3, validation_fraction=0.3, seed=5)
+    data = _zind(root, test_fraction=0.3, val_fraction=0.3, seed=5)
     rooms = [{n.rpartition("/")[0] for n in names_of(data, split)} for split in SPLITS]
     assert all(rooms)
     assert sum(map(len, rooms)) == len(set.union(*rooms)) == 4
-    again = _zind(root, test_fraction=0.3, validation_fraction=0.3, seed=6)
+    again = _zind(root, test_fraction=0.3, val_fraction=0.3, seed=6)
     assert [names_of(data, s) for s in SPLITS] == [names_of(again, s) for s in SPLITS]
     drawn = {
         tuple(names_of(_zind(root, test_fraction=0.3, split_seed=seed), "test"))
@@ -94,7 +94,7 @@ def test_the_partition_of_the_release_decides(root: Path) -> None:
     data = _zind(root)
     homes = [{n.partition("/")[0] for n in names_of(data, split)} for split in SPLITS]
     assert homes == [{"002"}, {"000"}, {"001"}]
-    assert not names_of(_zind(root, validation_fraction=0), "val")
+    assert not names_of(_zind(root, val_fraction=0), "val")
     partition.write_text(json.dumps({"train": ["002"], "val": [], "test": ["000"]}))
     with pytest.raises(DataError, match=r"zind_partition\.json: found no home 001; expected every"):
         _zind(root).setup()

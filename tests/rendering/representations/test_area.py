@@ -20,7 +20,7 @@ from tangent_train.geometry import (
 from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,
-    RingRepresentation,
+    HorizontalRepresentation,
     TangentRepresentation,
 )
 
@@ -33,9 +33,9 @@ TANGENT: dict[str, Any] = {
     "tangent, b = 0": TangentRepresentation(0, 6),
     "tangent, b = 1": TangentRepresentation(1, 6),
     "cropped": TangentRepresentation(0, 6, crop_multiple=2, blend="nearest"),
-    "ring": RingRepresentation(6, RINGS, [100, 100]),
+    "horizontal": HorizontalRepresentation(6, RINGS, [100, 100]),
     "cube map": CubemapRepresentation(6),
-    "rings of two widths": RingRepresentation(
+    "rings of two widths": HorizontalRepresentation(
         6,
         [{"pitch": 0, "views": 6}, *({"pitch": p, "views": 3, "fov": 120} for p in (50, -50))],
         100,
@@ -57,7 +57,7 @@ def _rotations(seed: int | None) -> tuple[NDArray[np.float64] | None, NDArray[np
         "tangent, b = 0": (10, 20),
         "tangent, b = 1": (40, 80),
         "cropped": (10, 20),
-        "ring": (8, 18),
+        "horizontal": (8, 18),
         "cube map": (4, 6),
     }.items(),
 )
@@ -157,7 +157,7 @@ def test_averaged_rotations_of_a_narrow_part_are_one_view() -> None:
 
 
 def test_level_views_of_an_area_are_refused_for_more_than_that() -> None:
-    row = RingRepresentation(6, RINGS[:1], [100, 100], area=STRIP)
+    row = HorizontalRepresentation(6, RINGS[:1], [100, 100], area=STRIP)
     assert len(row.limited_to(SphereArea.of(STRIP)).view_sets()[0]) == 8
     tilted = rotation_about((0, 1, 0), 0.5)
     for area, rotation in (

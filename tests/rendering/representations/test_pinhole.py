@@ -9,6 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     PinholeGrid,
@@ -18,13 +19,12 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.inference.representations import view_settings
-from tangent_train.registry import build_from_config
 from tangent_train.rendering import (
     Blend,
     CubemapRepresentation,
     EquirectRepresentation,
+    HorizontalRepresentation,
     Representation,
-    RingRepresentation,
     TangentRepresentation,
     equirect_to_tangent,
     rotate_equirect,
@@ -68,9 +68,9 @@ RINGS = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "vi
 WIDE_RINGS = [{"pitch": 0, "views": 6, "fov": 130}, *RINGS[1:]]
 
 REPRESENTATIONS: list[Representation] = [
-    RingRepresentation(5, RINGS, 100),
-    RingRepresentation(5, RINGS, (110, 100), 40, blend="nearest", mirror=True),
-    RingRepresentation(5, WIDE_RINGS, 100),
+    HorizontalRepresentation(5, RINGS, 100),
+    HorizontalRepresentation(5, RINGS, (110, 100), 40, blend="nearest", mirror=True),
+    HorizontalRepresentation(5, WIDE_RINGS, 100),
     TangentRepresentation(0, 5),
     TangentRepresentation(1, 5, blend="feather"),
     TangentRepresentation(0, 5, crop_multiple=8, random_rotation="so3", mirror=True),
@@ -103,8 +103,8 @@ def test_labels_come_back_from_the_views_of_the_whole_sphere(
         TangentRepresentation(0, 5, faces_per_panorama=5, random_rotation="so3", mirror=True),
         CubemapRepresentation(5, random_rotation="yaw", mirror=True),
         CubemapRepresentation(5, random_rotation="so3"),
-        RingRepresentation(5, RINGS, 100, None, 6, "yaw", mirror=True),
-        RingRepresentation(5, WIDE_RINGS, 100, None, 6, "yaw", mirror=True),
+        HorizontalRepresentation(5, RINGS, 100, None, 6, "yaw", mirror=True),
+        HorizontalRepresentation(5, WIDE_RINGS, 100, None, 6, "yaw", mirror=True),
         EquirectRepresentation(5, crop_deg=60, random_rotation="yaw", mirror=True),
         EquirectRepresentation(5, random_rotation="so3"),
     ],
@@ -183,24 +183,32 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (TangentRepresentation, {"random_rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
         (TangentRepresentation, {"blend": "average"}, "'nearest' or 'feather'"),
         (TangentRepresentation, {"rotations": 0}, "rotations: found 0"),
-        (RingRepresentation, {"faces_per_panorama": 19}, "found 19; expected 1 to 18"),
-        (RingRepresentation, {"dim": [32]}, r"dim: found \[32\]"),
-        (RingRepresentation, {"fov": 180}, r"fov: found \[180, 180\]; expected 0 to 170"),
+        (HorizontalRepresentation, {"faces_per_panorama": 19}, "found 19; expected 1 to 18"),
+        (HorizontalRepresentation, {"dim": [32]}, r"dim: found \[32\]"),
+        (HorizontalRepresentation, {"fov": 180}, r"fov: found \[180, 180\]; expected 0 to 170"),
         (
-            RingRepresentation,
+            HorizontalRepresentation,
             {"fov": [90, 90, 80]},
             r"fov: found \[90, 90, 80\]; expected 0 to 170",
         ),
-        (RingRepresentation, {"rings": []}, r"rings: found \[\]; expected one ring"),
-        (RingRepresentation, {"rings": [{"pitch": 91, "views": 8}]}, "pitch: -90 to 90"),
-        (RingRepresentation, {"rings": [{"pitch": math.nan, "views": 8}]}, "'pitch': nan"),
-        (RingRepresentation, {"rings": [{"pitch": 0, "views": 10**9}]}, "views: 1 to 360"),
-        (RingRepresentation, {"rings": [{"pitch": 0, "view": 8}]}, "{'pitch': 0, 'view': 8}"),
-        (RingRepresentation, {"rings": [{"pitch": 0, "views": 0}]}, "views: 1 to 360"),
-        (RingRepresentation, {"rings": [{"pitch": 90, "views": 2}]}, "the same direction"),
-        (RingRepresentation, {"rings": WIDE_RINGS[:2]}, r"11 views that miss .*latitude -\d\d°"),
-        (RingRepresentation, {"rings": WIDE_RINGS, "blend": "nearest"}, "expected feather, or the"),
-        (RingRepresentation, {"rings": [{**WIDE_RINGS[0], "fov": 175}]}, "fov: found"),
+        (HorizontalRepresentation, {"rings": []}, r"rings: found \[\]; expected one ring"),
+        (HorizontalRepresentation, {"rings": [{"pitch": 91, "views": 8}]}, "pitch: -90 to 90"),
+        (HorizontalRepresentation, {"rings": [{"pitch": math.nan, "views": 8}]}, "'pitch': nan"),
+        (HorizontalRepresentation, {"rings": [{"pitch": 0, "views": 10**9}]}, "views: 1 to 360"),
+        (HorizontalRepresentation, {"rings": [{"pitch": 0, "view": 8}]}, "{'pitch': 0, 'view': 8}"),
+        (HorizontalRepresentation, {"rings": [{"pitch": 0, "views": 0}]}, "views: 1 to 360"),
+        (HorizontalRepresentation, {"rings": [{"pitch": 90, "views": 2}]}, "the same direction"),
+        (
+            HorizontalRepresentation,
+            {"rings": WIDE_RINGS[:2]},
+            r"11 views that miss .*latitude -\d\d°",
+        ),
+        (
+            HorizontalRepresentation,
+            {"rings": WIDE_RINGS, "blend": "nearest"},
+            "expected feather, or the",
+        ),
+        (HorizontalRepresentation, {"rings": [{**WIDE_RINGS[0], "fov": 175}]}, "fov: found"),
         (EquirectRepresentation, {"crop_deg": 0}, "crop_deg: found 0; expected 0 to 360"),
         (EquirectRepresentation, {"crop_deg": 361}, "crop_deg: found 361"),
         (EquirectRepresentation, {"rows": 0}, "rows: found 0"),
@@ -211,7 +219,7 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
 def test_impossible_settings_are_refused(made: Any, settings: dict[str, Any], message: str) -> None:
     needed: dict[Any, dict[str, Any]] = {
         TangentRepresentation: {"base_level": 0},
-        RingRepresentation: {"rings": RINGS, "fov": 100},
+        HorizontalRepresentation: {"rings": RINGS, "fov": 100},
     }
     with pytest.raises(SettingError, match=message):
         made(**needed.get(made, {}) | {"level": 5} | settings)
@@ -243,7 +251,11 @@ def test_scores_of_other_rows_are_interpolated_around_the_sphere(rows: int) -> N
 
 @pytest.mark.parametrize(
     ("option", "counts", "step_deg"),
-    [("ring", [18], 22.5), ("ring_economy", [12], 30), ("ring_wide", [6, 10], 30)],
+    [
+        ("horizontal", [18], 22.5),
+        ("horizontal_economy", [12], 30),
+        ("horizontal_wide", [6, 10], 30),
+    ],
 )
 def test_options_of_rings_cover_the_sphere_and_turn_by_half_a_view(
     option: str, counts: list[int], step_deg: float

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tangent_train.config.build import build_from_config
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PhotoViews, view_settings
-from tangent_train.registry import build_from_config
 from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,
@@ -20,7 +20,7 @@ from tangent_train.rendering import (
 )
 from tests.inference.trained import TANGENT, trained_network
 
-RING = view_settings("ring") | {"level": 5}
+RING = view_settings("horizontal") | {"level": 5}
 
 
 @pytest.mark.parametrize(
@@ -30,7 +30,7 @@ RING = view_settings("ring") | {"level": 5}
         CubemapRepresentation(4, margin=2),
         build_from_config(RING, "representation"),
     ],
-    ids=["tangent", "cube", "ring"],
+    ids=["tangent", "cube", "horizontal"],
 )
 def test_lengths_are_those_of_the_rays(representation: Any) -> None:
     views = representation.view_sets()[0]

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.images.pixel_files import read_pixels, write_pixels
 from datamodules.synthrooms.camera import PanoramaRays, Pose
 from datamodules.synthrooms.raycast import RayScene
 from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
 from datamodules.synthrooms.scene import furnish
+from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tests.cli.rendering import render_with
 from tests.geometry.directions import angle_deg
 from tests.keypoints.scenes import rotation_angle_deg

@@ -11,15 +11,15 @@ import torch
 
 from tests.cli.tiny_runs import SMALL_ROOMS, Run
 
-_ROOMS = [text for text in SMALL_ROOMS if "panoramas_per_step" not in text]
+_ROOMS = [text for text in SMALL_ROOMS if "batch_size" not in text]
 KINDS = {
-    "panoramas": ["data=synthrooms", "data.panoramas_per_step=2", *_ROOMS],
+    "panoramas": ["data=synthrooms", "data.batch_size=2", *_ROOMS],
     "photos": [
-        *("data=synthrooms_perspective", "representation=perspective", "data.photos_per_step=2"),
+        *("data=synthrooms_perspective", "representation=perspective", "data.batch_size=2"),
         *("data.rooms.view_size=32", "data.rooms.views_per_camera=2", *_ROOMS),
     ],
     "shapes": [
-        *("experiment=shapes/default", "level=4", "data.shapes_per_step=2"),
+        *("experiment=shapes/default", "level=4", "data.batch_size=2"),
         *("data.shapes.train=4", "data.shapes.test=2", "trainer.accelerator=cpu"),
     ],
 }

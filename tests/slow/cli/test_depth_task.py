@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.images.pixel_files import read_depth_m, write_pixels
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.trained import load_trained
+from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
 from tests.inference.trained import sphere
@@ -25,7 +25,7 @@ SETTINGS = (
     "data.root='../small rooms'",
     "data.rooms.views_per_camera=2",
     "data.rooms.view_size=32",
-    "data.validation_fraction=0.4",
+    "data.val_fraction=0.4",
     "network.widths=[4,8]",
     "trainer.check_val_every_n_epoch=1",
     "panels=1",
@@ -168,7 +168,7 @@ def test_a_transfer_compares_views_and_their_alignment(run: Run) -> None:
     shown = ("compare=[{name: unaligned, task.align: none}, erp]", "fine_tuning.epochs=[1]")
     more: tuple[str, ...] = (*shown, "trainer.max_epochs=1", "photos.representation.dim=16")
     given = [s.replace("rooms/depth", "rooms/transfer_depth") for s in SETTINGS]
-    run("transfer", *given, *more, "photos.data.photos_per_step=4", "name=mine", "panels=0")
+    run("transfer", *given, *more, "photos.data.batch_size=4", "name=mine", "panels=0")
     stages: dict[str, Any] = {}
     for path in Path("runs/transfer/mine").rglob("results.json"):
         stages[path.parent.name] = results(path.parent)

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.run import build
 from tangent_train.cli.transfer_stages import plan
-from tangent_train.registry import build_from_config
+from tangent_train.config.build import build_from_config
 from tests.cli.test_compose import EXPERIMENTS
 from tests.running import command_of, composed
 

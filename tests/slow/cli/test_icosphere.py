@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import tangent_train
-from datamodules.images.pixel_files import read_pixels, write_pixels
+from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results
 from tests.inference.trained import sphere
 

@@ -11,8 +11,8 @@ import pytest
 from datamodules.core.problems import Problems
 from datamodules.folder.classes import read_classes
 from datamodules.folder.reader import FolderReader, list_images
-from datamodules.images.pixel_files import read_depth_m, write_pixels
 from datamodules.stanford2d3ds.pairs import StanfordPairs
+from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Run, predicted, results, run_command
 from tests.datamodules.data_files import read_png

@@ -46,15 +46,15 @@ def test_two_processes_make_the_steps_and_figures_of_one(
 ) -> None:
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     common = [*plain, *settings, rooms]
-    common += ["trainer.max_steps=3", "data.validation_fraction=0.4", "panels=2"]
+    common += ["trainer.max_steps=3", "data.val_fraction=0.4", "panels=2"]
     common += ["logger=many", "trainer.log_every_n_steps=1"]
     # Not of Adam, whose steps do not depend on the size of the gradient.
     common += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1"]
-    one = ["data.panoramas_per_step=2", "hydra.run.dir=one"]
+    one = ["data.batch_size=2", "hydra.run.dir=one"]
     run("train", *common, *one)
     devices = ["trainer.accelerator=cpu", "trainer.devices=2"]
     two = [*common, "trainer=ddp", *devices, "trainer.max_steps=3"]
-    two += ["data.panoramas_per_step=1", "task.images_per_chunk=2"]
+    two += ["data.batch_size=1", "task.view_batch_size=2"]
     _train(tmp_path, *two, "hydra.run.dir=two")
     assert {"mlflow.db", "mlruns", "one", "own", "two"} >= {p.name for p in tmp_path.iterdir()}
     logged = [_scalars(tmp_path / name) for name in ("one", "two")]
@@ -105,7 +105,7 @@ def test_depth_of_two_processes_is_that_of_one(
     common += ["optimizer=adam", "optimizer._target_=torch.optim.SGD", "optimizer.lr=0.1"]
     run("train", *common, "hydra.run.dir=one")
     two = ["trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_steps=2"]
-    _train(tmp_path, *common, *two, "data.panoramas_per_step=1", "hydra.run.dir=two")
+    _train(tmp_path, *common, *two, "data.batch_size=1", "hydra.run.dir=two")
     logged = [_scalars(tmp_path / name) for name in ("one", "two")]
     assert logged[1].keys() == logged[0].keys()
     for name in ("train/loss", "val/loss", "val/absrel"):
@@ -128,7 +128,7 @@ def test_no_process_outlives_a_first_one_that_was_killed(
     """Killed when it has started the other one, while they join, and in training."""
     settings = [*SETTINGS, rooms, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
     line = [sys.executable, "-m", "tangent_train.cli.main", "train", *settings]
-    line += ["data.validation_fraction=0.4", "trainer.max_epochs=1000"]
+    line += ["data.val_fraction=0.4", "trainer.max_epochs=1000"]
     environment = {name: text for name, text in os.environ.items() if name != "LOCAL_RANK"}
     environment["PYTHONPATH"] = str(ROOT)
     with subprocess.Popen(line, cwd=tmp_path, env=environment) as first:

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.images.pixel_files import write_pixels
 from tangent_train.cli.processes import command_line
+from tangent_train.io.pixel_files import write_pixels
 from tests.cli.test_shards import results
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import sphere, write_checkpoint

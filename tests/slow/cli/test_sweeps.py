@@ -25,7 +25,7 @@ def _no_debugger(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def settings(rooms: str) -> tuple[str, ...]:
     """Settings of a run of one epoch."""
-    return (*SETTINGS, "data.validation_fraction=0.4", "trainer.max_epochs=1", "panels=0", rooms)
+    return (*SETTINGS, "data.val_fraction=0.4", "trainer.max_epochs=1", "panels=0", rooms)
 
 
 def _writers(run: Path) -> set[int]:
@@ -101,8 +101,8 @@ def test_failing_jobs_are_shown_and_do_not_stop_the_others(
 def test_a_search_without_a_validation_split_is_refused(
     settings: tuple[str, ...], tmp_path: Path, run: Run
 ) -> None:
-    message = r"^tangent-train: data\.validation_fraction: found no validation split"
-    without = (*settings, "data.validation_fraction=0")
+    message = r"^tangent-train: data\.val_fraction: found no validation split"
+    without = (*settings, "data.val_fraction=0")
     with pytest.raises(SystemExit, match=message):
         run("train", "-m", "sweep=optuna", *without)
     assert not list(tmp_path.rglob("checkpoints"))

@@ -83,7 +83,7 @@ def test_classes_and_cameras_are_compared_before_training(tmp_path: Path, run: R
 @pytest.mark.usefixtures("stages")
 def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_path: Path) -> None:
     """Cityscapes to DensePASS with 13 classes, without training."""
-    from tests.inference.photo_networks import huggingface_networks as networks
+    from tests.photo_networks import huggingface_networks as networks
 
     panoramas = write_densepass(tmp_path / "panoramas", names=(1,))
     photos = write_cityscapes(tmp_path / "photos")
@@ -94,13 +94,13 @@ def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_
     arguments = [f"experiment={experiment}", "checkpoint=segformer.ckpt", "level=6"]
     arguments += [f"data.root={panoramas}", f"photos.data.root={photos}", "panels=0"]
     arguments += ["data.num_workers=0", "photos.data.num_workers=0", "trainer.accelerator=cpu"]
-    run("transfer", *arguments, "class_map=cityscapes_to_densepass13")
+    run("transfer", *arguments, "label_map=cityscapes_to_densepass13")
     folder = tmp_path / "runs" / "transfer" / experiment / "seed_0"
     assert {path.name for path in folder.iterdir()} == {"P", "S"}
     assert not list(folder.glob("*/checkpoints"))
     found = results(folder / "S")
     small = {"size": "256 × 128", "images": "1 of 100"}
     assert found["protocol"] == facts("densepass_13") | small
-    assert found["class_map"] == "cityscapes_to_densepass13"
+    assert found["label_map"] == "cityscapes_to_densepass13"
     report = (folder.parent / "transfer.md").read_text()
     assert "Trans4PASS+ (S), trained on Cityscapes: 51.4 and" in report

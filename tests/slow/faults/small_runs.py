@@ -61,7 +61,7 @@ def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
 def small_data(root: Path, **settings: Any) -> Stanford2D3DS:
     """RGB panoramas of 32×64 in the format of Stanford2D3DS."""
     representation = TangentRepresentation(base_level=0, level=4)
-    return Stanford2D3DS(root, representation, inputs=["rgb"], panoramas_per_step=1, **settings)
+    return Stanford2D3DS(root, representation, inputs=["rgb"], batch_size=1, **settings)
 
 
 def run_trainer(

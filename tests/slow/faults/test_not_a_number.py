@@ -26,7 +26,7 @@ def _last(folder: Path) -> dict[str, Any]:
     ("trainer", "settings", "at", "step", "value"),
     [
         ({}, {}, 2, 2, torch.nan),
-        ({}, {"images_per_chunk": 7}, 2 * 3 + 1, 2, torch.inf),  # not the last part of its step
+        ({}, {"view_batch_size": 7}, 2 * 3 + 1, 2, torch.inf),  # not the last part of its step
         ({"accumulate_grad_batches": 2}, {}, 3, 1, torch.nan),  # the second batch of the step
     ],
     ids=["plain", "in chunks", "accumulated"],
@@ -107,9 +107,9 @@ def test_all_processes_stop_when_the_loss_of_one_is_nan(
     (tmp_path / "one_of_two.py").write_text(ONE_OF_TWO)
     arguments = [
         "data=stanford2d3ds", f"data.root={stanford_root}", "level=4", "network=unet_small",
-        "representation.crop_multiple=null", "data.panoramas_per_step=1", "data.num_workers=0",
+        "representation.crop_multiple=null", "data.batch_size=1", "data.num_workers=0",
         "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2", "trainer.max_epochs=2",
-        "panels=0", "data.validation_fraction=0.3", "hydra.run.dir=run",
+        "panels=0", "data.val_fraction=0.3", "hydra.run.dir=run",
     ]  # fmt: skip
     done = run_python(tmp_path, "one_of_two.py", *arguments)
     assert done.returncode == 1

@@ -19,7 +19,7 @@ PANORAMAS = 14
 
 def _data(root: Path, store: Path | None) -> Stanford2D3DS:
     representation = TangentRepresentation(base_level=0, level=4)
-    return Stanford2D3DS(root, representation, store=store, panoramas_per_step=1)
+    return Stanford2D3DS(root, representation, store=store, batch_size=1)
 
 
 def _samples(data: Stanford2D3DS) -> int:

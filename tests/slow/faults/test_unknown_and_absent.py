@@ -48,7 +48,7 @@ def test_a_batch_without_labels_changes_nothing(root: Path, tmp_path: Path, half
     plugins = [MixedPrecision("16-mixed", "cpu", torch.amp.GradScaler("cpu"))] if half else []
     trainer = run_trainer(tmp_path / "run", max_epochs=1, plugins=plugins)
     network = Faulty()
-    trainer.fit(small_task(network), datamodule=small_data(root, validation_fraction=0))
+    trainer.fit(small_task(network), datamodule=small_data(root, val_fraction=0))
     weights = [*network.weights, network.layer.weight.detach()]
     changed = [not torch.equal(before, after) for before, after in pairwise(weights)]
     assert (len(changed), sum(changed)) == (9, 1)

@@ -20,15 +20,15 @@ from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
-from datamodules.images.gpano import read_area, read_up
-from datamodules.images.pixel_files import read_depth_m, read_pixels
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.files import CLASSES
 from datamodules.stanford2d3ds.reader import LabelTable, read_camera_matrix, read_panorama_pose
 from datamodules.zind.homes import list_home_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
-from tangent_train.rendering.camera_files import CameraFile, read_cameras, write_cameras
+from tangent_train.io.camera_files import CameraFile, read_cameras, write_cameras
+from tangent_train.io.gpano import read_area, read_up
+from tangent_train.io.pixel_files import read_depth_m, read_pixels
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, xmp_packet
 from tests.datamodules.folder.folder_format import VALUES
 from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home

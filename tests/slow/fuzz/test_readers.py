@@ -9,8 +9,8 @@ from random import Random
 
 import pytest
 
-from datamodules.images import png
 from tangent_train.errors import DataError
+from tangent_train.io import png
 from tests.slow.fuzz.mutation import mutate, sealed_png
 from tests.slow.fuzz.targets import TARGETS
 

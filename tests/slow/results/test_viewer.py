@@ -13,8 +13,8 @@ import pytest
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, FloatRect
 
-from datamodules.images.palette import class_colors
 from tangent_train.geometry import equirect_directions
+from tangent_train.io.palette import class_colors
 from tangent_train.results.html import EncodedImage, encode_image, write_report
 from tangent_train.results.tables import Table
 from tests.rendering.reference import sample_panorama, to_lonlat

@@ -33,7 +33,7 @@ TRAINING = (*SETTINGS, "data.inputs=[rgb]", "trainer.max_epochs=1", "panels=0")
             "train",  # makes rooms in several processes, trains in two, with workers
             (
                 *(*TRAINING, "trainer=ddp", "trainer.devices=2", "data.num_workers=1"),
-                *("data.validation_fraction=0.4", "data.in_memory=false"),
+                *("data.val_fraction=0.4", "data.in_memory=false"),
                 *("data.root=../rooms", "hydra.run.dir=../trained"),
             ),
             "trained/results.json",
@@ -42,7 +42,7 @@ TRAINING = (*SETTINGS, "data.inputs=[rgb]", "trainer.max_epochs=1", "panels=0")
             "train",  # in processes of submitit, with Optuna
             (
                 *("-m", "sweep=optuna", "launcher=local", "hydra.sweeper.n_trials=1", *TRAINING),
-                *("hydra.sweeper.n_jobs=1", "data.validation_fraction=0.4", "data.root=../rooms"),
+                *("hydra.sweeper.n_jobs=1", "data.val_fraction=0.4", "data.root=../rooms"),
                 "hydra.sweep.dir=../sweep",
             ),
             "sweep/0/results.json",

@@ -1,0 +1,1 @@
+"""Settings: building objects, rules, manifests of output folders."""

@@ -1,0 +1,190 @@
+"""Label maps: the classes of one data set as those of another.
+
+A map is a JSON file with the names of source classes for every target class::
+
+    {"source": "ADE20K", "classes": {"wall": ["wall", "painting"], "floor": ["floor", "rug"]}}
+
+The probability of a target class is the sum of the probabilities of its source classes.
+
+Names are compared without case, and with hyphens and underscores as spaces. If a network names a
+class by several synonyms ("windowpane, window"), only the first is compared; a map may list several
+names (``"windowpane", "window"``). A network may lack some of the source classes. A target class
+without source classes in the network is not predicted.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+from datamodules.core.labels import PIXEL_CLASSES
+from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.config.build import Text, check_fields
+from tangent_train.errors import DataError, SettingError
+from tangent_train.files import read_json
+from tangent_train.io.image_files import composed
+
+Unmapped = Literal["unknown", "never"]
+"""Treatment of source classes that are not in a map: label 0 where they win, or they never win."""
+
+_FOLDER = Path(__file__).with_suffix("")
+"""Folder with the maps of this package, ``label_maps/<name>.json``."""
+
+_EXPECTED = 'a label map: {"classes": {"wall": ["wall", "painting"], "floor": ["floor"]}}'
+_MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """A mapping from classes of a source data set to classes of a target data set.
+
+    Attributes:
+        name: Name or file of the map.
+        source: Name of the source data set; None if the file does not name it.
+        classes: Names of the source classes of each target class.
+    """
+
+    name: str
+    source: str | None
+    classes: Mapping[str, Sequence[str]]
+
+
+@dataclass(frozen=True)
+class MappedNetwork:
+    """A network with the classes of a map.
+
+    Attributes:
+        trained: The network.
+        classes: Classes of the original network in each target class.
+        absent: Source classes of the map that the original network lacks.
+        unmapped: Other classes of the original network.
+        unmapped_wins: True if unmapped classes may win, as label 0.
+    """
+
+    trained: TrainedNetwork
+    classes: Mapping[str, Sequence[str]]
+    absent: Sequence[str]
+    unmapped: Sequence[str]
+    unmapped_wins: bool
+
+    def __str__(self) -> str:
+        """Return a description in one line."""
+        parts = [f"{n} ← {', '.join(names)}" for n, names in self.classes.items() if names]
+        missing = [name for name, names in self.classes.items() if not names]
+        if missing:
+            parts.append(f"not predicted: {', '.join(missing)}")
+        if self.absent:
+            parts.append(f"not in the network: {', '.join(self.absent)}")
+        if self.unmapped:
+            effect = "unknown where they win" if self.unmapped_wins else "never win"
+            parts.append(f"{effect}: {', '.join(self.unmapped)}")
+        return "; ".join(parts)
+
+
+def load_label_map(given: str | Path) -> LabelMap:
+    """Load a label map.
+
+    Args:
+        given: Name of a map of this package, such as ``ade20k_to_stanford2d3ds``, or the path of a
+            file with the suffix ``.json``.
+
+    Raises:
+        SettingError: There is no map of this name.
+        DataError: The file is not a valid label map.
+    """
+    given = str(given)
+    shipped = sorted(path.stem for path in _FOLDER.glob("*.json"))
+    if given in shipped:
+        path = _FOLDER / f"{given}.json"
+    elif given.lower().endswith(".json"):
+        path = Path(given)
+    else:
+        raise SettingError(
+            "label_map", found=given, expected=f"{', '.join(shipped)}; or a file my_map.json"
+        )
+    content = read_json(path, _EXPECTED)
+    fields = check_fields(path, content, {"source": Text | None, "classes": dict}, _EXPECTED)
+    classes = fields["classes"]
+    check_fields(path, {"names": list(classes)}, {"names": list[Text]}, _EXPECTED, "classes")
+    check_fields(path, classes, dict.fromkeys(classes, list[Text]), _EXPECTED, "classes")
+    named = Counter(_plain(name) for names in classes.values() for name in names)
+    twice = [name for name, count in named.items() if count > 1]
+    if twice or not named or len(classes) > _MOST_CLASSES:
+        found = f"{len(classes)} classes" if named else "no source class"
+        raise DataError(
+            path,
+            found=f"{', '.join(twice)} more than once" if twice else found,
+            expected=f"1 to {_MOST_CLASSES} classes, every source class in one of them",
+        )
+    return LabelMap(given, fields["source"], classes)
+
+
+def map_classes(
+    trained: TrainedNetwork,
+    label_map: LabelMap,
+    unmapped: Unmapped = "unknown",
+    targets: Sequence[str] | None = None,
+) -> MappedNetwork:
+    """Return a network with the classes of a map instead of its own.
+
+    Args:
+        trained: The network.
+        label_map: The map.
+        unmapped: Treatment of classes that are not in the map. Unknown classes of an imported
+            network remain unknown.
+        targets: All target classes in order, without unknown; None for the classes of the map.
+
+    Raises:
+        SettingError: The map contains no class of the network, or a target that is not in
+            `targets`.
+    """
+    targets = list(label_map.classes) if targets is None else targets
+    foreign = label_map.classes.keys() - set(targets)
+    if foreign:
+        raise SettingError(
+            f"label_map={label_map.name}",
+            found=f"target classes {', '.join(sorted(foreign))}",
+            expected=f"names among {', '.join(targets)}",
+        )
+    target_of = {_plain(n): target for target, names in label_map.classes.items() for n in names}
+    trained.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
+    names = trained.class_names[1:]
+    groups = trained.groups or [[k] for k in range(len(names))]
+    members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
+    for k, name in enumerate(names):
+        members[target_of.get(_plain(name))].append(k)
+    remaining = members.pop(None)
+    if len(remaining) == len(names):
+        raise SettingError(
+            f"label_map={label_map.name}",
+            found=f"no class of {label_map.source or 'the map'} in a network of {', '.join(names)}",
+            expected="a map whose source classes include the network's",
+        )
+    if remaining and unmapped == "never" and trained.score_kind == "labels":
+        raise SettingError(
+            "unmapped",
+            found="never, for a network that returns labels",
+            expected="unknown, because labels have no second best class",
+        )
+    scores = [[k for member in group for k in groups[member]] for group in members.values()]
+    unknown = [k for group in groups[len(names) :] for k in group]
+    if unmapped == "unknown":
+        unknown += [k for member in remaining for k in groups[member]]
+    scores += [unknown] if unknown else []
+    found = {str(target): [names[k] for k in group] for target, group in members.items()}
+    return MappedNetwork(
+        trained=replace(trained, class_names=("unknown", *targets), groups=scores),
+        classes=found,
+        absent=[n for n in target_of if n not in map(_plain, names)],
+        unmapped=[names[k] for k in remaining],
+        unmapped_wins=unmapped == "unknown",
+    )
+
+
+def _plain(name: str) -> str:
+    """Return the first synonym of a name in the form in which names are compared."""
+    first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
+    return " ".join(first.casefold().split())

@@ -1,0 +1,297 @@
+"""Files with the cameras of pinhole images: ``cameras.json``, and COLMAP's ``rig_config.json``.
+
+Their world frame is right-handed: x forward (to the middle column of the panorama), y left, z up.
+`FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.config.build import Text, check_fields
+from tangent_train.errors import DataError
+from tangent_train.files import parse_json, write_text
+from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
+
+CAMERAS_FILE = "cameras.json"
+"""Name of the file in a folder of tangent images."""
+
+RIG_FILE = "rig_config.json"
+"""Name of the file in a COLMAP project."""
+
+_FORMAT = "tangent images"
+_MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
+_CONVENTIONS = {
+    "pixels": "Pixel centers are whole numbers: (0, 0) is the center of the upper left pixel, "
+    "columns count to the right, rows down. matrix (K) takes camera coordinates to (column, row). "
+    "For programs that count from pixel corners, add 0.5 to the principal point.",
+    "camera_axes": "x right, y down, z forward.",
+    "world_axes": "Right-handed, at the center of the panorama: x forward, to the middle column of "
+    "the panorama; y left, a quarter of the width to the left of it; z up, to the top row.",
+    "world_from_camera": "Rotation matrix by rows, determinant +1: a direction d of the camera is "
+    "world_from_camera · d in the world. All cameras stand at the origin.",
+    "icosahedron_rotation": "Rotation of the icosahedron as a whole, in the world axes; null if it "
+    "is not rotated.",
+    "views": "world_from_camera of all views. Tangent images are determined by base_level, level, "
+    "dim and icosahedron_rotation.",
+    "fov_deg": "Angle across the middle of an image, from edge to edge.",
+}
+_POSES = {
+    "panorama_axes": "Right-handed: x to the middle column of the panorama, y to the left of it, "
+    "z to the top row.",
+    "world_from_panorama": "Rotation matrix by rows, determinant +1: the point seen at distance r "
+    "in direction d of the panorama is location + r · world_from_panorama · d.",
+    "location": "Center of the panorama, in the world and the units of COLMAP's model.",
+}
+_NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
+"""Matches lists of numbers, which are written on one line."""
+
+_EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
+_KINDS: dict[str, Any] = {"format": Literal["tangent images"], "source": dict, "images": list}
+_KINDS_OF_TANGENT: dict[str, Any] = {
+    "base_level": int,
+    "level": int,
+    "dim": int,
+    "icosahedron_rotation": list[list[float]] | None,
+}
+_KINDS_OF_VIEWS: dict[str, Any] = {
+    "views": list[list[list[float]]],
+    "overlapping": bool,
+    "camera": dict,
+}
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """Content of a ``cameras.json``.
+
+    Attributes:
+        source: Name of the panorama.
+        shape: ``(H, W)`` of the panorama.
+        grid: Geometry of all images.
+        faces: Indices of the images that have a file.
+        files: File name of each face.
+    """
+
+    source: str
+    shape: tuple[int, int]
+    grid: PinholeGrid
+    faces: tuple[int, ...]
+    files: tuple[str, ...]
+
+
+def write_cameras(path: Path, cameras: CameraFile) -> None:
+    """Write a ``cameras.json``.
+
+    Args:
+        path: File to write.
+        cameras: Content of the file. Its section ``conventions`` explains the fields.
+    """
+    grid = cameras.grid
+    rows, columns = grid.size
+    described: dict[str, Any] = {
+        "views": [_world_from_camera(grid, face).tolist() for face in range(grid.num_images)],
+        "overlapping": grid.is_overlapping,
+    }
+    if isinstance(grid, TangentGrid):
+        rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
+        described = {"base_level": grid.base_level, "level": grid.level, "dim": grid.dim}
+        described |= {"icosahedron_rotation": rotation}
+    content = {
+        "format": _FORMAT,
+        "conventions": _CONVENTIONS,
+        "source": {
+            "file": cameras.source,
+            "height": cameras.shape[0],
+            "width": cameras.shape[1],
+        },
+        **described,
+        "camera": {
+            "width": columns,
+            "height": rows,
+            "matrix": grid.camera_matrix.tolist(),
+            "fov_deg": grid.width_deg,
+        },
+        "images": [
+            {
+                "file": file,
+                "face": face,
+                "world_from_camera": _world_from_camera(grid, face).tolist(),
+            }
+            for face, file in zip(cameras.faces, cameras.files, strict=True)
+        ],
+    }
+    _write_json(path, content)
+
+
+def _world_from_camera(grid: PinholeGrid, face: int) -> NDArray[np.float64]:
+    """Return the ``(3, 3)`` rotation from camera axes to the right-handed world of the files."""
+    return np.asarray(FLIP_Y @ grid.world_from_camera[face])
+
+
+def _in_world(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Convert a rotation between the library's frame and the right-handed world, either way."""
+    return np.asarray(FLIP_Y @ rotation @ FLIP_Y)
+
+
+def read_cameras(path: Path) -> CameraFile:
+    """Read a ``cameras.json``.
+
+    Args:
+        path: File to read.
+
+    Raises:
+        DataError: The file is missing, or its content is not valid.
+    """
+    try:
+        content = parse_json(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    is_tangent = not (isinstance(content, Mapping) and "views" in content)
+    of_grid = _KINDS_OF_TANGENT if is_tangent else _KINDS_OF_VIEWS
+    fields = check_fields(path, content, _KINDS | of_grid, _EXPECTED)
+    kinds: dict[str, Any] = {"height": int, "width": int}
+    source = check_fields(path, fields["source"], kinds, _EXPECTED, "source")
+    kinds = {"file": Text, "face": int}
+    images = [check_fields(path, i, kinds, _EXPECTED, "images") for i in fields["images"]]
+    shape = source["height"], source["width"]
+    faces, files = (tuple(image[name] for image in images) for name in ("face", "file"))
+    if not 1 <= min(shape) <= max(shape) <= _MOST_PIXELS:
+        raise DataError(path, found=f"a source of {shape} pixels", expected=_EXPECTED)
+    if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
+        raise DataError(path, found="an image twice", expected=_EXPECTED)
+    try:
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
+            grid = _grid_of(path, fields)
+        grid.face_indices(faces)
+    except (ValueError, OverflowError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    return CameraFile(str(fields["source"].get("file")), shape, grid, faces, files)
+
+
+def _grid_of(path: Path, fields: Mapping[str, Any]) -> PinholeGrid:
+    """Return the grid that the fields of a file describe."""
+    if "views" not in fields:
+        rotation = fields["icosahedron_rotation"]
+        in_world = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
+        return TangentGrid(fields["base_level"], fields["level"], fields["dim"], in_world)
+    kinds: dict[str, Any] = {"width": int, "height": int, "matrix": list[list[float]]}
+    camera = check_fields(path, fields["camera"], kinds, _EXPECTED, "camera")
+    axes = np.array([FLIP_Y @ checked_rotation(view) for view in fields["views"]])
+    size = camera["height"], camera["width"]
+    focal = float(np.array(camera["matrix"], np.float64).reshape(3, 3)[0, 0])
+    if not (len(axes) and 2 <= min(size) <= max(size) <= _MOST_PIXELS and 0 < focal < math.inf):
+        raise ValueError(f"a camera of {size} pixels with a focal length of {focal}")
+    return PinholeGrid(axes, size, 1 / focal, is_overlapping=fields["overlapping"])
+
+
+@dataclass(frozen=True)
+class RigFile:
+    """Content of a ``rig_config.json``: the images of a panorama as a rig of cameras, for COLMAP.
+
+    Attributes:
+        world_from_camera: ``(3, 3)`` rotation of each camera in the world of `write_cameras`, by
+            the prefix of its images' names (``face_000/``). The first is COLMAP's reference.
+        panoramas: File of each panorama, by the rest of its images' names (``room.png``).
+    """
+
+    world_from_camera: Mapping[str, NDArray[np.float64]]
+    panoramas: Mapping[str, str]
+
+    @property
+    def images(self) -> list[str]:
+        """Names of all images, as in COLMAP."""
+        return [prefix + name for prefix in self.world_from_camera for name in self.panoramas]
+
+
+def write_rig(
+    path: Path, grid: PinholeGrid, faces: Mapping[str, int], panoramas: Mapping[str, str]
+) -> None:
+    """Write a ``rig_config.json`` for COLMAP 3.12 or later.
+
+    All cameras have COLMAP's model PINHOLE and the same center; principal points are counted from
+    pixel corners. COLMAP ignores the fields ``world_from_camera`` and ``panoramas``.
+
+    Args:
+        path: File to write.
+        grid: Geometry of the images.
+        faces: Index of the image of each camera, by prefix.
+        panoramas: See `RigFile`.
+    """
+    from scipy.spatial.transform import Rotation  # slow to import
+
+    focal, (rows, columns) = 1 / grid.pitch, grid.size
+    reference = _world_from_camera(grid, next(iter(faces.values())))
+    cameras: list[dict[str, Any]] = []
+    for prefix, face in faces.items():
+        axes = _world_from_camera(grid, face)
+        from_rig = Rotation.from_matrix(axes.T @ reference)
+        of_rig = {
+            "cam_from_rig_rotation": from_rig.as_quat(canonical=True, scalar_first=True).tolist(),
+            "cam_from_rig_translation": (0, 0, 0),
+        }
+        cameras.append(
+            {
+                "image_prefix": prefix,
+                **(of_rig if cameras else {"ref_sensor": True}),
+                "camera_model_name": "PINHOLE",
+                "camera_params": (focal, focal, columns / 2, rows / 2),
+                "world_from_camera": axes.tolist(),
+            }
+        )
+    _write_json(path, [{"cameras": cameras, "panoramas": panoramas}])
+
+
+def read_rig(path: Path) -> RigFile:
+    """Read a ``rig_config.json`` that `write_rig` wrote.
+
+    Raises:
+        DataError: The file is missing, or another program wrote it.
+    """
+    try:
+        (rig,) = parse_json(path.read_bytes())
+        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
+            axes = {
+                str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])
+                for camera in rig["cameras"]
+            }
+        return RigFile(axes, {name: str(file) for name, file in rig["panoramas"].items()})
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
+        raise DataError(
+            path,
+            found=f"{type(error).__name__}: {error}",
+            expected="the rig that tangent-render wrote with colmap=true",
+        ) from error
+
+
+def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
+    """Write poses of panoramas in a right-handed world as JSON.
+
+    Args:
+        path: File to write. Its section ``conventions`` explains the fields.
+        poses: Pose of each panorama, by its file.
+    """
+    panoramas = [
+        {
+            "file": file,
+            "location": pose.location_m.tolist(),
+            "world_from_panorama": (pose.world_from_panorama @ FLIP_Y).tolist(),
+        }
+        for file, pose in poses.items()
+    ]
+    content = {"format": "panorama poses", "conventions": _POSES, "panoramas": panoramas}
+    _write_json(path, content)
+
+
+def _write_json(path: Path, content: Any) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False)
+    write_text(path, _NUMBERS.sub(lambda match: " ".join(match[0].split()), text) + "\n")

@@ -1,0 +1,304 @@
+"""Videos: reading frames, and writing videos with the frame times of another video."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, contextmanager
+from functools import partial
+from itertools import count, takewhile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tangent_train.errors import DataError, of_extra
+from tangent_train.files import atomic_path
+from tangent_train.io.png import check_pixels
+from tangent_train.threads import in_threads
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
+"""Suffixes of videos, in lower case."""
+
+_READERS = "mov,matroska,avi"
+"""FFmpeg's demuxers of these formats. Other demuxers read playlists, scripts and further files."""
+
+_EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
+_BOXES = b"ftyp styp moov moof mdat mfra free skip wide meta sidx ssix prft pdin emsg uuid".split()
+_BOX_HEAD = 8  # bytes
+_SHOWN_VP8 = 0x10
+_STRAIGHT = 0.02  # tolerance of a matrix: about a degree
+_UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
+_UPRIGHT = "Export the video upright."
+_AHEAD = 2
+_ENCODER = "libx264"
+_QUALITY = {"crf": "18", "preset": "veryfast"}
+_BT709 = 1  # of the matrix, primaries and transfer: what players assume of large videos
+
+
+def read_video_size(path: Path) -> tuple[int, int, int]:
+    """Return the number of frames that players show, and rows and columns of an upright frame.
+
+    All packets are read; only the first frame is decoded.
+
+    Raises:
+        DataError: The video cannot be read, is truncated or damaged, or has no frames.
+        SettingError: PyAV is missing.
+    """
+    _check_end(path)
+    first, packets, times = None, 0, []
+    with _logged_errors(path) as errors, _opened(path) as (container, stream):
+        stream.thread_type = "NONE"  # errors of other threads are not logged here
+        for packet in container.demux(stream):
+            if packet.is_corrupt:
+                raise _damaged(path, f"packet {packets} is incomplete")
+            if packet.size:
+                packets += 1
+                times += [packet.pts] if _is_shown(packet) else []
+            first = first or next(iter(packet.decode()), None)
+        indexed = sum(entry.size > 0 for entry in stream.index_entries)
+    if packets < indexed:
+        raise _damaged(path, f"{packets} of {indexed} packets")
+    if errors:
+        raise _damaged(path, errors[0])
+    if first is None:
+        raise DataError(path, found="no frame that can be decoded", expected="a whole video")
+    check_pixels(path, first.height, first.width)
+    rows, columns = _upright(first, _orientation(path, first)).shape[:2]
+    # Cutting without encoding leaves frames at the start that refer to missing ones.
+    start = first.pts
+    return sum(None in (time, start) or time >= start for time in times), rows, columns
+
+
+def read_frames(
+    path: Path, frames: int | None = None, every: int = 1
+) -> Generator[Callable[[], NDArray[np.uint8]]]:
+    """Yield the first and then every n-th frame of a video, decoded in a thread a few ahead.
+
+    Args:
+        path: Video file.
+        frames: Number of frames, see `read_video_size`; None to read it.
+        every: Step n between frames.
+
+    Yields:
+        Function that converts a frame to upright RGB, ``(H, W, 3)``.
+
+    Raises:
+        DataError: A frame is damaged, or the number of frames differs.
+    """
+    for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
+        yield partial(_upright, *frame)
+
+
+def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArray[np.int64]]]:
+    """Yield frames with their orientation, see `_orientation`."""
+
+    def decoded() -> Generator[tuple[Any, NDArray[np.int64]]]:
+        number, signs = -1, _UPRIGHT_SIGNS
+        with _opened(path) as (container, stream):
+            for number, frame in enumerate(container.decode(stream)):
+                if frame.is_corrupt:
+                    raise _damaged(path, f"frame {number}, and frames before that refer to it")
+                # Within an H.264 stream, only the first frame may have the matrix.
+                given = _orientation(path, frame)
+                signs = given if number == 0 else signs
+                if "DISPLAYMATRIX" in frame.side_data and (given != signs).any():
+                    found = f"another orientation from frame {number} on"
+                    expects = "a video of one orientation"
+                    raise DataError(path, found=found, expected=expects, remedy=_UPRIGHT)
+                if number % every == 0:
+                    yield frame, signs
+        if number + 1 != expected:
+            raise _damaged(path, f"{number + 1} of {expected} frames")
+
+    source = decoded()
+    with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
+        yield from takewhile(lambda frame: frame is not None, frames)
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
+    """Return a context with a container and its video stream; its errors name the file."""
+    with of_extra("video", path):
+        import av
+    options = {"format_whitelist": _READERS, "protocol_whitelist": "file"}
+    try:
+        with av.open(
+            _file_url(path), container_options=options, metadata_errors="replace"
+        ) as container:
+            stream: Any = container.streams.best("video")
+            if stream is None or stream.disposition & stream.disposition.attached_pic:
+                raise DataError(path, found="no video stream", expected="a video")
+            if stream.codec_context is None:
+                raise DataError(path, found="a codec that FFmpeg lacks", expected="another one")
+            stream.thread_type = "AUTO"
+            yield container, stream
+    except av.FFmpegError as error:
+        raise DataError(
+            path,
+            found=f"a video that cannot be decoded ({error.strerror})",
+            expected="a whole MP4, QuickTime, Matroska, WebM or AVI file",
+            remedy="Copy or export it again.",
+        ) from error
+
+
+def _file_url(path: Path) -> str:
+    # A bare name may select another protocol, e.g. "http:…".
+    return f"file:{path.absolute()}"
+
+
+@contextmanager
+def _logged_errors(path: Path) -> Iterator[list[str]]:
+    """Collect the errors that FFmpeg's Matroska demuxer logs when it skips damaged parts."""
+    with of_extra("video", path):
+        import av.logging as log
+    errors: list[str] = []
+    level, skips = log.get_level(), log.get_skip_repeated()
+    log.set_level(log.ERROR)
+    log.set_skip_repeated(False)  # another file may have the same errors
+    try:
+        with log.Capture() as messages:
+            yield errors
+        errors += [text.strip() for _, name, text in messages if name.startswith("matroska")]
+    finally:
+        log.set_level(level)
+        log.set_skip_repeated(skips)
+
+
+def _check_end(path: Path) -> None:
+    """Refuse a file that ends within one of its outermost elements, which FFmpeg accepts.
+
+    These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
+    """
+    end, is_box = 0, False
+    try:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            while head := file.read(16):
+                # Zeros may fill the file; fewer than four may be the start of a size.
+                if is_box and len(head) < _BOX_HEAD and (len(head) < 4 or any(head)):
+                    raise _damaged(path, f"it ends at byte {size}, within the header of a box")
+                is_box = head[4:8] in _BOXES
+                if head[:4] in _EBML and len(head) > 4:
+                    width = 9 - head[4].bit_length()  # of the length
+                    length = int.from_bytes(head[4 : 4 + width]) % (1 << 7 * width)
+                    if length == (1 << 7 * width) - 1:  # unknown: a live stream
+                        break
+                    length += 4 + width
+                elif head[:4] == b"RIFF":
+                    length = 8 + int.from_bytes(head[4:8], "little")
+                else:
+                    length = int.from_bytes(head[:4])
+                    if length == 1:  # the length follows
+                        length = int.from_bytes(head[8:]) if len(head) == 16 else 16
+                    if length < _BOX_HEAD or not head[4:8].isalnum():  # the last box, or none
+                        break
+                if (is_box or head[:4] in (*_EBML, b"RIFF")) and end + length > size:
+                    raise _damaged(path, f"it ends at byte {size} of {end + length}")
+                end = file.seek(end + length)
+    except OSError as error:
+        raise DataError(path, found=error, expected="a video that can be read") from error
+
+
+def _is_shown(packet: Any) -> bool:
+    """Return False for packets that an edit list hides and VP8 reference frames (RFC 6386, 9.1)."""
+    hidden = packet.stream.codec_context.name == "vp8" and not bytes(packet)[0] & _SHOWN_VP8
+    return not (packet.is_discard or hidden)
+
+
+def _damaged(path: Path, detail: str) -> DataError:
+    return DataError(
+        path,
+        found=f"a truncated or damaged video ({detail})",
+        expected="a whole one",
+        remedy="Copy or export it again. To use what is left of it, repair it, for example with "
+        "ffmpeg -i <video> -c copy <repaired>.",
+    )
+
+
+def _orientation(path: Path, frame: Any) -> NDArray[np.int64]:
+    """Return the signs ``(2, 2)`` of the transposed display matrix of a frame, or the identity.
+
+    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M.
+
+    Raises:
+        DataError: The matrix is not a rotation by quarter turns, with or without mirroring.
+    """
+    data = frame.side_data.get("DISPLAYMATRIX")
+    if data is None:
+        return _UPRIGHT_SIGNS
+    # Its rows give the column and the row of a displayed pixel.
+    matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
+    unit = matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)
+    signs = np.rint(unit).astype(np.int64)
+    if (signs @ signs.T != np.eye(2)).any() or abs(unit - signs).max() > _STRAIGHT:
+        shown = np.array2string(matrix / 2**16, precision=4).replace("\n", "")
+        expected = "a rotation by 90°, 180° or 270°, mirrored or not"
+        found = f"a display matrix {shown}"
+        raise DataError(path, found=found, expected=expected, remedy=_UPRIGHT)
+    return signs
+
+
+def _upright(frame: Any, signs: NDArray[np.int64]) -> NDArray[np.uint8]:
+    """Convert a frame to RGB ``(H, W, 3)`` as players show it, by its `_orientation`."""
+    rgb: NDArray[np.uint8] = frame.to_ndarray(format="rgb24")
+    rgb = rgb if signs[0, 0] else rgb.swapaxes(0, 1)
+    column_step, row_step = signs.sum(axis=1)
+    return np.ascontiguousarray(rgb[::row_step, ::column_step])
+
+
+def write_video(
+    path: Path,
+    source: Path,
+    size: tuple[int, int, int],
+    paint: Callable[[int, NDArray[np.uint8]], NDArray[np.uint8]],
+    every: int = 1,
+) -> None:
+    """Write a video (H.264 in MP4) with size, rate and frame times of another one, without sound.
+
+    Args:
+        path: New file, which appears when it is complete.
+        source: Source video.
+        size: Number of frames, rows and columns of the source, see `read_video_size`.
+        paint: Function that returns a new frame ``(H, W, 3)`` for the number of a frame and the
+            upright source frame; called in threads.
+        every: Step n: the first and then every n-th frame is written.
+
+    Raises:
+        DataError: The source cannot be decoded.
+        SettingError: The disk is full.
+    """
+    import av
+    from av.video.reformatter import Colorspace
+
+    expected, rows, columns = size
+
+    def painted(numbered: tuple[int, tuple[Any, NDArray[np.int64]]]) -> Any:
+        place, (frame, signs) = numbered
+        number = place * every
+        picture = np.ascontiguousarray(paint(number, _upright(frame, signs)))
+        made = av.VideoFrame.from_ndarray(picture, format="rgb24")
+        made = made.reformat(columns, rows, pixels, dst_colorspace=Colorspace.ITU709)
+        made.time_base = stream.time_base
+        made.pts = number * step if frame.pts is None else frame.pts
+        return made
+
+    with (
+        atomic_path(path) as temporary,
+        _opened(source) as (_, stream),
+        av.open(_file_url(temporary), "w", format="mp4") as output,
+    ):
+        rate = stream.average_rate or 30
+        step = max(1, round(1 / (rate * stream.time_base)))
+        # Players expect colors at half the resolution, which requires an even size.
+        pixels = "yuv444p" if rows % 2 or columns % 2 else "yuv420p"
+        encoder: Any = output.add_stream(_ENCODER, rate=rate, options=_QUALITY)
+        encoder.width, encoder.height, encoder.pix_fmt = columns, rows, pixels
+        encoder.codec_context.time_base = stream.time_base
+        encoder.codec_context.colorspace = encoder.codec_context.color_primaries = _BT709
+        encoder.codec_context.color_trc = _BT709
+        numbered = enumerate(_frames(source, expected, every))
+        with closing(in_threads(painted, numbered, ahead=_AHEAD)) as frames:
+            for frame in frames:
+                output.mux(encoder.encode(frame))
+        output.mux(encoder.encode(None))

@@ -1,0 +1,161 @@
+"""Manifest of an output folder: the settings that decide its content, and what is finished.
+
+Every command that writes many files opens the manifest of its folder first. A folder with the same
+settings is continued with what is missing; a folder with others is refused, and nothing is written.
+Shards of one work (`items[i::n]`) share the folder and its settings.
+
+A folder holds ``manifest.json``, and for each shard a file ``finished*.jsonl`` with a line for each
+finished item.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Self, TypeVar
+
+from tangent_train.errors import SettingError
+from tangent_train.files import parse_json, write_text
+
+MANIFEST = "manifest.json"
+
+_Item = TypeVar("_Item")
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One of several parts of a list: ``items[number - 1 :: count]``.
+
+    Attributes:
+        number: Number of the part, from 1 to `count`.
+        count: Number of parts.
+    """
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def parse(cls, setting: str | int | None) -> Self:
+        """Return the part that the setting ``shard`` names; None for the whole list.
+
+        Raises:
+            SettingError: The setting does not name a part.
+
+        >>> Shard.parse("3/16")
+        Shard(number=3, count=16)
+        """
+        if setting is None:
+            return cls()
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
+        number, count = map(int, match.groups()) if match else (0, 0)
+        if not 1 <= number <= count:
+            expected = "number/count, such as 1/16 to 16/16, or null"
+            raise SettingError("shard", found=setting, expected=expected)
+        return cls(number, count)
+
+    def __str__(self) -> str:
+        return f"{self.number}/{self.count}"
+
+    def part(self, items: Sequence[_Item]) -> Sequence[_Item]:
+        """Return the items of a list that belong to the part.
+
+        >>> Shard(2, 3).part("abcdefg")
+        'be'
+        """
+        return items[self.number - 1 :: self.count]
+
+
+@dataclass
+class Manifest:
+    """Settings and finished items of an output folder, created by `open`.
+
+    Attributes:
+        folder: Output folder.
+        finished: Entry of each finished item of all shards, by its name. An entry holds plain
+            values, e.g. the counts of a summary.
+    """
+
+    folder: Path
+    finished: dict[str, dict[str, Any]] = field(default_factory=dict)
+    _shard: Shard = field(default_factory=Shard)
+
+    @classmethod
+    def open(cls, folder: Path, settings: Mapping[str, Any], shard: Shard | None = None) -> Self:
+        """Create an output folder, or continue one that was written with the same settings.
+
+        Args:
+            folder: Output folder: new, empty, or begun with the same settings.
+            settings: Settings that decide the content, plain values; paths as text.
+            shard: Part of the work that this process does; None for all of it.
+
+        Raises:
+            SettingError: The folder holds other files, or was begun with other settings.
+        """
+        path = folder / MANIFEST
+        wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
+        if path.is_file():
+            cls._check_same(path, wanted)
+        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+            raise SettingError(
+                "output",
+                found=f"{folder}, which holds other files",
+                expected="a new or empty folder, or one that this command began",
+                remedy="Choose another folder.",
+            )
+        else:
+            write_text(path, json.dumps(wanted, indent=1) + "\n")
+        finished: dict[str, dict[str, Any]] = {}
+        for file in sorted(folder.glob("finished*.jsonl")):
+            finished |= _read_lines(file)
+        return cls(folder, finished, shard or Shard())
+
+    @staticmethod
+    def _check_same(path: Path, wanted: Mapping[str, Any]) -> None:
+        """Refuse a folder that was begun with other settings."""
+        content: Any = None
+        with suppress(ValueError):
+            content = parse_json(path.read_bytes())
+        before = content if isinstance(content, dict) else {}
+        for name in sorted(before.keys() | wanted.keys()):
+            if before.get(name) != wanted.get(name):
+                raise SettingError(
+                    name,
+                    found=_shown(wanted.get(name)),
+                    expected=f"{_shown(before.get(name))}, with which {path.parent} was begun",
+                    remedy="Choose another output, or delete this one to write it again.",
+                )
+
+    def missing(self, names: Iterable[str]) -> list[str]:
+        """Return the names of items that are not finished, in their order."""
+        return [name for name in names if name not in self.finished]
+
+    def finish(self, name: str, **entry: Any) -> None:
+        """Note that an item is finished; call it after its files were written.
+
+        Args:
+            name: Name of the item.
+            **entry: Plain values to keep with it.
+        """
+        self.finished[name] = entry
+        shard = self._shard
+        suffix = "" if shard.count == 1 else f"-{shard.number}-of-{shard.count}"
+        with (self.folder / f"finished{suffix}.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps({"item": name, **entry}) + "\n")
+
+
+def _shown(value: Any) -> str:
+    return "null" if value is None else str(value)
+
+
+def _read_lines(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the entries of a file; a line that was cut off by a kill is ignored."""
+    entries = {}
+    for line in path.read_text("utf-8").splitlines():
+        with suppress(ValueError):
+            entry = json.loads(line)
+            entries[entry.pop("item")] = entry
+    return entries

@@ -1,0 +1,287 @@
+"""Load networks of transformers for segmentation or depth, from the hub or a folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datamodules.core.inputs import Normalization
+from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.errors import DataError, first_line
+from tangent_train.imports import hide_output, offline
+from tangent_train.photo_networks.depth_kinds import declared_kind
+from tangent_train.photo_networks.network import (
+    USUAL_SIZE,
+    PhotoNetwork,
+    class_names_in,
+    names_of,
+)
+from tangent_train.photo_networks.saved import json_in, saved_folder, tensors_in
+
+_NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
+_TASK = "the task is semantic"
+_LEFT_OUT = ("use_auxiliary_head", "use_fov_model")
+"""Parts of networks that are not used: a head for training, and the field of view of Depth Pro,
+which is known here."""
+
+_PADDED = "zoedepth"
+"""Network whose images are padded before they are resized, see `HuggingFaceDepthNetwork`."""
+
+_VOCABULARIES = ("tokenizer.json", "vocab.json")
+_BYTE = 255
+_SIDE = 32
+"""Rows and columns of the images with which an image processor is tested."""
+
+_NOT_OF_COLORS = ("do_resize", "do_center_crop", "do_pad", "do_split_image")
+"""Settings of an image processor that move pixels; they are switched off in the test."""
+
+_LISTED = 4
+"""Largest number of wrong tensors in a message."""
+
+
+def load(
+    *,
+    model: str | None,
+    classes: Path | None,
+    normalization: Any,
+    depth: DepthKind | None = None,
+) -> PhotoNetwork:
+    """Load a network of transformers for semantic or universal segmentation, or for depth.
+
+    Code from the model's author is not run, and weights are only read from safetensors files.
+
+    Args:
+        model: Name on the hub, or a folder written by ``save_pretrained``.
+        classes: JSON file of the class names; None for the names in the model's config.
+        normalization: See `Normalization.of`; None for that of the model's image processor.
+        depth: Kind of depth; None for that of the model's config.
+
+    Raises:
+        DataError: A file is missing, or cannot be fetched or used.
+        SettingError: A setting is invalid, or transformers is not installed.
+    """
+    folder = saved_folder(model)
+    with offline():
+        return _from_folder(folder, classes, normalization, depth)
+
+
+def _from_folder(
+    folder: Path, classes: Path | None, normalization: Any, depth: DepthKind | None
+) -> PhotoNetwork:
+    config, path = json_in(folder, "config.json"), folder / "config.json"
+    described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
+    kind = declared_kind(config, path, depth) if _predicts_depth(config, path, depth) else None
+    labels = config.get("id2label")
+    if isinstance(labels, dict):
+        labels = {index: str(name).strip() for index, name in labels.items()}
+    names = names_of(labels, path, _NAMES) if kind is None else ()
+    processor = _processor(folder)
+    settings = {"config": described, "bgr": bool(processor.get("do_flip_channel_order"))}
+    if kind is None:
+        settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
+    else:
+        padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
+        settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
+    if described["model_type"] == "oneformer":
+        settings["task"] = _task(folder, config)
+    network = build_from_config(settings, "network", SettingsFile(path))
+    if len(names) == 1 and network.is_universal:
+        expected = "at least two classes: with one, masks contain it in every pixel"
+        raise DataError(path, found="masks of one class", expected=expected)
+    tensors, remarks = tensors_in(folder)
+    _load_tensors(network, tensors, folder)
+    settings["config"] = architecture(network.network.config.to_dict())
+    given = None if normalization is None else Normalization.of(normalization, 3)
+    return PhotoNetwork(
+        network=network,
+        settings=settings,
+        score_names=names if classes is None else class_names_in(classes),
+        normalization=given or Normalization(processor["mean"], processor["std"]),
+        image_size=_image_size(processor, folder),
+        score_kind="logits",
+        depth_kind=kind,
+        remarks=remarks,
+    )
+
+
+def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | None) -> bool:
+    """Return True for a depth network; if transformers has both, its architecture decides."""
+    kind = config["model_type"]
+    tasks = [task for task in (DEPTH, *SEGMENTATION) if kind in network_types(task)]
+    if DEPTH not in tasks or len(tasks) == 1:
+        return DEPTH in tasks
+    names = ", ".join(map(str, config.get("architectures") or ()))
+    if "DepthEstimation" in names or "Segmentation" in names:
+        return "DepthEstimation" in names
+    if depth is not None:
+        return True
+    raise DataError(
+        path,
+        found=f"architectures: {names or 'none'}",
+        expected=f"a {kind} network …ForDepthEstimation or …ForSemanticSegmentation",
+        remedy="Set depth=, e.g. metric_z, to import its depth. For its classes, name the second "
+        "architecture in the file.",
+    )
+
+
+def _processor(folder: Path) -> dict[str, Any]:
+    """Return settings of the image processor, with the defaults of its class.
+
+    ``do_flip_channel_order``, ``mean`` and ``std`` (for images from 0 to 1) are measured. Settings
+    with a text are left out, because some of them are names of files that would be fetched.
+
+    Raises:
+        DataError: There is no usable image processor.
+    """
+    path, content = _processor_file(folder)
+    kind = _processor_class(content, folder)
+    known = {
+        name: value
+        for name, value in content.items()
+        if name in kind.valid_kwargs.__annotations__ and not isinstance(value, str)
+    }
+    try:
+        with hide_output():
+            processor = kind(**known)
+            order, black, gain = _response(processor)
+    except Exception as error:  # processors raise many kinds about their settings
+        raise DataError(
+            path,
+            found=f"no normalization in {content} ({first_line(error)})",
+            expected=f"settings of {kind.__name__} that scale three channels",
+        ) from error
+    numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
+    rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
+    settings: dict[str, Any] = processor.to_dict()
+    return settings | rounded | {"do_flip_channel_order": bool(order[0])}
+
+
+def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
+    """Measure how an image processor normalizes colors.
+
+    Returns:
+        For each input channel of the network: index of the image's channel, value for black, and
+        difference between full intensity and black.
+
+    Raises:
+        ArithmeticError: The processor does not scale three channels, in their order or reversed.
+    """
+    known = processor.valid_kwargs.__annotations__
+    switched_off = {name: False for name in _NOT_OF_COLORS if name in known}
+    colors = np.array([[0, 0, 0], [255, 0, 0], [0, 255, 0], [0, 0, 255], [51, 204, 102]], np.uint8)
+    images = [np.tile(color, (_SIDE, _SIDE, 1)) for color in colors]
+    pixels = np.asarray(processor(images, return_tensors="np", **switched_off)["pixel_values"])
+    black, *primary, mixed = pixels[:, :, _SIDE // 2, _SIDE // 2].astype(np.float64)
+    ranges = np.array(primary) - black  # (channel of the image, channel of the network)
+    order = np.abs(ranges).argmax(axis=0)
+    gain = ranges[order, np.arange(len(order))]
+    error = np.abs(mixed - black - gain * colors[-1][order] / _BYTE).max()
+    in_order = order.tolist() in ([0, 1, 2], [2, 1, 0])
+    is_finite = np.isfinite(pixels).all()
+    if not (in_order and is_finite and gain.min() > 0 and error < 1e-3 * gain.max()):
+        raise ArithmeticError(f"maps {colors[-1].tolist()} to {mixed.round(3).tolist()}")
+    return order, black, gain
+
+
+def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:
+    path, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
+    if shared.is_file():
+        inside = json_in(folder, shared.name).get("image_processor")
+        if isinstance(inside, dict):
+            return shared, inside
+    if not path.is_file():
+        raise DataError(
+            folder,
+            found=f"no {path.name}",
+            expected="the image processor of the network: its normalization and image size",
+            remedy="Copy this file from the model from which this one was fine-tuned.",
+        )
+    return path, json_in(folder, path.name)
+
+
+def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
+    """Return the class named in a file, also by its older name, or the network's default."""
+    import transformers  # loads its classes on demand
+    from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
+    from transformers.image_processing_utils import BaseImageProcessor
+
+    older = str(content.get("feature_extractor_type", "")).replace("Feature", "Image")
+    name = str(content.get("image_processor_type") or older.replace("Extractor", "Processor"))
+    kind = getattr(transformers, name.removesuffix("Fast"), None)
+    if not (isinstance(kind, type) and issubclass(kind, BaseImageProcessor)):
+        model = AutoConfig.for_model(json_in(folder, "config.json")["model_type"])
+        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(model)]
+        kind = kinds.get("torchvision") or kinds["pil"]
+    return kind
+
+
+def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
+    """Return rows and columns of the images after the image processor."""
+    given = processor.get("size") if processor.get("do_resize") else None
+    if processor.get("do_center_crop") and processor.get("crop_size"):
+        given = processor["crop_size"]
+    if given is None:
+        return USUAL_SIZE
+    shortest = given.get("shortest_edge", given.get("longest_edge"))
+    rows, columns = given.get("height", shortest), given.get("width", shortest)
+    if not (isinstance(rows, int) and isinstance(columns, int) and min(rows, columns) > 0):
+        raise DataError(
+            folder / "preprocessor_config.json",
+            found=f"size: {given}",
+            expected="height and width, or shortest_edge, in pixels",
+        )
+    return rows, columns
+
+
+def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
+    """Return the tokens that select OneFormer's semantic task (``OneFormerProcessor``)."""
+    from transformers import AutoTokenizer
+
+    expected = "the tokenizer of OneFormer, which takes its task as text"
+    if not any((folder / name).is_file() for name in _VOCABULARIES):
+        raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
+    length = config.get("task_seq_len", 77)
+    try:
+        tokenizer = AutoTokenizer.from_pretrained(
+            folder, local_files_only=True, trust_remote_code=False
+        )
+        text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
+    except Exception as error:  # tokenizers raise many kinds about their files
+        raise DataError(
+            folder,
+            found=f"an unusable tokenizer ({first_line(error)})",
+            expected=expected,
+        ) from error
+    masked = zip(text["input_ids"], text["attention_mask"], strict=True)
+    return [token * mask for token, mask in masked]
+
+
+def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> None:
+    """Load weights with transformers, which maps tensor names of its older versions."""
+    inner = network.network
+    with hide_output():
+        loaded, found = type(inner).from_pretrained(
+            None,
+            config=inner.config,
+            state_dict=tensors,
+            output_loading_info=True,
+            ignore_mismatched_sizes=True,
+        )
+    wrong = [f"no {name}" for name in sorted(found["missing_keys"])]
+    for name, given, needed in sorted(found["mismatched_keys"]):
+        wrong.append(f"{name} of shape {tuple(given)} instead of {tuple(needed)}")
+    if wrong:
+        raise DataError(
+            folder,
+            found=f"other weights: {', '.join(wrong[:_LISTED])}",
+            expected=f"weights of {type(inner).__name__} as described in config.json"
+            + ", for the classes in its id2label" * hasattr(network, "is_universal"),
+        )
+    inner.load_state_dict(loaded.state_dict())

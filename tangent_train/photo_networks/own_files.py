@@ -1,0 +1,80 @@
+"""Load networks from users' files: ONNX, or a config with a state dict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from datamodules.core.inputs import Normalization
+from models.onnx_network import OnnxNetwork
+from models.pretrained import load_tensors, tensors_for
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.trained import completed_settings
+from tangent_train.config.build import build_from_config
+from tangent_train.errors import SettingError
+from tangent_train.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in
+
+
+def load_onnx(
+    *,
+    file: Path | None,
+    classes: Path | None,
+    normalization: Any,
+    depth: DepthKind | None = None,
+) -> PhotoNetwork:
+    """Load a network from an ONNX file, see `OnnxNetwork`.
+
+    Args:
+        file: ONNX file.
+        classes: JSON file of the class names.
+        normalization: See `Normalization.of`.
+        depth: Kind of depth; None for a network that predicts classes.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing.
+    """
+    if file is None:
+        raise SettingError("file", found="none", expected="an ONNX file")
+    network = OnnxNetwork(file)
+    return PhotoNetwork(
+        network=network,
+        settings=None,
+        score_names=class_names_in(classes, depth),
+        normalization=Normalization.of(normalization, 3),
+        image_size=network.image_size or USUAL_SIZE,
+        fixed_size=network.image_size is not None,
+        depth_kind=depth,
+    )
+
+
+def load_config(
+    settings: Mapping[str, Any],
+    *,
+    weights: str | Path | None,
+    classes: Path | None,
+    normalization: Any,
+    depth: DepthKind | None = None,
+) -> PhotoNetwork:
+    """Load a network that is described by a config of ``configs/network``.
+
+    Args:
+        settings: Section ``network`` of a config.
+        weights: File of the network's state dict.
+        classes: JSON file of the class names.
+        normalization: See `Normalization.of`.
+        depth: Kind of depth; None for a network that predicts classes.
+
+    Raises:
+        DataError: A file cannot be used.
+        SettingError: A setting is missing.
+    """
+    if weights is None:
+        raise SettingError("weights", found="none", expected="a file with the network's tensors")
+    names = class_names_in(classes, depth)
+    whole = completed_settings(settings, 3, len(names) or 1, restored=True)
+    network = build_from_config(whole, "network")
+    load_tensors(network, tensors_for(network, Path(weights)), weights)
+    normalized = Normalization.of(normalization, 3)
+    return PhotoNetwork(network, whole, names, normalized, depth_kind=depth)

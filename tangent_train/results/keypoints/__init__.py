@@ -1,1 +1,0 @@
-"""Keypoints of panorama pairs: detected on several representations, matched, scored, shown."""

@@ -1,0 +1,134 @@
+"""Objects of the user's config: all conventions of Hydra, and errors in one line."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import DictConfig
+
+from tangent_train.config.build import SettingsFile, build_from_config, named_arguments
+from tangent_train.errors import DataError, SettingError
+from tests.security.attacks import CANARY
+
+ME = __name__
+UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}
+
+
+class Kept:
+    """Keeps its arguments."""
+
+    def __init__(self, *positional: Any, **named: Any) -> None:
+        self.positional, self.named = positional, named
+
+
+class Handing(Kept):
+    """Hands its arguments on to a function that does not have all of them."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(pair(1, **settings))
+
+
+def pair(first: Any, second: Any = None) -> tuple[Any, Any]:
+    """Return both arguments."""
+    return first, second
+
+
+def test_conventions_of_hydra() -> None:
+    inner = {"_target_": f"{ME}.pair", "first": 1}
+    kept = build_from_config({"_target_": f"{ME}.Kept", "_args_": [1, inner], "x": [inner]}, "x")
+    assert kept.positional == (1, (1, None))
+    assert kept.named == {"x": [(1, None)]}
+    left = {"_target_": f"{ME}.Kept", "_recursive_": False, "x": inner}
+    assert build_from_config(left, "x").named == {"x": inner}
+    for convert, kind in ((None, dict), ("all", dict), ("none", DictConfig)):
+        section = {"_target_": f"{ME}.Kept", "x": {"y": [1]}} | (
+            {} if convert is None else {"_convert_": convert}
+        )
+        assert type(build_from_config(section, "x").named["x"]) is kind
+    later = build_from_config({"_target_": f"{ME}.pair", "_partial_": True, "first": 1}, "x")
+    assert type(later) is partial
+    assert (later.func, later.keywords, later(second=2)) == (pair, {"first": 1}, (1, 2))
+    given = build_from_config({"_target_": f"{ME}.pair", "first": 1}, "x", first=inner, second=2)
+    assert given == (inner, 2), "handed on as they are"
+
+
+@pytest.mark.parametrize("text", ["${oc.env:HOME}", "a\\${x} ${y", "$\\\\{x}", "${z}"])
+def test_text_is_not_interpreted_again(text: str) -> None:
+    """The config is resolved already: a folder may be called so."""
+    inner = {"_target_": f"{ME}.pair", "first": [text]}
+    section = {"_target_": f"{ME}.Kept", "x": text, "y": {"z": [text, {"z": text}]}, "i": inner}
+    named = build_from_config(section, "x").named
+    assert named == {"x": text, "y": {"z": [text, {"z": text}]}, "i": ([text], None)}
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        (UNET | {"in_channels": "three"}, r"^network\.in_channels: found three; expected int"),
+        (UNET | {"in_chanels": 3}, r"^network: found in_chanels for .*Is in_channels meant\?"),
+        (UNET | {"widths": 8}, r"^network: found models\.UNet cannot be made"),
+        (
+            {"_target_": f"{ME}.Kept", "i": UNET | {"x": 1}},
+            r"^network\.i: found x for models\.UNet",
+        ),
+        (
+            {"_target_": f"{ME}.Kept", "i": [UNET | {"widths": 8}]},
+            r"^network\.i\.0: found models\.UNet cannot",
+        ),
+        ({"_target_": f"{ME}.Absent"}, r"^network\._target_: .*Absent, which cannot be imported"),
+        ({"_target_": "os.unlink", "path": "x"}, r"^network: found os\.unlink cannot be made"),
+        ({"_target_": f"{ME}.Kept", "_args_": 3}, r"^network: .*InstantiationException"),
+        ({"_target_": f"{ME}.Handing", "x": 1}, r"^network: .*Handing cannot .* argument 'x'"),
+        (
+            {"_target_": f"{ME}.Kept", "i": {"_target_": f"{ME}.Handing", "x": 1}},
+            r"^network\.i: .*Handing cannot .* argument 'x'",
+        ),
+        (None, r"^network: found None; expected a section"),
+    ],
+)
+def test_errors_in_one_line(section: Any, message: str) -> None:
+    with pytest.raises(SettingError, match=message):
+        build_from_config(section, "network")
+
+
+def test_errors_of_ones_own_class_are_raised_as_they_are() -> None:
+    for section in ({"_target_": "builtins.int", "_args_": ["x"]},) * 2:
+        with pytest.raises(ValueError, match="invalid literal"):
+            build_from_config(section, "x")
+        with pytest.raises(ValueError, match="invalid literal"):
+            build_from_config({"_target_": f"{ME}.Kept", "x": section}, "x")
+
+
+def test_a_section_with_anything_of_a_file_is_not_given_to_hydra(tmp_path: Path) -> None:
+    fire = {"_target_": f"{CANARY}.fire"}
+    source = SettingsFile(tmp_path / "x.ckpt", (), {"network.widths", "data"})
+    network = build_from_config(UNET | {"_convert_": "all", "_recursive_": True}, "network", source)
+    assert type(network).__name__ == "UNet"
+    for key, value in (("_args_", [3]), ("_args_", []), ("_convert_", "x"), ("_recursive_", fire)):
+        with pytest.raises(DataError, match=rf"x\.ckpt: found network\.{key}="):
+            build_from_config(UNET | {key: value}, "network", source)
+    text = "${oc.env:HOME}"
+    trusted = SettingsFile(tmp_path / "x.ckpt", [f"{ME}.Kept"], {"network.y"})
+    section = {"_target_": f"{ME}.Kept", "_args_": [text], "x": {"z": text}, "y": text}
+    kept = build_from_config(section, "network", trusted)
+    assert (kept.positional, kept.named) == ((text,), {"x": {"z": text}, "y": text})
+    with pytest.raises(DataError, match=r"network\._args_\.0\._target_"):
+        build_from_config({"_target_": f"{ME}.Kept", "_args_": [fire]}, "network", trusted)
+
+
+def test_files_get_positional_arguments_by_name() -> None:
+    inner = {"_target_": f"{ME}.pair", "_args_": [1, 2]}
+    assert named_arguments({"network": inner | {"x": [inner]}, "level": 5}) == {
+        "network": {
+            "_target_": f"{ME}.pair",
+            "x": [{"_target_": f"{ME}.pair", "first": 1, "second": 2}],
+            "first": 1,
+            "second": 2,
+        },
+        "level": 5,
+    }
+    variable = {"_target_": f"{ME}.Kept", "_args_": [1]}
+    assert named_arguments(variable) == variable, "it has no name"

@@ -1,0 +1,358 @@
+from __future__ import annotations
+
+import io
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from PIL import Image, PngImagePlugin
+
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import equirect_to_lonlat
+from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, read_up, whole_area
+from tangent_train.orientation.gravity import up_from_pose
+from tests.datamodules.data_files import (
+    GPANO_TAGS,
+    exif_orientation,
+    gpano_xmp,
+    png_bytes,
+    png_chunk,
+    xmp_packet,
+)
+
+
+def _save(path: Path, tags: Mapping[str, str], shape: tuple[int, int] = (40, 60)) -> Path:
+    xmp = gpano_xmp(tags)
+    text = PngImagePlugin.PngInfo()
+    text.add_itxt("XML:com.adobe.xmp", xmp.decode())
+    formats: dict[str, Any] = {".png": {"pnginfo": text}, ".tif": {"tiffinfo": {700: xmp}}}
+    settings = formats.get(path.suffix, {"xmp": xmp})
+    Image.new("RGB", (shape[1], shape[0])).save(path, **settings)
+    return path
+
+
+_AREA = PanoramaArea((180, 360), (30, 70), (100, 160), (40, 60))
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp"])
+@pytest.mark.parametrize("projection", ["equirectangular", "Equirectangular", "EQUIRECTANGULAR"])
+def test_tags_of_all_formats(tmp_path: Path, suffix: str, projection: str) -> None:
+    path = _save(tmp_path / f"image{suffix}", GPANO_TAGS | {"ProjectionType": projection})
+    assert read_area(path, (40, 60)) == _AREA
+
+
+# XMP: ways to write the same, and places to write it to.
+
+_PITCH, _ROLL = "-24.5", "8.96"
+_UP = up_from_pose(-24.5, 8.96)
+_RDF = 'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"'
+_ATTRIBUTES = f'GPano:PosePitchDegrees="{_PITCH}" GPano:PoseRollDegrees="{_ROLL}"'
+_ELEMENTS = (
+    f"<GPano:PosePitchDegrees>{_PITCH}</GPano:PosePitchDegrees>"
+    f"<GPano:PoseRollDegrees>{_ROLL}</GPano:PoseRollDegrees>"
+)
+_OTHERS = (  # of the image that this one was made from, and of another program
+    '<m:Ingredients xmlns:m="of/another"><rdf:Bag><rdf:li rdf:parseType="Resource">'
+    "<GPano:PosePitchDegrees>1</GPano:PosePitchDegrees></rdf:li>"
+    '<rdf:li><rdf:Description GPano:PosePitchDegrees="2"/></rdf:li></rdf:Bag></m:Ingredients>'
+    '<m:PosePitchDegrees xmlns:m="of/another">3</m:PosePitchDegrees>'
+)
+_QUALIFIER = '<q:by xmlns:q="of/q">me</q:by>'
+
+
+def _described(old: str = "", new: str = "") -> str:
+    elements = _ELEMENTS.replace(old, new) if old else _ELEMENTS
+    return f"<rdf:Description>{elements}</rdf:Description>"
+
+
+_FORMS = {
+    "attributes": f'<rdf:Description rdf:about="" {_ATTRIBUTES}/>',
+    "references": f"<rdf:Description {_ATTRIBUTES}/>".replace("-24", "&#x2d;&#50;4"),
+    "elements": _described(),
+    "white space": _described(f">{_PITCH}<", f">\n\t{_PITCH}<"),
+    "two descriptions": f"<rdf:Description/><rdf:Description {_ATTRIBUTES}/>",
+    "beside others": f"<rdf:Description>{_OTHERS}{_ELEMENTS}{_OTHERS}</rdf:Description>",
+    "after others": f"<rdf:Description {_ATTRIBUTES}>{_OTHERS}</rdf:Description>",
+    "comments": _described(f">{_PITCH}<", f"><!-- ° -->-<![CDATA[{_PITCH[1:]}]]><"),
+    "language": _described("PitchDegrees>-", 'PitchDegrees xml:lang="x-default">-'),
+    "qualifiers": _described(
+        f"Degrees>{_PITCH}<",
+        f'Degrees rdf:parseType="Resource"><rdf:value>{_PITCH}</rdf:value>{_QUALIFIER}<',
+    ),
+    "qualifiers in a description": _described(
+        f"Degrees>{_PITCH}<",
+        f"Degrees>\n<rdf:Description>{_QUALIFIER}<rdf:value>{_PITCH}</rdf:value>"
+        "</rdf:Description>\n<",
+    ),
+    "a value as attribute": _described(
+        f"Degrees>{_PITCH}</GPano:PosePitchDegrees>",
+        f'Degrees rdf:value="{_PITCH}" q:by="me" xmlns:q="of/q"/>',
+    ),
+}
+
+
+def _jpeg(*segments: bytes) -> bytes:
+    """A JPEG file with APP1 segments."""
+    file = io.BytesIO()
+    Image.new("RGB", (60, 40)).save(file, "JPEG")
+    parts = [b"\xff\xe1" + (len(s) + 2).to_bytes(2, "big") + s for s in segments]
+    return b"".join([file.getvalue()[:2], *parts, file.getvalue()[2:]])
+
+
+def _adobe(packet: bytes) -> bytes:
+    return b"http://ns.adobe.com/xap/1.0/\0" + packet
+
+
+@pytest.mark.parametrize("prefix", ["GPano", "ns1", "photo-sphere"])
+@pytest.mark.parametrize("form", _FORMS)
+def test_forms_of_xmp(tmp_path: Path, form: str, prefix: str) -> None:
+    packet = xmp_packet(_FORMS[form].replace("GPano", prefix), prefix)
+    (tmp_path / "image.jpg").write_bytes(_jpeg(_adobe(packet)))
+    np.testing.assert_array_equal(read_up(tmp_path / "image.jpg"), _UP)
+
+
+def test_places_of_xmp(tmp_path: Path) -> None:
+    """In every format where programs put it, with what fills the packet or without."""
+    packet = xmp_packet(_FORMS["attributes"])
+    title = b"XML:com.adobe.xmp\0"
+    raw = b"\nxmp\n%8d\n%s\n" % (len(packet), packet.hex().encode())
+    app1 = _adobe(packet)
+    raw_app1 = b"\napp1\n%8d\n%s\n" % (len(app1), app1.hex().encode())
+    chunks = {
+        "plain": png_chunk(b"iTXt", title + b"\0\0\0\0" + packet),
+        "compressed": png_chunk(b"iTXt", title + b"\1\0en\0\0" + zlib.compress(packet)),
+        "raw": png_chunk(b"tEXt", b"Raw profile type xmp\0" + raw),
+        "raw, compressed": png_chunk(b"zTXt", b"Raw profile type xmp\0\0" + zlib.compress(raw)),
+        "raw APP1": png_chunk(b"tEXt", b"Raw profile type APP1\0" + raw_app1),
+    }
+    pixels = np.zeros((40, 60, 3), np.uint8)
+    files = {f"{name}, before.png": png_bytes(pixels, before=c) for name, c in chunks.items()}
+    files |= {f"{name}, behind.png": png_bytes(pixels, behind=c) for name, c in chunks.items()}
+    files["main.jpg"] = _jpeg(b"Exif\0\0" + exif_orientation(1), _adobe(packet))
+    files["padded.jpg"] = _jpeg(_adobe(packet + b" \n" * 2000 + b"\0"))
+    named = "0123456789ABCDEF0123456789ABCDEF"
+    extended = [
+        b"http://ns.adobe.com/xmp/extension/\0" + name.encode() + len(packet).to_bytes(4, "big")
+        + start.to_bytes(4, "big") + packet[start : start + 200]
+        for name in ("F" * 32, named)
+        for start in reversed(range(0, len(packet), 200))
+    ]  # fmt: skip
+    note = f'<rdf:Description n:HasExtendedXMP="{named}" xmlns:n="http://ns.adobe.com/xmp/note/"/>'
+    files["extended.jpg"] = _jpeg(_adobe(xmp_packet(note)), *extended)
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    Image.fromarray(pixels).save(tmp_path / "xmp.tif", tiffinfo={700: packet})
+    Image.fromarray(pixels).save(tmp_path / "xmp.webp", xmp=packet, lossless=True)
+    Image.fromarray(pixels).save(
+        tmp_path / "utf16.jpg", xmp=packet.decode().encode("utf-16"), quality=90
+    )
+    for path in sorted(tmp_path.iterdir()):
+        np.testing.assert_array_equal(read_up(path), _UP, err_msg=path.name)
+    foreign = _jpeg(_adobe(xmp_packet("<rdf:Description/>")), *extended)
+    (tmp_path / "foreign.jpg").write_bytes(foreign)
+    assert read_up(tmp_path / "foreign.jpg") is None
+
+
+@pytest.mark.parametrize(
+    "packet",
+    [
+        xmp_packet(_FORMS["attributes"])[:-60],
+        xmp_packet(_FORMS["attributes"]).replace(b"rdf:about", b"other:about"),
+        b'<!DOCTYPE x [<!ENTITY a "aaaa">]>' + xmp_packet(_FORMS["attributes"]),
+        '<?xml version="1.0" encoding="UTF-16"?><!DOCTYPE x>'.encode("utf-16")
+        + xmp_packet(_FORMS["attributes"]).decode().encode("utf-16-le"),
+        b'<?xml version="1.0" encoding="none"?>' + xmp_packet(_FORMS["attributes"]),
+    ],
+    ids=["truncated", "unknown prefix", "entities", "UTF-16", "unknown encoding"],
+)
+def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
+    """Refused with these tags, ignored without them."""
+    path = tmp_path / "image.jpg"
+    path.write_bytes(_jpeg(_adobe(packet)))
+    with pytest.raises(DataError, match=r"image\.jpg: found XMP data that .*exiftool"):
+        read_up(path)
+    old, new = (name.encode("utf-16-le") for name in ("photos", "videos"))
+    other = packet.replace(b"photos", b"videos").replace(old, new)
+    path.write_bytes(_jpeg(_adobe(other)))
+    assert read_up(path) is None
+
+
+def test_a_raw_profile_that_is_not_hexadecimal(tmp_path: Path) -> None:
+    chunk = png_chunk(b"tEXt", b"Raw profile type xmp\0\nxmp\n       3\n3c?\n")
+    (tmp_path / "a.png").write_bytes(png_bytes(np.zeros((4, 8, 3), np.uint8), before=chunk))
+    with pytest.raises(DataError, match=r"a\.png: found XMP data that cannot be read"):
+        read_up(tmp_path / "a.png")
+
+
+def test_images_that_say_nothing(tmp_path: Path) -> None:
+    Image.new("RGB", (60, 40)).save(tmp_path / "none.jpg")
+    incomplete = {k: v for k, v in GPANO_TAGS.items() if k != "CroppedAreaTopPixels"}
+    other = _save(tmp_path / "other.jpg", GPANO_TAGS)
+    other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
+    for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
+        assert read_area(path, (30, 60)) == whole_area(path, (30, 60)), path.name
+        with pytest.raises(DataError, match="a whole panorama"):
+            read_area(path, (40, 60))
+        assert read_up(path) is None
+
+
+@pytest.mark.parametrize("size", [(20, 30), (80, 120), (27, 40), (33, 50)])
+def test_resized_images_show_the_same(tmp_path: Path, size: tuple[int, int]) -> None:
+    path = _save(tmp_path / "image.jpg", GPANO_TAGS, size)
+    area = read_area(path, size)
+    assert area is not None
+    assert area.image_shape == size
+    west, north = _angles_deg(area, (area.columns[0], area.rows[0]))
+    east, south = _angles_deg(area, (area.columns[1], area.rows[1]))
+    pixel_deg = 180 / area.full_shape[0]
+    assert np.allclose([west, east, south, north], [-80, -20, 20, 60], atol=1.01 * pixel_deg)
+    known = area.place(np.ones(size, bool))
+    assert known.shape == area.full_shape
+    assert abs(known.sum() - size[0] * size[1]) <= max(size)
+
+
+def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.float64]:
+    """Longitude and latitude of the upper left corner of a pixel."""
+    return np.degrees(equirect_to_lonlat(np.subtract(corner_xy, 0.5), area.full_shape))
+
+
+@pytest.mark.parametrize(
+    ("changes", "size", "found"),
+    [
+        ({"ProjectionType": "cylindrical"}, (40, 60), "GPano:ProjectionType cylindrical"),
+        ({"FullPanoWidthPixels": "many"}, (40, 60), "GPano:FullPanoWidthPixels 'many'"),
+        (
+            {"FullPanoHeightPixels": "100"},
+            (40, 60),
+            r"of 360 × 100 \(width × height\), .*expected a part",
+        ),
+        (
+            {"CroppedAreaTopPixels": "150"},
+            (40, 60),
+            "100 from the left and 150 from the top of 360 × 180",
+        ),
+        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "tags of 0 × 40"),
+        ({}, (40, 50), r"in an image of 50 × 40 \(width × height\); .*may have been cut after"),
+        ({"FullPanoWidthPixels": "9e7", "FullPanoHeightPixels": "4.5e7"}, (40, 60), "columns"),
+    ],
+)
+def test_tags_that_cannot_be_are_refused(
+    tmp_path: Path, changes: dict[str, str], size: tuple[int, int], found: str
+) -> None:
+    path = _save(tmp_path / "image.jpg", GPANO_TAGS | changes)
+    with pytest.raises(DataError, match=rf"image\.jpg: found .*{found}"):
+        read_area(path, size)
+
+
+# Placing and cutting
+
+
+@pytest.mark.parametrize(
+    "area",
+    [
+        PanoramaArea((8, 16), (2, 5), (3, 8), (3, 5)),
+        PanoramaArea((8, 16), (0, 8), (12, 20), (8, 8)),
+        PanoramaArea((8, 16), (5, 8), (15, 31), (3, 16)),
+        PanoramaArea((8, 16), (0, 8), (5, 21), (8, 16)),
+    ],
+)
+@pytest.mark.parametrize(("channels", "dtype"), [((3,), np.uint8), ((), np.float32)])
+def test_place_and_cut(area: PanoramaArea, channels: tuple[int, ...], dtype: Any) -> None:
+    shape = (*area.image_shape, *channels)
+    image = np.random.default_rng(0).integers(1, 250, shape).astype(dtype)
+    placed = area.place(image)
+    assert placed.dtype == image.dtype
+    whole = np.zeros((8, 16, *channels))
+    for column in range(image.shape[1]):
+        whole[slice(*area.rows), (area.columns[0] + column) % 16] = image[:, column]
+    np.testing.assert_array_equal(placed, whole)
+    np.testing.assert_array_equal(area.cut(placed), image)
+
+
+@pytest.mark.parametrize("width", [19, 20, 21])
+def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, width: int) -> None:
+    area = whole_area(tmp_path / "image.jpg", (10, width))
+    assert area.full_shape == (10, 20)
+    assert area.is_whole
+    image = np.arange(10 * width).reshape(10, width)
+    placed = area.place(image)
+    assert placed.shape == (10, 20)
+    assert set(np.diff(placed[0])) <= {0, 1, 2}
+    cut = area.cut(placed)
+    assert cut.shape == image.shape
+    assert np.abs(cut - image).max() <= (width != 20)
+
+
+@pytest.mark.parametrize("size", [(10, 18), (10, 22), (1, 1)])
+def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
+    message = rf"a\.jpg: found {size[1]} × {size[0]} .*area=.*GPano.*photo, give fov=.*projection="
+    with pytest.raises(DataError, match=message):
+        whole_area(tmp_path / "a.jpg", size)
+
+
+# The setting
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_edges_are_at_the_angles(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    across, down = rng.uniform(20, 350), rng.uniform(10, 170)
+    west = rng.uniform(-180, 180)
+    east = (west + across + 180) % 360 - 180
+    south = rng.uniform(-90, 90 - down)
+    width = int(rng.integers(300, 900))
+    size = (round(width * down / across), width)
+    area = area_of_angles(size, (west, east, south, south + down))
+    pixel_deg = 180 / area.full_shape[0]
+    left, top = _angles_deg(area, (area.columns[0], area.rows[0]))
+    assert abs((left - west + 180) % 360 - 180) <= pixel_deg
+    assert abs(top - (south + down)) <= pixel_deg
+    assert abs((area.columns[1] - area.columns[0]) * pixel_deg - across) <= 2 * pixel_deg
+    assert abs((area.rows[1] - area.rows[0]) * pixel_deg - down) <= 2 * pixel_deg
+    assert 0 <= area.columns[0] < area.full_shape[1]
+    assert 0 <= area.rows[0] < area.rows[1] <= area.full_shape[0]
+    image = rng.integers(0, 255, size, np.uint8)
+    cut = area.cut(area.place(image))
+    assert (cut == image).mean() > 0.98
+
+
+def test_pixels_that_are_not_square_are_refused() -> None:
+    message = r"area: found .*pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square: "
+    message += r"40\.00° high, e\.g\. -20\.00 to 20\.00"
+    with pytest.raises(SettingError, match=message):
+        area_of_angles((100, 100), (0, 40, 0, 10))
+
+
+# Pose
+
+
+@pytest.mark.parametrize(
+    ("pitch", "roll"),
+    [("-24.49", "-121"), ("5.0", "0"), ("0.0", "-0"), ("+2.3E+1", "-.31e2"), ("5.", "007")],
+)
+def test_zero_pitch_and_roll_are_unknown(tmp_path: Path, pitch: str, roll: str) -> None:
+    """Programs write zero pitch and roll by default."""
+    tags = {"PosePitchDegrees": pitch, "PoseRollDegrees": roll}
+    up = read_up(_save(tmp_path / "image.jpg", tags))
+    expected = None if float(pitch) == 0 else up_from_pose(float(pitch), float(roll))
+    np.testing.assert_array_equal(up, expected)
+
+
+def test_impossible_poses_are_refused(tmp_path: Path) -> None:
+    for axis, value in (
+        ("Pitch", "91"),
+        ("Roll", "nan"),
+        ("Roll", "180.5"),
+        ("Roll", "steep"),
+        ("Pitch", "1_0"),
+        ("Pitch", "\u0663"),
+        ("Pitch", "1e400"),
+    ):
+        path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
+        message = rf"image\.jpg: found GPano:Pose{axis}Degrees .*expected a number from"
+        with pytest.raises(DataError, match=message):
+            read_up(path)

@@ -1,0 +1,356 @@
+"""Videos as PyAV writes them, whole, rotated, cut and damaged; edited boxes are written by hand."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tangent_train.errors import DataError
+from tangent_train.io.videos import read_frames, read_video_size, write_video
+from tests.datamodules.data_files import hide_start
+
+av: Any = pytest.importorskip("av")
+
+_RATE = 10
+_COUNT = 12
+_UNEVEN = (0, 1, 2, 4, 5, 9, 10, 30, 31, 32, 60, 100)
+_X264 = ("libx264", "yuv420p", {"bf": "2", "g": "6"})
+_CODECS: dict[str, tuple[str, str, dict[str, str]]] = {
+    "x264": _X264,
+    "forward": ("libx264", "yuv420p", {"bf": "0", "g": "6"}),
+    "mpeg4": ("mpeg4", "yuv420p", {"bf": "2"}),
+    "mjpeg": ("mjpeg", "yuvj420p", {}),
+    "ffv1": ("ffv1", "yuv420p", {}),
+    "prores": ("prores_ks", "yuv422p10le", {}),
+    "vp8": ("libvpx", "yuv420p", {"lag-in-frames": "16", "auto-alt-ref": "1"}),
+    "vp9": ("libvpx-vp9", "yuv420p", {"lag-in-frames": "16"}),
+    "av1": ("libsvtav1", "yuv420p", {"preset": "12"}),
+    "opengop": ("libx264", "yuv420p", {"g": "6", "x264-params": "open-gop=1:scenecut=0"}),
+    "lossless": ("libx264rgb", "rgb24", {"crf": "0"}),
+}
+
+
+def _pictures(count: int = _COUNT) -> list[NDArray[np.uint8]]:
+    blocks = np.random.default_rng(0).integers(0, 256, (8, 16, 3), np.uint8)
+    picture = np.kron(blocks, np.ones((8, 8, 1), np.uint8))
+    return [np.ascontiguousarray(np.roll(picture, 3 * k, axis=1)) for k in range(count)]
+
+
+def _write(
+    path: Path,
+    codec: str = "x264",
+    frames: Sequence[NDArray[np.uint8]] | None = None,
+    times: Sequence[int] | None = None,
+    sound: int = 0,
+    setup: Callable[[Any], object] = id,
+    **container: str,
+) -> Path:
+    """Write a video, perhaps with seconds of sound."""
+    name, pixels, options = _CODECS[codec]
+    frames = _pictures() if frames is None else frames
+    with av.open(str(path), "w", container_options=container) as output:
+        stream = output.add_stream(name, rate=_RATE, options=options)
+        stream.height, stream.width = frames[0].shape[:2]
+        stream.pix_fmt = pixels
+        stream.codec_context.time_base = Fraction(1, _RATE)
+        setup(stream)
+        audio: Any = output.add_stream("aac", rate=44100) if sound else None
+        for number, rgb in enumerate(frames):
+            frame = av.VideoFrame.from_ndarray(rgb, format="rgb24").reformat(format=pixels)
+            frame.pts, frame.time_base = (times or range(99))[number], Fraction(1, _RATE)
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode(None))
+        for number in range(43 * sound):
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+            silence.sample_rate, silence.pts = 44100, 1024 * number
+            output.mux(audio.encode(silence))
+        if audio is not None:
+            output.mux(audio.encode(None))
+    return path
+
+
+def _decoded(path: Path) -> list[NDArray[np.uint8]]:
+    with av.open(str(path)) as container:
+        return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+
+
+def _read(path: Path) -> list[NDArray[np.uint8]]:
+    return [frame() for frame in read_frames(path)]
+
+
+_WHOLE = [
+    ("x264.mp4", {}),
+    ("x264.mov", {"times": _UNEVEN}),
+    ("x264.m4v", {}),
+    ("x264.mkv", {"sound": 3}),
+    ("x264.avi", {"sound": 3}),
+    ("x264.mp4", {"movflags": "frag_keyframe+empty_moov"}),
+    ("x264.mp4", {"times": range(50, 99)}),
+    ("x264.mkv", {"live": "1"}),
+    ("opengop.mkv", {}),
+    ("mpeg4.avi", {"times": _UNEVEN}),
+    ("mjpeg.avi", {"frames": _pictures(1)}),
+    ("mjpeg.mov", {}),
+    ("ffv1.mkv", {"times": _UNEVEN}),
+    ("prores.mov", {}),
+    ("vp8.webm", {}),
+    ("vp9.webm", {"times": _UNEVEN}),
+    ("av1.webm", {"frames": _pictures(1)}),
+    ("av1.mp4", {"times": _UNEVEN}),
+    ("lossless.avi", {}),
+]
+
+
+@pytest.mark.parametrize(("name", "settings"), _WHOLE, ids=[name for name, _ in _WHOLE])
+def test_whole_videos_are_read(tmp_path: Path, name: str, settings: dict[str, Any]) -> None:
+    """Varying rate, longer sound, late start, one frame."""
+    path = _write(tmp_path / name, name.partition(".")[0], **settings)
+    count = len(settings.get("frames", range(_COUNT)))
+    assert read_video_size(path) == (count, 64, 128)
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+    every = [frame() for frame in read_frames(path, count, 5)]
+    np.testing.assert_array_equal(every, _decoded(path)[::5])
+
+
+@pytest.mark.parametrize("codec", ["x264", "mpeg4", "mjpeg", "vp9", "opengop"])
+@pytest.mark.parametrize("hidden", [1, 5, 11])
+def test_frames_that_an_edit_list_hides_do_not_count(
+    tmp_path: Path, codec: str, hidden: int
+) -> None:
+    """At the start, and at the end as PyAV leaves them out."""
+    path = _write(tmp_path / "cut.mp4", codec)
+    whole, data = _decoded(path), bytearray(path.read_bytes())
+    hide_start(path, hidden / _RATE)
+    assert read_video_size(path)[0] == _COUNT - hidden
+    np.testing.assert_array_equal(_read(path), whole[hidden:])
+    place = data.index(b"elst") + 12
+    (ticks,) = struct.unpack_from(">I", data, place)
+    struct.pack_into(">I", data, place, ticks * (_COUNT - hidden) // _COUNT)
+    path.write_bytes(data)
+    kept = _read(path)
+    assert 0 < len(kept) == read_video_size(path)[0] < _COUNT
+    np.testing.assert_array_equal(kept, _decoded(path))
+    np.testing.assert_array_equal(kept, whole[: len(kept)])
+
+
+@pytest.mark.parametrize("suffix", [".mkv", ".mp4"])
+def test_frames_that_need_what_was_cut_off_do_not_count(tmp_path: Path, suffix: str) -> None:
+    """A cut without encoding at a key frame that others before it refer to."""
+    path, whole = tmp_path / f"cut{suffix}", _write(tmp_path / "whole.mkv", "opengop")
+    with av.open(str(whole)) as source, av.open(str(path), "w") as output:
+        stream = output.add_stream_from_template(source.streams.video[0])
+        keys = 0
+        for packet in source.demux(video=0):
+            keys += packet.is_keyframe
+            if keys > 1 and packet.size:
+                packet.stream = stream
+                output.mux(packet)
+    assert 0 < len(_decoded(path)) < _COUNT
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+
+
+def _hide(path: Path, number: int) -> None:
+    """Make a frame of VP8 one that is not shown: bit 4 of its first byte (RFC 6386, 9.1)."""
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0)][number]
+    hidden = bytes([packet[0] & ~0x10]) + packet[1:]
+    path.write_bytes(path.read_bytes().replace(packet, hidden))
+
+
+def test_reference_frames_of_vp8_do_not_count(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8")
+    _hide(path, 5)
+    assert len(_decoded(path)) == _COUNT - 1
+    np.testing.assert_array_equal(_read(path), _decoded(path))
+
+
+@pytest.mark.parametrize("suffix", [".mp4", ".mkv"])
+@pytest.mark.parametrize("quarter_turns", range(4))
+@pytest.mark.parametrize("mirrored", ["", "hflip", "vflip"])
+def test_frames_are_upright(tmp_path: Path, suffix: str, quarter_turns: int, mirrored: str) -> None:
+    """Counterclockwise by quarter quarter_turns, and then mirrored."""
+
+    def rotate(stream: Any) -> None:
+        stream.set_display_rotation(90 * quarter_turns, **({mirrored: True} if mirrored else {}))
+
+    stored = _pictures(2)
+    path = _write(tmp_path / f"a{suffix}", "lossless", stored, setup=rotate)
+    flip: Any = {"": lambda a: a, "hflip": np.fliplr, "vflip": np.flipud}[mirrored]
+    shown = [flip(np.rot90(rgb, quarter_turns)) for rgb in stored]
+    assert read_video_size(path) == (2, *shown[0].shape[:2])
+    np.testing.assert_array_equal(_read(path), shown)
+    seen: dict[int, NDArray[np.uint8]] = {}
+    size = (2, *shown[0].shape[:2])
+    write_video(tmp_path / "b.mp4", path, size, seen.setdefault)
+    np.testing.assert_array_equal([seen[0], seen[1]], shown)
+    again = np.array(_decoded(tmp_path / "b.mp4"), float)
+    assert again.shape == np.shape(shown)
+    assert np.abs(again - shown).mean() < 20  # compressed, with colors at half resolution
+
+
+def test_other_angles_are_refused(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mp4", setup=lambda stream: stream.set_display_rotation(30))
+    with pytest.raises(
+        DataError, match=r"a\.mp4: found a display matrix .*0\.866.*90°, 180° or 270°"
+    ):
+        read_video_size(path)
+
+
+def _orientation_sei(quarter_turns: int) -> bytes:
+    """Quarter quarter_turns counterclockwise (H.264, D.1.27), with the length of the NAL unit."""
+    bits = f"000{quarter_turns % 4 << 14:016b}10100"
+    return b"\0\0\0\x07\x06\x2f\x03" + int(bits, 2).to_bytes(3) + b"\x80"
+
+
+@pytest.mark.parametrize("quarter_turns", ["1", "1 1", "3 3", "0 3", "1 3", "3 2", "0 1"])
+def test_the_orientation_in_an_h264_stream_is_that_of_all_frames(
+    tmp_path: Path, quarter_turns: str
+) -> None:
+    """In quarter quarter_turns of the first frame and of frame 6; the others have no matrix."""
+    whole, path = _write(tmp_path / "whole.mp4", "forward"), tmp_path / "a.mp4"
+    first, *later = map(int, quarter_turns.split())
+    places = {0: first} | dict.fromkeys([6] if later else [], *later)
+    with av.open(str(whole)) as source, av.open(str(path), "w") as output:
+        stream = output.add_stream_from_template(source.streams.video[0])
+        for number, packet in enumerate(p for p in source.demux(video=0) if p.size):
+            content = bytes(packet)
+            if number in places:
+                content = _orientation_sei(places[number]) + content
+            written = av.Packet(content)
+            written.pts, written.dts, written.time_base = packet.pts, packet.dts, packet.time_base
+            written.is_keyframe, written.stream = packet.is_keyframe, stream
+            output.mux(written)
+    if later and later != [first]:
+        with pytest.raises(DataError, match=r"a\.mp4: found another orientation from frame 6 on"):
+            _read(path)
+        return
+    shown = [np.rot90(rgb, first) for rgb in _decoded(whole)]
+    assert read_video_size(path) == (_COUNT, *shown[0].shape[:2])
+    np.testing.assert_array_equal(_read(path), shown)
+    np.testing.assert_array_equal([frame() for frame in read_frames(path, every=5)], shown[::5])
+
+
+@pytest.mark.parametrize(
+    ("name", "settings"),
+    [
+        ("x264.mp4", {"movflags": "faststart"}),
+        ("x264.mov", {"movflags": "frag_keyframe+empty_moov"}),
+        ("x264.mkv", {"sound": 3}),
+        ("vp9.webm", {}),
+        ("mpeg4.avi", {}),
+    ],
+)
+def test_truncated_videos_are_refused(tmp_path: Path, name: str, settings: Any) -> None:
+    path = _write(tmp_path / name, name.partition(".")[0], **settings)
+    data = path.read_bytes()
+    tags = (b"mdat", b"moof", b"mfra", b"\x1f\x43\xb6\x75", b"00dc")
+    starts = {find(tag) for tag in tags if tag in data for find in (data.find, data.rfind)}
+    end, is_fragmented = len(data), b"moof" in data
+    cuts = {end * part // 19 for part in range(19)} | {start + 4 for start in starts} | {end - 1}
+    # Within the header of a box, which starts 4 bytes before its name.
+    cuts |= {start - cut for start in starts for cut in range(-3, 4) if is_fragmented}
+    for length in cuts:
+        path.write_bytes(data[:length])
+        with pytest.raises(DataError, match=rf"{name}: found"):
+            read_video_size(path)
+
+
+def _packets(path: Path) -> list[tuple[int, int]]:
+    """Place and size of the packets in a file."""
+    with av.open(str(path)) as container:
+        return [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
+
+
+@pytest.mark.parametrize("name", ["x264.mkv", "vp8.webm", "vp9.webm", "mpeg4.avi"])
+def test_frames_lost_in_the_middle_are_an_error(tmp_path: Path, name: str) -> None:
+    """Headers of packets are overwritten; the second of two such files is refused as well."""
+    path = _write(tmp_path / name, name.partition(".")[0])
+    data = bytearray(path.read_bytes())
+    start, _ = _packets(path)[_COUNT // 2]
+    data[start - 8 : start + 8] = bytes(16)
+    for copy in (path, tmp_path / f"again-{name}"):
+        copy.write_bytes(data)
+        with pytest.raises(DataError, match="found a truncated or damaged video"):
+            read_video_size(copy)
+
+
+@pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "forward.avi", "av1.webm"])
+def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: str) -> None:
+    path = _write(tmp_path / name, name.partition(".")[0])
+    whole, data = _decoded(path), bytearray(path.read_bytes())
+    start, size = _packets(path)[7]
+    data[start + 12 : start + size] = b"\x55" * (size - 12)
+    path.write_bytes(data)
+    kept = []
+    with pytest.raises(DataError, match=r"found a (truncated or damaged|video that cannot)"):  # noqa: PT012
+        for frame in read_frames(path):
+            kept.append(frame())  # noqa: PERF401 - those before the error
+    assert 0 < len(kept) < _COUNT
+    np.testing.assert_array_equal(kept, whole[: len(kept)])
+
+
+def test_an_incomplete_last_packet_in_a_box_without_a_size(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mp4", movflags="faststart")
+    data = bytearray(path.read_bytes())
+    place = data.index(b"mdat")
+    data[place - 4 : place] = bytes(4)  # to the end of the file
+    path.write_bytes(data)
+    assert read_video_size(path)[0] == _COUNT
+    path.write_bytes(data[:-5])
+    with pytest.raises(DataError, match=r"packet 11 is incomplete"):
+        read_video_size(path)
+
+
+def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.mkv", "vp8", _pictures(1))
+    _hide(path, 0)
+    with pytest.raises(DataError, match=r"a\.mkv: found no frame that can be decoded"):
+        read_video_size(path)
+    with pytest.raises(DataError, match="12 of 13 frames"):
+        list(read_frames(_write(tmp_path / "b.mkv"), _COUNT + 1))
+
+
+def test_names_and_contents_open_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    whole = _write(tmp_path / "neighbor.mp4")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(0.2)
+        port = server.getsockname()[1]
+        for name in (f"tcp:127.0.0.1:{port}.mp4", f"http:127.0.0.1:{port}.mkv", "a%03d.mp4"):
+            Path(name).write_bytes(whole.read_bytes())
+            assert read_video_size(Path(name)) == (_COUNT, 64, 128)
+        written = Path(f"tcp:127.0.0.1:{port}") / "a.mp4"
+        write_video(written, whole, (_COUNT, 64, 128), lambda _, rgb: rgb)
+        assert len(_decoded(tmp_path / written)) == _COUNT
+        texts = (
+            "ffconcat version 1.0\nfile neighbor.mp4\n",
+            f"#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nhttp://127.0.0.1:{port}/a.ts\n",
+            "#EXTM3U\n#EXT-X-TARGETDURATION:9\n#EXTINF:9,\nneighbor.mp4\n#EXT-X-ENDLIST\n",
+            f"v=0\no=- 0 0 IN IP4 127.0.0.1\ns=x\nc=IN IP4 127.0.0.1\nm=video {port} RTP/AVP 96\n",
+        )
+        for suffix in (".mp4", ".mkv", ".avi"):
+            for text in texts:
+                path = tmp_path / f"x{suffix}"
+                path.write_text(text)
+                with pytest.raises(DataError, match="found a video that cannot be decoded"):
+                    read_video_size(path)
+        with pytest.raises(TimeoutError):
+            server.accept()
+
+
+def test_texts_that_are_not_utf_8_do_not_matter(tmp_path: Path) -> None:
+    path = _write(tmp_path / "a.avi", "mpeg4")
+    data = path.read_bytes()
+    assert b"Lavf" in data
+    path.write_bytes(data.replace(b"Lavf", b"L\xe4vf"))
+    assert read_video_size(path)[0] == _COUNT

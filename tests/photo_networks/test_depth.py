@@ -1,0 +1,181 @@
+"""Depth networks of transformers and of files: the kind of their output, and their values."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from datamodules.core.inputs import Normalization
+from models.huggingface import HuggingFaceDepthNetwork, architecture
+from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.distances import depth_of_output
+from tangent_train.checkpoints.trained import describe_network
+from tangent_train.errors import DataError, SettingError
+from tangent_train.photo_networks import PhotoNetwork, huggingface, import_network
+from tangent_train.photo_networks.depth_kinds import declared_kind, try_depth
+from tests.photo_networks import depth_networks as depth
+from tests.photo_networks.huggingface_networks import change_json, imported, saved
+from tests.security.attacks import undeclared_settings
+
+CONFIG = Path("config.json")
+METRIC = {"model_type": "depth_anything", "depth_estimation_type": "metric"}
+
+
+def check_equal(found: Tensor, expected: Tensor) -> None:
+    """Values are equal up to 1e-5 of their range, and the range is not empty."""
+    span = float(expected.max() - expected.min())
+    assert span > 1e-2 * float(expected.abs().max())
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-5 * span)
+
+
+def check_family(
+    folder: Path, make: Callable[[], Any], side: int, given: DepthKind | None, kind: DepthKind
+) -> None:
+    """An imported network returns the depth of the library's pipeline, also from its checkpoint."""
+    fov_deg = 70.0 if kind == "canonical_inverse" else None
+    saved(make, folder, noise=0.1 if fov_deg else 0.2)
+    image = depth.photo(side)
+    expected = depth.own_depth(folder, image, fov_deg)
+    network = huggingface.load(model=str(folder), classes=None, normalization=None, depth=given)
+    trained = import_network(network, folder / "imported.ckpt")
+    assert (network.depth_kind, trained.depth_kind, trained.class_names) == (kind, kind, ())
+    for found in (depth.depth_of(network, image), depth.depth_of(trained, image)):
+        if fov_deg is not None:
+            x = (torch.arange(side) - (side - 1) / 2) * 2 * math.tan(math.radians(fov_deg) / 2)
+            lengths = (1 + (x / side) ** 2 + (x[:, None] / side) ** 2).sqrt()[None, None]
+            found = depth_of_output(found[None, None], kind, lengths)[0][0, 0]  # noqa: PLW2901
+        check_equal(found, expected)
+    described = describe_network(folder / "imported.ckpt")
+    assert described is not None
+    assert described.depth_kind == kind
+    assert described.settings["_target_"] == "models.HuggingFaceDepthNetwork"
+
+
+@pytest.mark.parametrize("family", [depth.FAMILIES[0], depth.FAMILIES[4]])
+def test_depth_is_that_of_the_library(family: Any, tmp_path: Path) -> None:
+    """Depth Anything, and ZoeDepth with its padding; tests/slow has all families."""
+    check_family(tmp_path, *family)
+
+
+@pytest.mark.parametrize(
+    ("config", "given", "expected"),
+    [
+        ({"model_type": "depth_anything"}, None, "relative_disparity"),
+        ({"model_type": "depth_anything"}, "relative_depth", "relative_depth"),
+        (METRIC, None, "metric_z"),
+        ({"model_type": "zoedepth"}, "metric_distance", "metric_distance"),
+        ({"model_type": "depth_pro"}, None, "canonical_inverse"),
+        ({"model_type": "dpt"}, "relative_disparity", "relative_disparity"),
+        (METRIC, "relative_disparity", "expected metric_z or metric_distance, because config.json"),
+        ({"model_type": "depth_pro"}, "metric_z", "expected canonical_inverse, because config.js"),
+        ({"model_type": "dpt"}, None, "depth: found none; expected one of .* Set depth=, e.g. rel"),
+        ({"model_type": "chmv2"}, None, "config.json: found chmv2: heights of trees"),
+        ({"model_type": "prompt_depth_anything"}, None, "depth image of a sensor, a second input"),
+    ],
+)
+def test_the_config_determines_the_kind(config: Any, given: Any, expected: str) -> None:
+    if " " not in expected:
+        assert declared_kind(config, CONFIG, given) == expected
+        return
+    with pytest.raises((DataError, SettingError), match=expected):
+        declared_kind(config, CONFIG, given)
+
+
+def test_the_architecture_decides_if_transformers_has_both(tmp_path: Path) -> None:
+    saved(depth.dpt, tmp_path)
+
+    def kind(given: DepthKind | None, architecture: str) -> DepthKind | None:
+        change_json(tmp_path / "config.json", architectures=[architecture])
+        load = huggingface.load
+        return load(model=str(tmp_path), classes=None, normalization=None, depth=given).depth_kind
+
+    assert kind("metric_z", "DPTForDepthEstimation") == "metric_z"
+    assert kind("metric_z", "DPTForDensePrediction") == "metric_z"
+    with pytest.raises(DataError, match=r"architectures: DPTForDensePrediction; .*Set depth="):
+        kind(None, "DPTForDensePrediction")
+    with pytest.raises(DataError, match="expected id2label with the name of every score"):
+        kind(None, "DPTForSemanticSegmentation")
+
+
+@pytest.mark.parametrize(
+    ("changed", "expected"),
+    [
+        ({"depth_estimation_type": "squared"}, r"config\.json: .*DepthNetwork cannot be made"),
+        ({"head_hidden_size": 9}, r"conv2\.\w+ of shape .* as described in config\.json\.$"),
+    ],
+)
+def test_configs_that_do_not_fit_are_refused(changed: Any, expected: str, tmp_path: Path) -> None:
+    saved(depth.depth_anything, tmp_path)
+    change_json(tmp_path / "config.json", **changed)
+    with pytest.raises(DataError, match=expected):
+        imported(tmp_path, depth="relative_disparity")
+
+
+def test_undeclared_settings_are_refused(tmp_path: Path) -> None:
+    config = architecture(depth.depth_anything()[0].config.to_dict())
+    for attack in undeclared_settings(tmp_path):
+        with pytest.raises(SettingError, match=r"network\.config"):
+            HuggingFaceDepthNetwork(config | attack)
+
+
+def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:
+    saved(depth.depth_pro, tmp_path)
+    trained = imported(tmp_path)
+    assert trained.fixed_size == trained.image_size == (64, 64)
+    assert "fov_model" not in json.dumps([*trained.inner.state_dict()])
+    change_json(tmp_path / "preprocessor_config.json", size={"height": 128, "width": 128})
+    with pytest.raises(
+        SettingError, match=r"network: found SettingError \(.*expected 64 × 64.*image of 128 × 128"
+    ):
+        imported(tmp_path)
+
+
+class _Output(nn.Module):
+    """Returns the mean color, times a factor and plus a shift."""
+
+    def __init__(self, factor: float, shift: float = 0, channels: int = 1) -> None:
+        super().__init__()
+        self.factor, self.shift, self.channels = factor, shift, channels
+
+    def forward(self, images: Tensor) -> Tensor:
+        mean = images.mean(dim=1, keepdim=True) * self.factor + self.shift
+        return mean.expand(-1, self.channels, -1, -1)
+
+
+@pytest.mark.parametrize(
+    ("output", "kind", "expected"),
+    [
+        (_Output(3), "metric_z", None),
+        (_Output(-3), "log_distance", None),
+        (_Output(1, 2), "relative_disparity", None),
+        (_Output(0, 2), "relative_disparity", "nearly the same depth everywhere, from 2 to 2"),
+        (
+            _Output(-3),
+            "relative_depth",
+            "negative numbers, unusual for relative_depth, from -3 to 0",
+        ),
+        (_Output(5000), "metric_distance", "depth of more than 1 km, from 0 to 5000 on images of"),
+        (_Output(1, channels=3), "metric_z", "found 3 per pixel, .* Leave out depth="),
+        (_Output(math.nan), "metric_z", "found 1 per pixel, 0 of 786432 numbers are finite"),
+        (nn.AvgPool2d(2), "metric_z", r"found \(1, 3, 256, 256\)"),
+    ],
+)
+def test_outputs_that_look_wrong_are_remarked_or_refused(
+    output: nn.Module, kind: DepthKind, expected: str | None
+) -> None:
+    network = PhotoNetwork(output, None, (), Normalization((0,) * 3, (1,) * 3), depth_kind=kind)
+    if expected and expected.startswith("found"):
+        with pytest.raises(SettingError, match=f"output of the network: {expected}"):
+            try_depth(network)
+        return
+    remarks = try_depth(network)
+    assert len(remarks) == (expected is not None)
+    assert re.search(expected or "", "".join(remarks))
