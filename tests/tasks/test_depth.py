@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import DistanceNetwork, from_distance, is_metric
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.metrics.depth import depth_scores
