@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.scores import network_for_views
 from tangent_train.errors import SettingError, at_least
 from tangent_train.metrics.score_columns import ScoreColumn

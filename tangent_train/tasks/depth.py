@@ -16,7 +16,6 @@ from torch.nn import functional
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.samples import EvaluationSample
-from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,
@@ -25,6 +24,7 @@ from tangent_train.checkpoints.distances import (
     is_disparity,
     is_metric,
 )
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.depth import check_align, combine_depth

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import SMALL_ROOMS, Run
 from tests.decoded import decoded
@@ -76,4 +76,4 @@ def test_a_task_of_ones_own_trains_evaluates_reports_and_resumes(
     assert read_checkpoint(folder / "checkpoints" / "last.ckpt")["epoch"] == 3
     assert json.loads((folder / "validation.json").read_text())["best"] <= min(scores)
     with pytest.raises(DataError, match=r"predicts something else; expected .* pixel_classes"):
-        load_trained(folder / "checkpoints" / "last.ckpt", ["toy_regression.ShareOfClass"])
+        load_network(folder / "checkpoints" / "last.ckpt", ["toy_regression.ShareOfClass"])

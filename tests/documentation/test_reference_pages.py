@@ -9,7 +9,7 @@ from dataclasses import fields
 from itertools import chain
 from pathlib import Path
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import TangentGrid
 from tangent_train.inference.label_maps import __file__ as label_maps
 from tangent_train.io.camera_files import CameraFile, write_cameras
@@ -56,7 +56,7 @@ def test_file_formats_names_every_field_of_results() -> None:
 
 
 def test_file_formats_names_every_field_of_an_exported_network() -> None:
-    names = {field.name for field in fields(TrainedNetwork)} - {"inner", "source"}
+    names = {field.name for field in fields(LoadedNetwork)} - {"module", "source"}
     assert not missing(names, "file_formats.md")
 
 

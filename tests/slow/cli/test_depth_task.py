@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
@@ -124,7 +124,7 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
         run("train", *tuned, "hydra.run.dir=refused")
     run("train", *tuned, "task.alignment=affine", "hydra.run.dir=relative")
     assert "Output of the network: relative_disparity" in capsys.readouterr().out
-    trained = load_trained(Path("relative/checkpoints/best.ckpt"))
+    trained = load_network(Path("relative/checkpoints/best.ckpt"))
     assert trained.depth_kind == "relative_disparity"
     assert results(Path("relative"))["protocol"]["alignment"] == "affine in disparity"
 
