@@ -12,7 +12,6 @@ from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import UNet
 from tangent_train.checkpoints.trained import TrainedNetwork
-from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
@@ -28,7 +27,7 @@ def area(quick: bool) -> Iterator[Table]:
     network = UNet(3, 13, (16, 24, 32, 48)).eval()
     rows = 2 ** (level + 1)
     rgb = np.random.default_rng(0).integers(0, 256, (rows, 2 * rows, 3), np.uint8)
-    canvas = PanoramaArea.on_canvas(SphereArea(-180, 180, -35.15625, 35.15625), rows)
+    canvas = PanoramaArea.on_canvas((-180, 180, -35.15625, 35.15625), rows)
     images = {
         WHOLE: InputImage(rgb),
         PART: InputImage(canvas.place(canvas.cut(rgb)), area=canvas),
