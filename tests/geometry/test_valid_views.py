@@ -106,9 +106,7 @@ def test_training_samples_have_one_size(rotation: Any, up: int | None, kind: str
     shapes, seen = set(), []
     for given in (valid, None):
         shown = [
-            views.sample(np.random.default_rng(seed), given).render(
-                valid.astype(np.uint8), "nearest"
-            )
+            views.sample(np.random.default_rng(seed), given).render(image, "nearest")
             for seed in range(12)
         ]
         if given is not None:
