@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import torch
 
-from tangent_train.checkpoints.content import Align
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
+from tangent_train.checkpoints.kinds import Align
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_to_lonlat,
@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import Tensor
 
-    from tangent_train.checkpoints.content import DepthKind
-    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.checkpoints.kinds import DepthKind
+    from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.geometry import SphereArea
     from tangent_train.inference.alignment import AlignmentReport
     from tangent_train.inference.images import InputImage
@@ -151,7 +151,7 @@ class DepthPredictor(ViewPredictor):
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         view_batch_size: int | None = None,

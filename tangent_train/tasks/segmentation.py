@@ -18,6 +18,7 @@ from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import scored_views, view_scores
+from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.metrics.segmentation import (
     AbsentClass,
     SegmentationCounts,
@@ -31,9 +32,9 @@ from tangent_train.metrics.segmentation import (
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.results.evaluation import class_entries, latitude_entries
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import prediction_panel, shown_arrays
-from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.results.tables import percent
 from tangent_train.tasks.base import RGB
 from tangent_train.tasks.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
@@ -58,10 +59,10 @@ class SegmentationTask(ViewsTask):
     """
 
     predicts: ClassVar[str] = PIXEL_CLASSES
-    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
-            "macc": Heading("mAcc", "%", "accuracy", "accuracy"),
-            "miou": Heading("mIoU", "%", "iou", "IoU"),
+            "macc": ScoreColumn("mAcc", "%", "accuracy", "accuracy"),
+            "miou": ScoreColumn("mIoU", "%", "iou", "IoU"),
         }
     )
     monitor: ClassVar[str] = "val/miou"
@@ -182,14 +183,14 @@ class SegmentationTask(ViewsTask):
         scores = self._scores(result)[0].iou.tolist()
         return {f"iou/{n}": s for n, s in zip(self.class_names[1:], scores, strict=True)}
 
-    def record(self, result: SegmentationCounts, noun: str) -> Record:
+    def evaluation_result(self, result: SegmentationCounts, noun: str) -> EvaluationResult:
         """Return the record with scores of classes and latitude bands, and confidence intervals."""
         pixels, angles = self._scores(result)
         of_images, absent = result.of_images.swapaxes(0, 1), self._absent_classes(result)
         intervals = list(map(bootstrap_intervals, of_images, absent))
         columns = pixels.of_classes | by_solid_angle(angles.of_classes) | {"share": pixels.share}
         return replace(
-            super().record(result, noun),
+            super().evaluation_result(result, noun),
             classes=class_entries(columns, result.pixels, self.class_names),
             latitude_bands=latitude_entries(
                 segmentation_scores(band, self.absent_class if band.any() else "skip").means
