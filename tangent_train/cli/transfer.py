@@ -42,8 +42,8 @@ from tangent_train.files import write_text
 from tangent_train.inference.engine import views_per_forward
 from tangent_train.inference.representations import PERSPECTIVE, panorama_settings
 from tangent_train.manifest import Manifest
-from tangent_train.results.comparisons import levels_report, transfer_report
 from tangent_train.results.evaluation_result import load_result
+from tangent_train.results.report import levels_report, transfer_report
 
 _HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
 _SLOWER = 10  # in fine-tuning: from 1e-4 to 1e-5 (paper, supplement, "Transfer learning")
@@ -308,6 +308,6 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
         name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
     report.tables()[0].print()
-    for note in report.all_notes():
+    for note in report.notes:
         print_text(f"- {note}")
     print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
