@@ -139,7 +139,7 @@ def test_the_part_of_an_equirectangular_image_shows_the_area(
     rendered = views.render(image, "bilinear")
     assert rendered.shape[1:3] == (views.window.height, views.window.width)
     assert rendered.shape[1] % 32 == rendered.shape[2] % 32 == 0
-    scores, _ = views.placed(torch.from_numpy(rendered).movedim(-1, 1), SHAPE)
+    scores, _ = views.on_canvas(torch.from_numpy(rendered).movedim(-1, 1), SHAPE)
     back = scores[0, :, 1:-1, 1:-1].movedim(0, -1).numpy()
     if back.shape[:2] == SHAPE:
         inside = area.contains(image)
