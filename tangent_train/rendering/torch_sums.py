@@ -99,7 +99,9 @@ class TorchSums:
             image = torch.searchsorted(edges_there, places, right=True) - 1
             flat = flat_at(places, image)
             offsets = offsets_at(image, flat)
-            positions = offsets.to(values.dtype).T[None, None]
+            positions, weight = offsets.to(values.dtype).T[None, None], None
+            if is_feathered:
+                weight = (1 - offsets.square()).clamp_(min=0).prod(dim=0).sqrt_().to(values.dtype)
             limits = edges.clip(start, stop) - start
             for m in np.flatnonzero(np.diff(limits)).tolist():
                 part = slice(int(limits[m]), int(limits[m + 1]))
@@ -108,23 +110,23 @@ class TorchSums:
                     positions[:, :, part],
                     padding_mode="border",
                     align_corners=False,
-                )[0, :, 0]
-                self._add(sampled, flat[part], offsets[:, part] if is_feathered else None)
+                )
+                sampled = sampled.view(self._channels, -1)
+                self._add(sampled, flat[part], None if weight is None else weight[part])
 
-    def _add(self, sampled: Tensor, index: Tensor, offsets: Tensor | None) -> None:
+    def _add(self, sampled: Tensor, index: Tensor, weight: Tensor | None) -> None:
         """Add values of one image to P different pixels of the canvas.
 
         Args:
             sampled: ``(K, P)`` values.
             index: ``(P,)`` flat indices of the pixels.
-            offsets: ``(2, P)`` offsets for the weights; None for pixels that the image owns.
+            weight: ``(P,)`` weights; None for pixels that the image owns.
         """
         if not len(self._sums):
             self._labels[index] = _without_nan(sampled).argmax(dim=0).int()
             return
-        if offsets is not None:
-            weight = (1 - offsets.square()).clamp_(min=0).prod(dim=0).sqrt_()
-            sampled = sampled * weight.to(sampled.dtype)
+        if weight is not None:
+            sampled = sampled * weight
         elif self._softmax:
             sampled = _softmax(sampled, 0)
         # The pixels are different, so the order of additions does not vary.
