@@ -15,19 +15,19 @@ from torch import Tensor, nn
 
 import tangent_train as tt
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import from_distance, is_metric
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    SphereArea,
     TangentGrid,
     camera_matrix_from_fov,
     equirect_directions,
     equirect_solid_angles,
     rotation_about,
 )
+from tangent_train.geometry.equirect import area_mask
 from tangent_train.inference.applying import apply
 from tangent_train.inference.depth import DepthPredictor, combine_depth
 from tangent_train.inference.images import InputImage
@@ -106,14 +106,13 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
     for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, 17 * depth.where(up.abs() < 0.6, depth / 4)))  # farther at the poles
-    for shape, area in (
+    for shape, valid in (
         (SHAPE, None),
-        (SHAPE, SphereArea(-60, 100, -20, 70)),
+        (SHAPE, area_mask((-60, 100, -20, 70), SHAPE)),
         ((32, 64), None),  # fewer pixels than directions
     ):
-        found = combine_depth(outputs, shape, "relative_disparity", "nearest", "none", area=area)
-        directions = equirect_directions(shape)
-        inside = area.contains(directions) if area else np.ones(shape, bool)
+        found = combine_depth(outputs, shape, "relative_disparity", "nearest", "none", valid=valid)
+        inside = np.ones(shape, bool) if valid is None else valid
         values: Any = found.distance.numpy()[inside]
         weight = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)[inside]
         assert weight[values < 1].sum() / weight.sum() == pytest.approx(0.5, abs=0.015)
@@ -176,10 +175,10 @@ class RedIsFar(nn.Module):
         return from_distance(distance, self.kind, self.lengths)
 
 
-def depth_network(kind: DepthKind = "metric_distance", **changes: Any) -> TrainedNetwork:
+def depth_network(kind: DepthKind = "metric_distance", **changes: Any) -> LoadedNetwork:
     """Return a network whose distance in meters is 4 · red (0 to 1), times a scale per view."""
     settings: dict[str, Any] = {
-        "inner": RedIsFar(kind),
+        "module": RedIsFar(kind),
         "class_names": (),
         "depth_kind": kind,
         "normalization": Normalization([0.0] * 3, [1.0] * 3),
@@ -245,9 +244,9 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     return loaded(depth_network(), monkeypatch)
 
 
-def loaded(trained: TrainedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Network:
+def loaded(trained: LoadedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Network:
     """Return a network as `load` does, without a file."""
-    monkeypatch.setattr("tangent_train.inference.network.load_trained", lambda *_: trained)
+    monkeypatch.setattr("tangent_train.inference.network.load_network", lambda *_: trained)
     return tt.load("net.ckpt", **settings)
 
 
