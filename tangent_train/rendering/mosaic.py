@@ -89,6 +89,7 @@ class Mosaic:
             values: ``(n, K, h, w)`` scores, not probabilities; or other values.
             views: The views.
         """
+        values = values if values.dtype == torch.float64 else values.float()
         images, views = views.on_canvas(values, self.shape)
         is_feathered = blend_of(self.blend, is_overlapping=views.is_overlapping) == "feather"
         self._backend.add(images, views, is_feathered=is_feathered)

@@ -82,7 +82,6 @@ class TorchSums:
             is_feathered: True to feather them, which needs sums; False to take each pixel from its
                 owner.
         """
-        values = values.to(self._sums.dtype)
         geometry = images.geometry(self._shape, None)
         if is_feathered and self._softmax:
             values = _softmax(values, 1)
