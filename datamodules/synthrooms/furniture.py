@@ -239,7 +239,10 @@ def add_board(room: Room) -> None:
     values: dict[str, Any] = {
         "face": palette.material(pattern, color=color, second=writing, frequency=(2.5, 5)),
         "trim": palette.material(Pattern.PLAIN, Pattern.WOOD),
-        "wide": wide, "high": high, "bottom": bottom, "middle": bottom + high / 2,
+        "wide": wide,
+        "high": high,
+        "bottom": bottom,
+        "middle": bottom + high / 2,
     }
     board = room.item("board", frame)
     board.put("board", **values)
