@@ -24,23 +24,17 @@ _HEIGHTS = (2.5, 3.3)
 _L_SHAPED = 0.35
 
 
-def _build_chair(room: Room, frame: Frame) -> None:
+def _build_chair(room: Room, place: Frame) -> None:
     """Build a chair: four legs, star base, sledge, or tub; with or without armrests."""
-    rng = room.rng
-    chair = room.item("chair", frame)
+    chair = room.item("chair", place)
     design = room.pick(0.35, 0.3, 0.15, 0.2)
-    values: dict[str, Any] = {
-        "cover": room.palette.material(),
-        "frame": room.palette.material(Pattern.PLAIN, Pattern.WOOD),
-        "wide": rng.uniform(0.44, 0.56),
-        "seat": rng.uniform(0.42, 0.5),
-        "back": rng.uniform(0.4, 0.6),
-        "thick": rng.uniform(0.05, 0.11),
-    }
+    cover, frame = room.palette.material(), room.palette.material(Pattern.PLAIN, Pattern.WOOD)
+    values = room.sizes(wide=(0.44, 0.56), seat=(0.42, 0.5), back=(0.4, 0.6), thick=(0.05, 0.11))
+    values |= {"cover": cover, "frame": frame}
     if design == 3:
         chair.put("tub chair", **values)
         return
-    chair.put("chair", gap=rng.uniform(0, 0.12), **values)
+    chair.put("chair", gap=room.rng.uniform(0, 0.12), **values)
     chair.put(("chair legs", "chair star", "chair sledge")[design], **values)
     chair.put("chair posts", **values)
     if room.chance(0.4):

@@ -173,6 +173,10 @@ class Room:
         """Draw an index with the given shares."""
         return int(self.rng.choice(len(shares), p=np.asarray(shares) / np.sum(shares)))
 
+    def sizes(self, **limits: tuple[float, float]) -> dict[str, Any]:
+        """Draw sizes uniformly between their limits, in order."""
+        return {name: self.rng.uniform(*between) for name, between in limits.items()}
+
     def count(self, least: int, most: int) -> int:
         """Draw an integer between two limits, inclusive."""
         return int(self.rng.integers(least, most + 1))
