@@ -39,13 +39,13 @@ def area(quick: bool) -> Iterator[Table]:
             "level": level,
         } | ({"base_level": 0} if name == "tangent" else {})
         trained = LoadedNetwork(
-            network,
-            ("unknown", *map(str, range(13))),
-            ("rgb",),
-            RGB_NORMALIZATION,
-            level,
-            settings,
-            (rows, 2 * rows) if name == "equirect" else (2**level, 2**level),
+            module=network,
+            class_names=("unknown", *map(str, range(13))),
+            inputs=("rgb",),
+            normalization=RGB_NORMALIZATION,
+            level=level,
+            representation=settings,
+            image_size=(rows, 2 * rows) if name == "equirect" else (2**level, 2**level),
         )
         predictor = Predictor(trained, PanoramaViews(trained))
         alternatives = [
