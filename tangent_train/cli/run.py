@@ -48,14 +48,13 @@ from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.representations import check_size
 from tangent_train.results.evaluation import (
     confusion_table,
-    plain_scores,
     result_tables,
     summary_lines,
     write_results,
 )
+from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
 from tangent_train.results.html import write_report
 from tangent_train.results.published import Comparison
-from tangent_train.results.record import Record
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -142,7 +141,7 @@ class Run:
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        record = self.task.record(self.task.result, noun) if tested else None
+        record = self.task.evaluation_result(self.task.result, noun) if tested else None
         images = record.images if record else 0
         if record and images == total:
             record = replace(record, groups=self._groups(trainer.world_size))
@@ -202,7 +201,9 @@ class Run:
             ) from error
 
     @rank_zero_only
-    def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
+    def _report(
+        self, record: EvaluationResult, checkpoint: Path, callbacks: Sequence[Callback]
+    ) -> None:
         is_inside = checkpoint.is_relative_to(self.folder)
         # A relative path stays right when the folder is moved.
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)

@@ -159,14 +159,14 @@ def _report(
     """Write and print the tables and the chart."""
     with elsewhere():  # imports matplotlib
         from tangent_train.results.comparisons import levels_report, transfer_report
-    from tangent_train.results.record import load_record
+    from tangent_train.results.evaluation_result import load_result
 
     records: dict[Any, list[Any]] = defaultdict(list)
     study = bool(config.study_levels)
     for stage in stages:
         if not study or stage.view:
             key = stage.config["level"] if study else stage.name
-            records[key].append(load_record(stage.folder))
+            records[key].append(load_result(stage.folder))
     if study:
         level = config.level if trained is None else trained.level
         name, report = "angular_resolution", levels_report(records, level)

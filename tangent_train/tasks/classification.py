@@ -13,8 +13,9 @@ from torch.nn import functional
 
 from datamodules.core.labels import IMAGE_CLASS
 from tangent_train.metrics.classification import ClassificationMetric, classification_scores
+from tangent_train.metrics.score_columns import ScoreColumn
 from tangent_train.results.evaluation import class_entries
-from tangent_train.results.record import Heading, Record
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.tasks.base import Task
 
 
@@ -31,9 +32,9 @@ class ClassificationTask(Task):
 
     labels: ClassVar[str] = IMAGE_CLASS
     predicts: ClassVar[str] = IMAGE_CLASS
-    headings: ClassVar[Mapping[str, Heading]] = {
-        "accuracy": Heading("accuracy"),
-        "class_accuracy": Heading("mean over classes", "%", "accuracy", "accuracy"),
+    columns: ClassVar[Mapping[str, ScoreColumn]] = {
+        "accuracy": ScoreColumn("accuracy"),
+        "class_accuracy": ScoreColumn("mean over classes", "%", "accuracy", "accuracy"),
     }
     monitor: ClassVar[str] = "val/accuracy"
     takes: ClassVar[str] = "views of shapes (B, N, C, h, w) to scores of classes (B, K)"
@@ -100,12 +101,12 @@ class ClassificationTask(Task):
         scores = classification_scores(result).of_class.tolist()
         return {f"accuracy/{n}": s for n, s in zip(self.class_names, scores, strict=True)}
 
-    def record(self, result: Any, noun: str) -> Record:
+    def evaluation_result(self, result: Any, noun: str) -> EvaluationResult:
         """Return the record with the accuracy of every class and the confusion matrix."""
         scores = classification_scores(result)
         columns = {"images": scores.counts, "accuracy": scores.of_class}
         return replace(
-            super().record(result, noun),
+            super().evaluation_result(result, noun),
             classes=class_entries(columns, result, self.class_names),
             confusion=result.tolist(),
         )

@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,
@@ -26,7 +26,6 @@ from tangent_train.checkpoints.distances import (
 )
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
-from tangent_train.geometry import SphereArea
 from tangent_train.inference.depth import check_align, combine_depth
 from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.depth import (
@@ -39,11 +38,12 @@ from tangent_train.metrics.depth import (
     mean_depth_scores,
     scaled_and_shifted,
 )
+from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering.checks import check_choice
 from tangent_train.results.evaluation import latitude_entries
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.html.page import EncodedImage, encode_image
 from tangent_train.results.pictures import distance_panel, shown_arrays
-from tangent_train.results.record import Heading, Record, by_solid_angle, with_solid_angle
 from tangent_train.tasks.base import RGB
 from tangent_train.tasks.losses import DepthLoss, log_error_sum
 from tangent_train.tasks.views import ViewsTask, labels_of_views
@@ -84,17 +84,17 @@ class DepthTask(ViewsTask):
 
     labels: ClassVar[str] = DISTANCE
     predicts: ClassVar[str] = DISTANCE
-    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
-            "absrel": Heading("AbsRel", "", better="lower"),
-            "delta1": Heading("δ1"),
-            "rmse": Heading("RMSE", "m", better="lower"),
-            "mae": Heading("MAE", "m", better="lower", is_main=False),
-            "sqrel": Heading("SqRel", "m", better="lower", is_main=False),
-            "rmse_log": Heading("RMSElog", "", better="lower", is_main=False),
-            "delta2": Heading("δ2", is_main=False),
-            "delta3": Heading("δ3", is_main=False),
-            "missing": Heading("missing", better="lower", is_main=False),
+            "absrel": ScoreColumn("AbsRel", "", better="lower"),
+            "delta1": ScoreColumn("δ1"),
+            "rmse": ScoreColumn("RMSE", "m", better="lower"),
+            "mae": ScoreColumn("MAE", "m", better="lower", is_main=False),
+            "sqrel": ScoreColumn("SqRel", "m", better="lower", is_main=False),
+            "rmse_log": ScoreColumn("RMSElog", "", better="lower", is_main=False),
+            "delta2": ScoreColumn("δ2", is_main=False),
+            "delta3": ScoreColumn("δ3", is_main=False),
+            "missing": ScoreColumn("missing", better="lower", is_main=False),
         }
     )
     monitor: ClassVar[str] = "val/absrel"
@@ -221,14 +221,14 @@ class DepthTask(ViewsTask):
         self, sample: EvaluationSample[Tensor], truth: Tensor
     ) -> Float[Tensor, "height width"]:
         """Predict the distances of a panorama from its views, which are aligned with each other."""
-        area = SphereArea.of_numbers(sample.area.cpu().numpy())
-        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area)
+        valid = valid_mask(sample.valid)
+        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), valid)
         outputs = list(scored_views(self, sets, self.eval_view_batch_size))
         for views, depth in [] if self.is_tested else outputs:
             lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
             self._add_loss(depth, labels_of_views(truth, views), lengths)
         shape, blend = (truth.shape[0], truth.shape[1]), self.representation.blend
-        combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, area=area)
+        combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, valid=valid)
         self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
 
@@ -241,10 +241,10 @@ class DepthTask(ViewsTask):
         pixels, angles = (mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
         return pixels | (by_solid_angle(angles) if result[:, 1].any() else {})
 
-    def record(self, result: NDArray[np.float64], noun: str) -> Record:
+    def evaluation_result(self, result: NDArray[np.float64], noun: str) -> EvaluationResult:
         """Return the record with scores of latitude bands, and confidence intervals."""
         return replace(
-            super().record(result, noun),
+            super().evaluation_result(result, noun),
             latitude_bands=latitude_entries(map(mean_depth_scores, result[:, 2:].swapaxes(0, 1)))
             if result[:, 1].any()
             else (),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,10 +11,8 @@ from typing import Any
 import onnx
 import pytest
 import torch
-import yaml  # type: ignore[import-untyped]
 from safetensors.torch import load_file, save_file
 
-from tangent_train.checkpoints.content import read_settings
 from tangent_train.checkpoints.loaded import METADATA_KEY, load_network, read_description
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.run import build
@@ -23,7 +20,6 @@ from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.camera_files import read_cameras
-from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
 from tests.security.attacks import (
     attacks,
@@ -133,22 +129,6 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         save_file(tensors, one, {METADATA_KEY: text})
         with pytest.raises(DataError, match="is repeated"):
             pytest.fail(f"{place}: {load_network(one)}")
-
-
-def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
-    folder = forbidden.parent / "theirs"
-    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("tensorboard", "checkpoints"))
-    settings = read_settings(run / "config.yaml")
-    for place, value in sampled(list(json_attacks(forbidden)), list(places(settings))):
-        (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
-        _nothing_happens(load_record, folder, forbidden, (place, value))
-    for place, text in _named_twice(settings, forbidden, yaml.safe_dump):
-        (folder / "config.yaml").write_text(text)
-        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a repeated name"):
-            pytest.fail(f"{place}: {load_record(folder)}")
-    (folder / "config.yaml").write_text(f"<<: {{name: x}}\n{yaml.safe_dump(settings)}")
-    with pytest.raises(DataError, match=r"config\.yaml: found ConstructorError"):
-        load_record(folder)
 
 
 def test_in_lists_of_cameras_and_results_of_keypoints(
