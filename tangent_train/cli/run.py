@@ -187,7 +187,6 @@ class Run:
             depth_kind=self.task.depth_kind,
             fill=getattr(data, "fill", None) or "mean",
             settings=completed_settings(self.settings["network"], channels, outputs, restored=True),
-            source=self.source,
         )
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:
