@@ -132,6 +132,7 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
     from tangent_train.cli.setting_names import check_names, declared_settings
     from tangent_train.cli.sweep import in_sweep, run_job
     from tangent_train.config.build import check_arguments
+    from tangent_train.config.settings import validate
 
     composed: Any = OmegaConf.to_container(config)
     hydra_settings = OmegaConf.to_container(HydraConfig.instance().cfg)
@@ -156,6 +157,8 @@ def _run(command: str, config: DictConfig, stored: Any, visible_gpus: str | None
         section = override.lstrip("+").partition(".")[0]
         if override[0] == "+" and section in _NOT_BUILT.get(command, ()):
             check_arguments(settings.get(section), section)
+    if command in ("export", "keypoints", "render"):
+        return run(validate(command, settings))
     if command == "transfer":  # its stages need the config with its references
         return run(config)
     return run(settings) if stored is None else run(*stored.settings(settings))

@@ -41,16 +41,13 @@ def test_the_suffix_selects_the_format(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "checkpoint: found null; expected a file"),
-        (["checkpoint={}", "output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
-        (["checkpoint={}", "output=x.onnx", "image_size=32"], "image_size: found 32; expected"),
-        (["checkpoint={}", "output=x.safetensors", "image_size=[9,9]"], "image_size and opset:"),
-        (["checkpoint={}", "output=x.onnx", "image_size=[15,16]"], "output: .* multiples of 2"),
+        (["output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
+        (["output=x.safetensors", "image_size=[9,9]"], "output: .* multiples of 2"),
     ],
 )
 def test_export_errors_are_one_line(
     arguments: list[str], message: str, checkpoint: Path, tmp_path: Path, run: Run
 ) -> None:
     with pytest.raises(SystemExit, match=f"^tangent-export: {message}"):
-        run("export", *(text.format(checkpoint) for text in arguments))
+        run("export", f"checkpoint={checkpoint}", *arguments)
     assert list(tmp_path.iterdir()) == []
