@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from contextlib import redirect_stdout
-from typing import Any
 
 from datamodules.core.class_weights import label_doubts
 from tangent_train.cli.run import open_data
 from tangent_train.config.build import build_from_config
+from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.results.tables import Table, percent
 
 
-def check(settings: Mapping[str, Any]) -> None:
+def check(settings: RunSettings) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding
     and remedy, separated by tabs; everything else then goes to standard error.
 
     Args:
-        settings: Composed ``check.yaml``.
+        settings: Settings of the command.
     """
     data = open_data(settings)
     terminal = sys.stdout.isatty()
@@ -51,7 +50,7 @@ def check(settings: Mapping[str, Any]) -> None:
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     if getattr(data, "area", None) is not None:
-        representation = build_from_config(settings["representation"], "representation")
+        representation = build_from_config(settings.representation, "representation")
         views = [sum(map(len, r.view_sets())) for r in (data.representation, representation)]
         rows, columns = data.representation.image_size
         print_text(
