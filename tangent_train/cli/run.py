@@ -41,7 +41,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
 from tangent_train.results.html import write_report
-from tangent_train.results.published import Comparison
+from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -168,11 +168,13 @@ class Run:
             protocol={**self.data.facts, **self.task.facts},
             checkpoint=name,
             label_map=self.plain_settings().get("label_map"),
+            folds=getattr(self.data, "folds", ()),
             settings=flat_settings(self.plain_settings()),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(result)
-        summary, published = summary_lines(result), Comparison.of([result])
-        write_results(result, self.folder, [*notes, *published.notes], published.tables(result))
+        summary, (rows, sources) = summary_lines(result), published_rows([result])
+        published = [published_table(rows, result)] if rows else []
+        write_results(result, self.folder, [*notes, *sources], published)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",

@@ -11,11 +11,7 @@ import torch
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.checkpoints.kinds import Align
 from tangent_train.errors import SettingError
-from tangent_train.geometry import (
-    equirect_to_lonlat,
-    lonlat_to_xyz,
-    ray_lengths,
-)
+from tangent_train.geometry import ray_lengths
 from tangent_train.inference.alignment import align as align_views
 from tangent_train.inference.alignment import lattice, sample_views, sphere_points
 from tangent_train.inference.engine import ViewPredictor
@@ -31,7 +27,6 @@ if TYPE_CHECKING:
 
     from tangent_train.checkpoints.kinds import DepthKind
     from tangent_train.checkpoints.loaded import LoadedNetwork
-    from tangent_train.geometry import SphereArea
     from tangent_train.inference.alignment import AlignmentReport
     from tangent_train.inference.images import InputImage
     from tangent_train.inference.representations import PanoramaViews, PhotoViews
@@ -75,7 +70,7 @@ def combine_depth(
     blend: Blend,
     align: Align | None = None,
     *,
-    area: SphereArea | None = None,
+    valid: NDArray[np.bool_] | None = None,
     camera_matrix: NDArray[np.float64] | None = None,
 ) -> DistanceMap:
     """Align the depth of all views of a panorama or photo, and blend it.
@@ -89,14 +84,16 @@ def combine_depth(
         kind: Kind of the output.
         blend: Blend of the views.
         align: See `alignment.align`.
-        area: Area of a partial panorama: views are compared inside it. None for the whole sphere.
+        valid: ``(H, W)`` valid pixels of a partial panorama, at which views are compared; None if
+            all are valid.
         camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
 
     Raises:
         SettingError: The views cannot be aligned in this way.
     """
     points = sphere_points(shape) if camera_matrix is None else lattice(shape)
-    points = points[_inside(area, points, shape)]
+    if valid is not None:
+        points = points[valid[points[:, 0], points[:, 1]]]
     parts, samples, count = [], [], 0
     for views, raw in outputs:
         lengths = torch.from_numpy(views.ray_lengths()).to(raw)
@@ -181,7 +178,7 @@ class DepthPredictor(ViewPredictor):
             self._kind,
             self._view_sets.blend,
             self._align,
-            area=None if image.area is None else image.area.sphere,
+            valid=image.valid,
             camera_matrix=image.camera_matrix,
         )
 
@@ -199,12 +196,3 @@ def _median(
         return 1.0
     weights, values = lengths[known] ** -3.0, (values / lengths)[known]
     return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))
-
-
-def _inside(
-    area: SphereArea | None, points: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.bool_]:
-    """Return a mask of points ``(P, 2)`` in the area of a panorama; all True without an area."""
-    if area is None:
-        return np.ones(len(points), bool)
-    return area.contains(lonlat_to_xyz(equirect_to_lonlat(points[:, ::-1], shape)))

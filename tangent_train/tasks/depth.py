@@ -15,7 +15,7 @@ from torch.nn import functional
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,
@@ -26,7 +26,6 @@ from tangent_train.checkpoints.distances import (
 )
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
-from tangent_train.geometry import SphereArea
 from tangent_train.inference.depth import check_align, combine_depth
 from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.depth import (
@@ -222,14 +221,14 @@ class DepthTask(ViewsTask):
         self, sample: EvaluationSample[Tensor], truth: Tensor
     ) -> Float[Tensor, "height width"]:
         """Predict the distances of a panorama from its views, which are aligned with each other."""
-        area = SphereArea.of_numbers(sample.area.cpu().numpy())
-        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area)
+        valid = valid_mask(sample.valid)
+        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), valid)
         outputs = list(scored_views(self, sets, self.eval_view_batch_size))
         for views, depth in [] if self.is_tested else outputs:
             lengths = torch.from_numpy(views.ray_lengths()).to(depth.device)
             self._add_loss(depth, labels_of_views(truth, views), lengths)
         shape, blend = (truth.shape[0], truth.shape[1]), self.representation.blend
-        combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, area=area)
+        combined = combine_depth(outputs, shape, self.depth_kind, blend, self.align, valid=valid)
         self.views_aligned = combined.report.mode
         return combined.distance.to(truth.device)
 

@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from datamodules.core.class_weights import ClassWeights
 from datamodules.core.labels import PIXEL_CLASSES
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.errors import SettingError
-from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import scored_views, view_scores
 from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.metrics.segmentation import (
@@ -122,7 +121,7 @@ class SegmentationTask(ViewsTask):
         shape: tuple[int, ...],
         rotation: NDArray[np.float64] | None = None,
         target: Tensor | None = None,
-        area: SphereArea | None = None,
+        valid: NDArray[np.bool_] | None = None,
     ) -> Integer[Tensor, ...]:
         """Predict the label of every pixel of one panorama, or of the crops of a photo.
 
@@ -132,11 +131,11 @@ class SegmentationTask(ViewsTask):
                 crops.
             rotation: Rotation of the representation ``(3, 3)``.
             target: Ground truth, to add to the validation loss; None to compute no loss.
-            area: Area of a partial panorama; None for the whole sphere.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
 
         Returns:
             Labels of that shape from 1 to K; 0 where an imported network predicts none of the
-            classes. Labels outside the area have no meaning.
+            classes. Labels of invalid pixels have no meaning.
         """
         if len(shape) > 2:  # crops, each separately
             best = images.new_empty(shape, dtype=torch.int64)
@@ -147,7 +146,7 @@ class SegmentationTask(ViewsTask):
                 if target is not None:
                     self._add_loss(scores, target[part])
         else:
-            sets, blend = self.view_sets(images, rotation, area), self.representation.blend
+            sets, blend = self.view_sets(images, rotation, valid), self.representation.blend
             how: Any = {"averaged": len(sets) > 1, "device": images.device}
             mosaic = ScoreMosaic((shape[0], shape[1]), self.num_scores, blend, **how)
             for views, scores in scored_views(self, sets, self.eval_view_batch_size):
@@ -165,9 +164,9 @@ class SegmentationTask(ViewsTask):
     def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
         """Return the predicted and the true labels, see `ViewsTask`."""
         rotation, shape = sample.rotation.cpu().numpy(), tuple(sample.target.shape)
-        area = SphereArea.of_numbers(sample.area.cpu().numpy())
+        valid = valid_mask(sample.valid)
         target = None if self.is_tested else sample.target
-        return self.predict_labels(sample.images, shape, rotation, target, area), sample.target
+        return self.predict_labels(sample.images, shape, rotation, target, valid), sample.target
 
     def build_metric(self) -> SegmentationMetric:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""

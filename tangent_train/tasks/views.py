@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 from datamodules.core.samples import EvaluationSample
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import sees_rays, upright_rays
 from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
 from tangent_train.rendering.representations.views import Representation
@@ -143,18 +142,19 @@ class ViewsTask(Task):
         return torch.stack(predictions)
 
     def view_sets(
-        self, images: Tensor, rotation: NDArray[np.float64] | None, area: SphereArea | None
+        self, images: Tensor, rotation: NDArray[np.float64] | None, valid: NDArray[np.bool_] | None
     ) -> list[ViewSet]:
         """Return the sets of views of a panorama, with their images.
 
         Args:
             images: Images of all view sets of the representation, in this order.
             rotation: Rotation of the representation ``(3, 3)``.
-            area: Area of a partial panorama; None for the whole sphere.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
         """
-        limited = self.representation.limited_to(area)
-        rotated = limited if rotation is None else limited.with_rotation(rotation)
-        sets = rotated.view_sets()
+        rotated = self.representation
+        if rotation is not None:
+            rotated = rotated.with_rotation(rotation)
+        sets = rotated.view_sets(valid)
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
         seen = upright_rays(sets, rotation, images.device) if self.sees_rays else [None] * len(sets)
         return list(zip(sets, readers, seen, strict=True))
