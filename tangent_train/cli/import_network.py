@@ -30,8 +30,6 @@ _OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "logits": "scores before a softmax",
     "probabilities": "probabilities after a softmax",
-    "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
-    "sigmoid": "probabilities after a sigmoid, with ½ as the threshold",
     "labels": "label maps, of which other values are unknown",
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
@@ -68,7 +66,6 @@ def import_network(settings: ImportSettings) -> None:
             check_unread(settings, "for networks of classes", depth=None)
         else:
             check_unread(settings, "for depth networks", **_OF_CLASSES)
-        remarks = list(network.remarks)
         trained = photo_networks.import_network(
             network,
             output,
@@ -80,11 +77,8 @@ def import_network(settings: ImportSettings) -> None:
             unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
-            remark=remarks.append,
         )
     print_text(_understood(output, trained, settings))
-    for remark in remarks:
-        print_text(remark)
 
 
 def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:

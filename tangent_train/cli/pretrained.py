@@ -50,21 +50,20 @@ def with_pretrained_network(
     if path.suffix.lower() == ".onnx":
         expected = "a checkpoint, a state dict or a .safetensors file"
         raise DataError(path, found="an ONNX file, which is not trained", expected=expected)
-    description = describe_network(path)
-    if description is None:
+    description = read_description(path)
+    if description is None or description.settings is None:
         return settings, None
     changes: dict[str, Any] = {}
     typed = any(re.match(r"[+~]*network[.@=]", o) for o in HydraConfig.get().overrides.task)
     if not typed:
-        if description.score_kind in ("probabilities", "sigmoid", "labels"):
+        if description.score_kind in ("probabilities", "labels"):
             raise DataError(
                 path,
                 found=f"a network that returns {description.score_kind}",
                 expected="logits, which the losses need",
             )
-        changes["network"] = without_weights(description.settings)
-        target = description.settings["_target_"]
-        _print(f"Network of {path}: {target} (another: network=…)")
+        changes["network"] = section = without_weights(description.trainable_settings())
+        _print(f"Network of {path}: {section['_target_']} (another: network=…)")
     if description.depth_kind is not None and settings.task.get("depth_kind", "") is None:
         changes["task"] = settings.task | {"depth_kind": description.depth_kind}
         _print(f"Output of the network: {description.depth_kind} (another: task.depth_kind=…)")
@@ -93,7 +92,7 @@ def load_pretrained(run: Run, path: Path | None) -> None:
             found = task.backbone_lr_factor
             raise SettingError("task.backbone_lr_factor", found=found, expected=expected)
         return
-    description, channels, heads = describe_network(path), None, set[str]()
+    description, channels, heads = read_description(path), None, set[str]()
     if description is not None:
         if description.groups is not None or description.class_names != tuple(data.class_names):
             heads = _heads(run)
@@ -120,7 +119,7 @@ def _normalization(
     count = _RGB + ("depth" in inputs)
     return {
         name: [*values, *default[name][len(values) :]][:count]
-        for name, values in ((name, description.normalization.get(name, ())) for name in default)
+        for name, values in ((name, getattr(description.normalization, name)) for name in default)
     }
 
 

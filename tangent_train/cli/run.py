@@ -24,8 +24,12 @@ from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointCo
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.pictures import ValidationPictures
 from tangent_train.callbacks.progress import ProgressBar
-from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
-from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
+from tangent_train.checkpoints.loaded import (
+    METADATA_KEY,
+    LoadedNetwork,
+    completed_settings,
+    declared_sizes,
+)
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
 from tangent_train.config.settings import RunSettings, flat_settings
@@ -99,8 +103,7 @@ class Run:
     def _contents(self) -> dict[str, Any]:
         # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
         return {
-            "predicts": self.task.predicts,
-            "depth_kind": self.task.depth_kind,
+            METADATA_KEY: self.as_loaded().plain(),
             "config": {name: v for name, v in self.plain_settings().items() if name != "logger"},
             **inputs_and_classes(self.data),
         }
@@ -114,8 +117,7 @@ class Run:
         """
         by_classes = self.task.predicts == PIXEL_CLASSES  # else upright=auto is by the image alone
         if getattr(self.data, "upright", None) == "auto" and by_classes:
-            loaded = self.loaded or self._as_loaded()
-            self.data.estimate_up(NetworkJudge(loaded, trainer.strategy.root_device))
+            self.data.estimate_up(NetworkJudge(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
@@ -141,19 +143,27 @@ class Run:
             for group, some in sorted(places.items())
         ]
 
-    def _as_loaded(self) -> LoadedNetwork:
+    def as_loaded(self) -> LoadedNetwork:
         """Return the network of the run with its inputs, classes and representation."""
-        data = self.data
-        network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
+        if self.loaded is not None:
+            return self.loaded
+        data, module, settings = self.data, self.task.network, self.settings
+        channels, outputs = data.in_channels, self.task.num_outputs(data.num_classes)
+        multiple, fixed = declared_sizes(module)
         return LoadedNetwork(
-            module=self.task.network,
+            module=module,
+            predicts=self.task.predicts,
             class_names=data.class_names,
-            inputs=data.inputs,
+            inputs=getattr(data, "inputs", ()),
             normalization=data.normalization,
-            level=self.settings.level,
-            representation=self.settings.representation,
+            level=settings.level,
+            representation=settings.representation,
             image_size=data.representation.image_size,
-            size_multiple=size_multiple_of(network, data.in_channels) or 1,
+            size_multiple=multiple,
+            fixed_size=fixed,
+            depth_kind=self.task.depth_kind,
+            fill=getattr(data, "fill", None) or "mean",
+            settings=completed_settings(settings.network, channels, outputs, restored=True),
         )
 
     @rank_zero_only

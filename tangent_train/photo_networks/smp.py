@@ -50,16 +50,15 @@ def load(*, model: str | None, classes: Path | None, normalization: Any) -> Phot
         )
     network = build_from_config(settings, "network", SettingsFile(path))
     given = None if normalization is None else Normalization.of(normalization, 3)
-    tensors, remarks = tensors_in(folder)
+    tensors = tensors_in(folder)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_HEAD_OF_IMAGES)}
     load_tensors(network, tensors, folder)
     return PhotoNetwork(
-        network=network,
+        module=network,
         settings=settings,
         score_names=class_names_in(classes),
         normalization=given or _of_encoder(config),
-        score_kind="sigmoid_logits" if "sigmoid" in str(config.get("activation")) else "logits",
-        remarks=remarks,
+        score_kind="logits",
     )
 
 
