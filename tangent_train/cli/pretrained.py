@@ -15,7 +15,7 @@ from models import initialize
 from tangent_train.checkpoints.loaded import (
     NetworkDescription,
     completed_settings,
-    describe_network,
+    read_description,
 )
 from tangent_train.cli.run import Run
 from tangent_train.config.build import build_from_config

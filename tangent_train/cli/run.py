@@ -82,7 +82,7 @@ class Run:
             callbacks=[
                 *callbacks,
                 *build_callbacks(self.settings, self.task),
-                CheckpointContents(self._contents()),
+                CheckpointContents(self.contents()),
                 ProgressBar(),
                 PredictionPanels(self.folder / "panels", self.settings.panels),
                 ValidationPictures(self.settings.validation_images),
@@ -100,7 +100,8 @@ class Run:
         """Return the settings as plain values."""
         return self.settings.model_dump(mode="json")
 
-    def _contents(self) -> dict[str, Any]:
+    def contents(self) -> dict[str, Any]:
+        """Return what checkpoints of the run store besides tensors: plain values."""
         # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
         return {
             METADATA_KEY: self.as_loaded().plain(),

@@ -73,7 +73,7 @@ def trained(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
-        wandb_settings = composed_settings("train", "logger=wandb")["logger"]["wandb"]
+        wandb_settings = composed_settings("train", "logger=wandb").logger["wandb"]
         text = ", ".join(f"{n}: {'null' if v is None else v}" for n, v in wandb_settings.items())
         _fit(folder, data, task, "logger=many", f"+logger.wandb={{{text}}}")
         wandb.finish()
