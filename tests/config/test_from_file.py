@@ -85,7 +85,14 @@ def test_nothing_else_is_called(target: Any) -> None:
 @pytest.mark.parametrize(
     "value",
     [
-        *("/etc/passwd", "../x", "https://localhost", "hf-hub:a/b", "local-dir:x", "${oc.env:HOME}"),
+        *(
+            "/etc/passwd",
+            "../x",
+            "https://localhost",
+            "hf-hub:a/b",
+            "local-dir:x",
+            "${oc.env:HOME}",
+        ),
         *("x\n", "a;b", b"x", {1}, ["a/b"], {"name": "a/b"}),
     ],
 )
