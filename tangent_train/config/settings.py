@@ -341,10 +341,10 @@ class RunSettings(Settings):
 class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
-    init_from: ExistingPath | None = None
+    init_from: Path | None = None
     """fine-tuning: checkpoint, state dict or safetensors that the network starts from; null = new
     weights"""
-    resume: ExistingPath | None = None
+    resume: Path | None = None
     """folder of an interrupted run, which is continued with its settings"""
     trust: OneOrMore[str] = ()
     """packages of your own whose classes a checkpoint may name, e.g. my_networks"""

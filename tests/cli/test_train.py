@@ -176,16 +176,17 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
     settings += ["logger=csv", "callbacks=early_stopping", "callbacks.early_stopping.patience=3"]
     settings += ["callbacks.early_stopping.min_delta=0.01"]
     run("train", *settings, "hydra.run.dir=whole")
-    with monkeypatch.context() as patch, pytest.raises(RuntimeError, match="interrupted"):
-        start = SegmentationTask.on_train_epoch_start
+    start = SegmentationTask.on_train_epoch_start
 
-        def interrupt(task: SegmentationTask) -> None:
-            if task.current_epoch == 2:
-                raise RuntimeError("interrupted")
-            start(task)
+    def interrupt(task: SegmentationTask) -> None:
+        if task.current_epoch == 2:
+            raise RuntimeError("interrupted")
+        start(task)
 
+    with monkeypatch.context() as patch:
         patch.setattr(SegmentationTask, "on_train_epoch_start", interrupt)
-        run("train", *settings, "hydra.run.dir=cut")
+        with pytest.raises(RuntimeError, match="interrupted"):
+            run("train", *settings, "hydra.run.dir=cut")
     for _ in range(2):  # the second time, its training is over
         run("train", "resume=cut")
         assert _epochs(Path("cut")) == _epochs(Path("whole"))
