@@ -24,7 +24,7 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.scores import ClassScoreNetwork
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import load_plain
 from tangent_train.io.gpano import Fill
@@ -150,11 +150,11 @@ class LoadedNetwork(NetworkDescription):
 
     Attributes:
         module: Network as it was trained or imported, in evaluation mode; see `network`.
-        source: File that `representation` and `settings` come from.
+        trust: Packages that the file may name besides the usual ones.
     """
 
     module: nn.Module
-    source: SettingsFile | None = None
+    trust: tuple[str, ...] = ()
 
     @cached_property
     def network(self) -> nn.Module:
@@ -244,14 +244,13 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     Args:
         path: Checkpoint of a run or of ``tangent-import``, or a file of ``tangent-export`` with the
             suffix ``.onnx`` or ``.safetensors``.
-        trust: Full names of classes that the file may name besides those of this package and of
-            known libraries.
+        trust: Packages, modules or classes of the user that the file may name too.
 
     Raises:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
     """
-    source, module = SettingsFile(path, trust), None
+    module: nn.Module | None = None
     if path.suffix.lower() == ".onnx":
         module = OnnxNetwork(path)
         described = _parsed(path, module.metadata.get(METADATA_KEY))
@@ -260,26 +259,22 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
         if content is None:
             raise DataError(path, found="no description of a network", expected=_EXPECTED)
         described = content
-    try:
-        # Built to refuse an impossible representation before it is used.
-        build_from_config(described.representation, "representation", source)
-        module = module or _built(described, source)
-    except SettingError as error:
-        found = f"{error.subject}: {error.found}"
-        raise DataError(path, found=found, expected=error.expected, remedy=error.remedy) from error
-    return LoadedNetwork(**vars(described), module=module, source=source)
+    # Built to refuse a representation that is not allowed or impossible.
+    build_from_file(described.representation, "representation", path, trust)
+    module = module or _built(described, path, trust)
+    return LoadedNetwork(**vars(described), module=module, trust=tuple(trust))
 
 
-def _built(described: NetworkDescription, source: SettingsFile) -> nn.Module:
+def _built(described: NetworkDescription, path: Path, trust: Collection[str]) -> nn.Module:
     """Build a network with the tensors of its file."""
     classes, channels = len(described.class_names) - 1, described.in_channels
     settings = completed_settings(described.settings, channels, classes, restored=True)
-    module: nn.Module = build_from_config(settings, "network", source)
+    module: nn.Module = build_from_file(settings, "network", path, trust)
     try:
-        module.load_state_dict(_tensors(source.path))
+        module.load_state_dict(_tensors(path))
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(
-            source.path,
+            path,
             found=f"other tensors than those of its network ({error})",
             expected=f"the tensors of {settings['_target_']}",
             remedy="Install the version of the network's package that it was trained with.",

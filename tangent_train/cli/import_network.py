@@ -130,8 +130,8 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
         f"image size: {size}{multiple}",
         f"panoramas: {PanoramaViews(trained).description()}",
     ]
-    if trained.source is not None and trained.source.trust:
-        trust = ",".join(trained.source.trust)
+    if trained.trust:
+        trust = ",".join(trained.trust)
         lines.append(f"your own network: every command that reads it needs trust=[{trust}]")
     if settings.unknown_classes:
         effect = "written as unknown" if settings.unknown_wins else "never win"

@@ -139,7 +139,7 @@ def _export(
             found = f"{width_height(shape)}, a part of a panorama"
             raise DataError(file, found=found, expected="a whole panorama for COLMAP")
         images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
-    for name, matched in comparison.found[AS_GIVEN].items():
+    for name, matched in comparison.matched[AS_GIVEN].items():
         path = folder / file_name(name) / "database.db"
         keypoints = (matched.left, matched.right)
         add_pair(path, images, keypoints, matched.matches, matched.geometry)

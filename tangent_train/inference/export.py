@@ -164,7 +164,7 @@ def _write_safetensors(loaded: LoadedNetwork, path: Path) -> None:
 @torch.no_grad()
 def _verified(loaded: LoadedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
     """Read the file as a user would, and compare its output with PyTorch's."""
-    exported = load_network(path, loaded.source.trust if loaded.source else ())
+    exported = load_network(path, loaded.trust)
     rows, columns = loaded.image_size
     step = loaded.size_multiple
     rows, columns = (max(step, side // step * step) for side in (rows, columns))

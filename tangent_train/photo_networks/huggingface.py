@@ -13,7 +13,7 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
 from tangent_train.checkpoints.kinds import DepthKind
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.imports import hide_output, offline
 from tangent_train.photo_networks.network import (
@@ -112,7 +112,7 @@ def _from_folder(
         settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
     if described["model_type"] == "oneformer":
         settings["task"] = _task(folder, config)
-    network = build_from_config(settings, "network", SettingsFile(path))
+    network = build_from_file(settings, "network", path)
     if len(names) == 1 and network.is_universal:
         expected = "at least two classes: with one, masks contain it in every pixel"
         raise DataError(path, found="masks of one class", expected=expected)

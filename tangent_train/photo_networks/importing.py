@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -125,8 +124,7 @@ def import_network(
             _write_checkpoint(loaded, temporary)
         # The classes are from the user.
         loaded = load_network(temporary, unregistered(network.settings))
-    source = None if loaded.source is None else replace(loaded.source, path=path)
-    return replace(loaded, source=source)
+    return loaded
 
 
 @torch.no_grad()

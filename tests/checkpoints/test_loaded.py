@@ -94,7 +94,7 @@ def _network(**settings: Any) -> dict[str, Any]:
             r"other tensors than .*the tensors of models\.UNet",
         ),
         ({"settings": {"_target_": "os.system"}}, r"network\._target_=?.*os\.system"),
-        ({"settings": _network(widths=[])}, r"network: models\.UNet cannot be made"),
+        ({"settings": _network(widths=[])}, r"network cannot be built"),
         ({"representation": None}, r".*representation: Input should be"),
         ({"depth_kind": "inverse"}, r".*depth_kind: Input should be"),
         ({"unknown": 1}, r".*unknown: Unexpected"),

@@ -106,7 +106,7 @@ def test_the_architecture_decides_if_transformers_has_both(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changed", "expected"),
     [
-        ({"depth_estimation_type": "squared"}, r"config\.json: .*DepthNetwork cannot be made"),
+        ({"depth_estimation_type": "squared"}, r"config\.json: found network cannot be built"),
         ({"head_hidden_size": 9}, r"conv2\.\w+ of shape .* as described in config\.json\.$"),
     ],
 )

@@ -12,7 +12,7 @@ from torch import nn
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.loaded import LoadedNetwork, declared_sizes
 from tangent_train.cli.run import Run, build
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.build import build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
@@ -49,7 +49,7 @@ def small_trained(
         fixed_size=fixed,
         fill="edge",
         settings=settings,
-        source=SettingsFile(Path("x.ckpt"), trust={settings["_target_"]}),
+        trust=(settings["_target_"],),
     )
 
 
