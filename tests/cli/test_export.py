@@ -14,12 +14,12 @@ from tests.tasks.small_networks import save_checkpoint
 
 @pytest.fixture(scope="module")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("run (1)") / "best=1.ckpt"
+    path = tmp_path_factory.mktemp("run") / "best.ckpt"
     save_checkpoint(path, "network.widths=[4,8]")
     return path
 
 
-@pytest.mark.parametrize("name", ["a, b.onnx", "new/folder/model.SAFETENSORS"])
+@pytest.mark.parametrize("name", ["a.onnx", "new/folder/model.SAFETENSORS"])
 def test_the_suffix_selects_the_format(
     name: str, checkpoint: Path, tmp_path: Path, run: Run, capfd: pytest.CaptureFixture[str]
 ) -> None:

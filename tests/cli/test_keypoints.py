@@ -48,9 +48,9 @@ def test_two_panoramas_are_a_pair(
     run: Run, panoramas: Path, tmp_path: Path, capsys: Capture
 ) -> None:
     pair = (f"left={panoramas}/a.png", f"right={panoramas}/b.png")
-    run(*pair, "base_level=[0]", "level=5", "output=out (1)")
-    output = tmp_path / "out (1)"
-    assert [path.name for path in tmp_path.iterdir()] == ["out (1)"]
+    run(*pair, "base_level=[0]", "level=5", "output=out_1")
+    output = tmp_path / "out_1"
+    assert [path.name for path in tmp_path.iterdir()] == ["out_1"]
     names = ["finished.jsonl", "keypoints.md", "manifest.json", "matches", "pairs.csv"]
     names.append("results.json")
     assert sorted(path.name for path in output.iterdir()) == names
@@ -62,7 +62,7 @@ def test_two_panoramas_are_a_pair(
         assert int(row["putative"]) == kept["putative"] > 0
     pictures = sorted(path.name for path in (output / "matches").iterdir())
     assert pictures == ["000_a_b_as_given.png", "000_a_b_rotated.png"]
-    assert "Results are in out (1)." in capsys.readouterr().out
+    assert "Results are in out_1." in capsys.readouterr().out
 
 
 def test_export_for_colmap(run: Run, tmp_path: Path, panoramas: Path) -> None:
