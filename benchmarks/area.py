@@ -11,7 +11,7 @@ import torch
 from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import UNet
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import SphereArea
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -38,7 +38,7 @@ def area(quick: bool) -> Iterator[Table]:
             "_target_": f"tangent_train.rendering.{name.capitalize()}Representation",
             "level": level,
         } | ({"base_level": 0} if name == "tangent" else {})
-        trained = TrainedNetwork(
+        trained = LoadedNetwork(
             network,
             ("unknown", *map(str, range(13))),
             ("rgb",),

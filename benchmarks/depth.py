@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import Normalization
 from models import HuggingFaceDepthNetwork
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import equirect_directions
 from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import views_per_forward
@@ -36,7 +36,7 @@ def depth(quick: bool) -> Iterator[Table]:
     """
     side, rows = (70, 64) if quick else (518, 1024)
     settings = photo_network_settings(side)
-    trained = TrainedNetwork(
+    trained = LoadedNetwork(
         RoomDepth(),
         (),
         ("rgb",),

@@ -53,7 +53,7 @@ def main() -> None:
             guess = torch.from_numpy(meters).float().expand(truth.shape)
             task.metric.update(task.protocol.aligned(guess, truth), truth)
         task.evaluated = len(test)
-        record = task.record(task.metric.compute(), data.noun)
+        record = task.evaluation_result(task.metric.compute(), data.noun)
         record = replace(record, protocol={**data.facts, **task.facts})
         print(f"{name}, {np.median(meters):.2f} m:", *summary_lines(record), sep="\n  ")
 

@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
 from studies.output import Row, markdown
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.config.build import build_from_config
 from tangent_train.files import csv_text, write_text
 from tangent_train.geometry import (
@@ -120,7 +120,7 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> Row:
         checkpoint: File of the trained network.
         count: Number of rotations of each group.
     """
-    trained, rng = load_trained(Path(checkpoint)), np.random.default_rng(1)
+    trained, rng = load_network(Path(checkpoint)), np.random.default_rng(1)
     representation = build_from_config(trained.representation, "representation")
     by_cells = isinstance(representation, IcosphereRepresentation)
     group = rng.permutation(icosahedral_rotations()[1:])[:count]
@@ -133,7 +133,7 @@ def rotation_error(name: str, checkpoint: str, count: int = 20) -> Row:
     pixels = equirect_directions((representation.erp_height, 2 * representation.erp_height))
     with torch.no_grad():
         probabilities(random.train(), representation, signal(pixels))
-    networks = {"random weights": random.eval(), "trained": trained.inner}
+    networks = {"random weights": random.eval(), "trained": trained.module}
     row: Row = {"method": name}
     for weights, network in networks.items():
         row[f"icosahedral group, {weights}"] = mean_error(network, representation, group, by_cells)

@@ -17,7 +17,7 @@ import torch
 from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, measure
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import TangentGrid, equirect_shape
@@ -49,7 +49,7 @@ def predict(quick: bool) -> Iterator[Table]:
         yield Table("predict: time per frame", [row])
 
 
-def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwork:
+def _imported(settings: dict[str, Any], level: int, path: Path) -> LoadedNetwork:
     """Write a checkpoint with an untrained network for tangent images of a level."""
     settings |= {"num_classes": NUM_CLASSES}
     names, side = [f"class {k}" for k in range(NUM_CLASSES)], TangentGrid(1, level).dim
@@ -58,7 +58,7 @@ def _imported(settings: dict[str, Any], level: int, path: Path) -> TrainedNetwor
     return import_network(photo, path, levels=level, base_level=1)
 
 
-def _rows(trained: TrainedNetwork, level: int, rounds: int) -> list[Row]:
+def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
     """Time the network alone and `Predictor`, with all data on the device."""
     shape, grid = equirect_shape(level), TangentGrid(1, level)
     image = InputImage(np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8))

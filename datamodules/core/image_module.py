@@ -39,7 +39,6 @@ from datamodules.core.panoramas import (
     check_headers,
 )
 from datamodules.core.problems import Problems
-from datamodules.core.progress import show_progress
 from datamodules.core.reading import Transform
 from datamodules.core.samples import EvaluationImages, TrainingImages
 from datamodules.core.split_module import SplitDataModule
@@ -57,6 +56,7 @@ from tangent_train.geometry import SphereArea, shift_range
 from tangent_train.io.gpano import Fill, PanoramaArea, check_area_size
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.png import check_panorama_size
+from tangent_train.progress import show_progress
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.threads import in_threads
 

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
-from datamodules.core.progress import show_progress
 from datamodules.core.store import Store
 from tangent_train.errors import DataError, SettingError
+from tangent_train.progress import show_progress
 from tangent_train.threads import in_threads
 
 Split = Literal["train", "val", "test"]

@@ -59,7 +59,7 @@ class SplitDataModule(LabeledData[_Item], LightningDataModule):
 
     @property
     def _per_step(self) -> str:
-        return f"{self.noun}_per_step"
+        return "batch_size"
 
     def evaluation_size(self) -> int:
         """Number of samples in a batch of validation and test."""

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
-from datamodules.core.progress import show_progress
 from datamodules.synthia import reader
 from tangent_train.errors import DataError, at_least
 from tangent_train.geometry import (
@@ -31,6 +30,7 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.io.pixel_files import read_rgb, write_pixels
+from tangent_train.progress import show_progress
 from tangent_train.threads import in_threads
 
 HEIGHT = 2096

@@ -12,7 +12,6 @@ import numpy as np
 
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
-from datamodules.core.progress import show_progress
 from datamodules.stanford2d3ds.files import AREAS
 from datamodules.synthrooms import writer
 from datamodules.synthrooms.camera import PanoramaRays, PictureRays, Pose, ViewKind, draw_rays
@@ -21,6 +20,7 @@ from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, rende
 from datamodules.synthrooms.scene import draw_room_type, furnish
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import write_bytes, write_text
+from tangent_train.progress import show_progress
 
 MANIFEST = "synthrooms.json"
 """File that marks a folder as SynthRooms and holds its settings."""

@@ -13,12 +13,12 @@ from trimesh.exchange.off import export_off
 
 from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
-from datamodules.core.progress import show_progress
 from datamodules.synthshapes import furniture, vessels
 from datamodules.synthshapes.parts import Parts
 from tangent_train.errors import at_least
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
+from tangent_train.progress import show_progress
 
 MANIFEST = "synthshapes.json"
 """File that marks a folder as SynthShapes and holds its settings."""

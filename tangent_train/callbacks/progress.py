@@ -10,7 +10,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import RichProgressBar
 from rich import get_console
 
-from datamodules.core.progress import PlainLines
+from tangent_train.progress import PlainLines
 
 
 class ProgressBar(RichProgressBar):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.scores import plain_scores
 from tangent_train.errors import SettingError
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.distortion_aware import make_distortion_aware
-from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.errors import SettingError, width_height
 
 _LABEL_MAP = 3

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import datamodules
-from tangent_train.checkpoints.content import Align, DepthKind, ScoreKind
+from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
 from tangent_train.cli.settings import names_of, parse_settings
 from tangent_train.errors import DataError
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.command_settings import EvaluateSettings
 from tangent_train.cli.run import Run, machine_faults
 from tangent_train.cli.settings import parse_settings
@@ -16,7 +16,7 @@ from tangent_train.config.build import SettingsFile
 def evaluate(
     settings: Mapping[str, Any],
     source: SettingsFile | None = None,
-    trained: TrainedNetwork | None = None,
+    trained: LoadedNetwork | None = None,
 ) -> None:
     """Evaluate a checkpoint on the test fold of its data.
 
@@ -34,7 +34,7 @@ def evaluate(
     if not mapped:
         settings = {name: value for name, value in settings.items() if name != "unmapped"}
     if trained is None and (mapped or run_settings(checkpoint) is None):
-        trained = load_trained(checkpoint, settings.get("trust", ()))
+        trained = load_network(checkpoint, settings.get("trust", ()))
     run = Run.create(settings, source, trained, trains=False)
     with machine_faults(run.folder, run.data):
         run.test(run.trainer([]), checkpoint)

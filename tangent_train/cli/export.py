@@ -8,7 +8,7 @@ from typing import Any
 from rich import get_console
 from rich.text import Text
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.command_settings import ExportSettings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.console import print_text
@@ -32,7 +32,7 @@ def export(config: Mapping[str, Any]) -> None:
     output = settings.output
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
-        trained = load_trained(settings.checkpoint, settings.trust)
+        trained = load_network(settings.checkpoint, settings.trust)
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)
     fixed, multiple = written.trained.fixed_size, trained.size_multiple

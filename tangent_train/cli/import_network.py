@@ -15,7 +15,7 @@ from omegaconf import OmegaConf
 from rich import get_console
 from rich.text import Text
 
-from tangent_train.checkpoints.content import DepthKind, ScoreKind
+from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.cli.command_settings import ImportSettings
 from tangent_train.cli.settings import check_new, check_unread, parse_settings
 from tangent_train.console import print_text
@@ -23,7 +23,7 @@ from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.imports import elsewhere
 
 if TYPE_CHECKING:
-    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.photo_networks import PhotoNetwork
 
 
@@ -131,7 +131,7 @@ def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
     return load(**given, normalization=normalization)
 
 
-def _understood(path: Path, trained: TrainedNetwork, settings: ImportSettings) -> str:
+def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
     from tangent_train.inference.representations import PanoramaViews
 

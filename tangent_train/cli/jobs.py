@@ -10,8 +10,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-from datamodules.core.progress import progress_bar
 from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.progress import progress_bar
 from tangent_train.threads import in_threads
 
 _THREADS = min(4, os.cpu_count() or 1)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
@@ -64,7 +64,7 @@ def predict(config: Mapping[str, Any]) -> None:
     _check_unread(settings)
     decisive = {name: config[name] for name in _DECISIVE}
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
-    trained = load_trained(settings.checkpoint, settings.trust)
+    trained = load_network(settings.checkpoint, settings.trust)
     views = _views(settings, trained)
     prediction = PREDICTIONS[trained.predicts](settings, trained, views)
     if isinstance(views, PanoramaViews):
@@ -267,7 +267,7 @@ def _check_videos(inputs: Inputs, folder: PredictionFolder) -> None:
         )
 
 
-def _views(settings: PredictSettings, trained: TrainedNetwork) -> PanoramaViews | PhotoViews:
+def _views(settings: PredictSettings, trained: LoadedNetwork) -> PanoramaViews | PhotoViews:
     how = settings.levels, settings.base_level, settings.blend, settings.rotations
     if settings.projection == "perspective":
         return PhotoViews(trained, *how)
@@ -287,7 +287,7 @@ def _check_unread(settings: PredictSettings) -> None:
         check_unread(settings, "without label_map", unmapped="unknown")
 
 
-def _depth_folder(settings: PredictSettings, trained: TrainedNetwork) -> DepthFolder | None:
+def _depth_folder(settings: PredictSettings, trained: LoadedNetwork) -> DepthFolder | None:
     folder, wanted = settings.depth, "depth" in trained.inputs
     if wanted != (folder is not None) or (folder is not None and not folder.is_dir()):
         raise SettingError(

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from tangent_train.checkpoints.distances import is_metric
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
 from tangent_train.console import print_text
@@ -53,7 +53,7 @@ class LabelPrediction:
     announcement = "A panorama is labeled"
 
     def __init__(
-        self, settings: PredictSettings, original: TrainedNetwork, views: PanoramaViews | PhotoViews
+        self, settings: PredictSettings, original: LoadedNetwork, views: PanoramaViews | PhotoViews
     ) -> None:
         check_unread(settings, "for networks of classes", **_OF_DEPTH)
         if settings.depth is None:
@@ -131,7 +131,7 @@ class DepthPrediction:
     announcement = "The depth of a panorama is predicted"
 
     def __init__(
-        self, settings: PredictSettings, trained: TrainedNetwork, views: PanoramaViews | PhotoViews
+        self, settings: PredictSettings, trained: LoadedNetwork, views: PanoramaViews | PhotoViews
     ) -> None:
         check_unread(settings, "for depth networks", **_OF_CLASSES)
         if settings.upright == "auto":

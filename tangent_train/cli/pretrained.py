@@ -12,7 +12,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
 from models import initialize
-from tangent_train.checkpoints.trained import (
+from tangent_train.checkpoints.loaded import (
     NetworkDescription,
     completed_settings,
     describe_network,

@@ -27,9 +27,9 @@ def report(arguments: Sequence[str]) -> None:
     # Slow imports, not needed to refuse a command line.
     with elsewhere():
         from tangent_train.results.comparisons import runs_report
-        from tangent_train.results.record import find_runs, load_record, unfinished_runs
+        from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
 
-    records = [load_record(folder) for folder in find_runs(options.folders)]
+    records = [load_result(folder) for folder in find_runs(options.folders)]
     notes = [f"{run}: not finished, ignored." for run in unfinished_runs(options.folders)]
     runs = runs_report(records, notes)
     runs.write(options.output, "report")

@@ -22,8 +22,8 @@ from datamodules.core.loading import explained, gathered_order
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
+from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
-from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.command_settings import LabelMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
@@ -44,14 +44,13 @@ from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.representations import check_size
 from tangent_train.results.evaluation import (
     confusion_table,
-    plain_scores,
     result_tables,
     summary_lines,
     write_results,
 )
+from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
 from tangent_train.results.html import write_report
 from tangent_train.results.published import Comparison
-from tangent_train.results.record import Record
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -77,14 +76,14 @@ class Run:
     source: SettingsFile | None
     data: Any
     task: Any
-    trained: TrainedNetwork | None = None
+    trained: LoadedNetwork | None = None
     notes: Sequence[str] = ()
 
     @staticmethod
     def create(
         settings: Mapping[str, Any],
         source: SettingsFile | None,
-        trained: TrainedNetwork | None = None,
+        trained: LoadedNetwork | None = None,
         *,
         trains: bool = True,
     ) -> Run:
@@ -139,7 +138,7 @@ class Run:
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        record = self.task.record(self.task.result, noun) if tested else None
+        record = self.task.evaluation_result(self.task.result, noun) if tested else None
         images = record.images if record else 0
         if record and images == total:
             record = replace(record, groups=self._groups(trainer.world_size))
@@ -164,14 +163,14 @@ class Run:
             for group, some in sorted(places.items())
         ]
 
-    def _as_trained(self) -> TrainedNetwork:
+    def _as_trained(self) -> LoadedNetwork:
         """Return the network of the run with its inputs, classes and representation."""
         if self.trained is not None:
             return self.trained
         data = self.data
         network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
-        return TrainedNetwork(
-            inner=self.task.network,
+        return LoadedNetwork(
+            module=self.task.network,
             class_names=data.class_names,
             inputs=data.inputs,
             normalization=data.normalization,
@@ -193,7 +192,9 @@ class Run:
             ) from error
 
     @rank_zero_only
-    def _report(self, record: Record, checkpoint: Path, callbacks: Sequence[Callback]) -> None:
+    def _report(
+        self, record: EvaluationResult, checkpoint: Path, callbacks: Sequence[Callback]
+    ) -> None:
         is_inside = checkpoint.is_relative_to(self.folder)
         # A relative path stays right when the folder is moved.
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
@@ -292,7 +293,7 @@ def open_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -
 
 
 def build_trained(
-    settings: Mapping[str, Any], trained: TrainedNetwork, source: SettingsFile | None = None
+    settings: Mapping[str, Any], trained: LoadedNetwork, source: SettingsFile | None = None
 ) -> tuple[Any, Any, list[str]]:
     """Build the data module and the task that evaluate a network from a file.
 
@@ -345,7 +346,7 @@ def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
 
 
 def inputs_and_classes(data: Any) -> dict[str, Any]:
-    """Return inputs and classes of a data module or a `TrainedNetwork` as plain values."""
+    """Return inputs and classes of a data module or a `LoadedNetwork` as plain values."""
     mean, std = list(data.normalization.mean), list(data.normalization.std)
     inputs = {"inputs": list(data.inputs)} if hasattr(data, "inputs") else {}
     names = list(data.class_names)

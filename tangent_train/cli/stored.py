@@ -166,18 +166,18 @@ class StoredNetwork:
             composed: Composed config, resolved.
 
         Returns:
-            Settings, the file that they come from, and the `TrainedNetwork`.
+            Settings, the file that they come from, and the `LoadedNetwork`.
 
         Raises:
             DataError: The file cannot be used.
         """
-        from tangent_train.checkpoints.trained import load_trained
+        from tangent_train.checkpoints.loaded import load_network
         from tangent_train.inference.engine import views_per_forward
         from tangent_train.inference.representations import panorama_settings
 
         typed = names_of(self.user_overrides)
         trust = parse_settings(Trust, composed).trust
-        trained = load_trained(self.path, trust)
+        trained = load_network(self.path, trust)
         settings = dict(composed)
         level = composed["level"] if "level" in typed else None
         settings["level"] = trained.level if level is None else level

@@ -14,7 +14,7 @@ from typing import Any
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.cli.stored import StoredNetwork, run_settings
 from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
 from tangent_train.cli.transfer_views import views_of
@@ -58,7 +58,7 @@ def transfer(config: DictConfig) -> None:
     _report(config, folder, stages, trained)
 
 
-def _with_network(config: DictConfig) -> tuple[DictConfig, TrainedNetwork]:
+def _with_network(config: DictConfig) -> tuple[DictConfig, LoadedNetwork]:
     """Load a network without settings of a run; return the config for its evaluation, and it."""
     overrides = list(HydraConfig.get().overrides.task)
     for text in overrides:
@@ -98,7 +98,7 @@ def _check_fold(path: Path, stored: Mapping[str, Any], stages: Sequence[Stage]) 
         )
 
 
-def _check_data(stages: Sequence[Stage], trained: TrainedNetwork | None) -> None:
+def _check_data(stages: Sequence[Stage], trained: LoadedNetwork | None) -> None:
     """Build the data and networks of all stages, to find errors before hours of training."""
     from tangent_train.cli.run import build, build_trained, check_fits, inputs_and_classes
 
@@ -154,19 +154,19 @@ def _run(stage: Stage, heading: str) -> None:
 
 
 def _report(
-    config: DictConfig, folder: Path, stages: Sequence[Stage], trained: TrainedNetwork | None
+    config: DictConfig, folder: Path, stages: Sequence[Stage], trained: LoadedNetwork | None
 ) -> None:
     """Write and print the tables and the chart."""
     with elsewhere():  # imports matplotlib
         from tangent_train.results.comparisons import levels_report, transfer_report
-    from tangent_train.results.record import load_record
+    from tangent_train.results.evaluation_result import load_result
 
     records: dict[Any, list[Any]] = defaultdict(list)
     study = bool(config.study_levels)
     for stage in stages:
         if not study or stage.view:
             key = stage.config["level"] if study else stage.name
-            records[key].append(load_record(stage.folder))
+            records[key].append(load_result(stage.folder))
     if study:
         level = config.level if trained is None else trained.level
         name, report = "angular_resolution", levels_report(records, level)

@@ -14,8 +14,8 @@ from hydra import compose
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, ListConfig, OmegaConf
 
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.scores import network_for_views
-from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.inference.representations import panorama_settings
@@ -24,7 +24,7 @@ _NAME = re.compile(r"\w[\w.+-]*")
 """Names that can be part of a folder's name."""
 
 
-def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, dict[str, Any]]:
+def views_of(config: DictConfig, trained: LoadedNetwork | None) -> dict[str, dict[str, Any]]:
     """Return the views of ``compare`` or of the study by name, each as changes of settings.
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
@@ -58,7 +58,7 @@ def views_of(config: DictConfig, trained: TrainedNetwork | None) -> dict[str, di
     return {name: view for name, view in views.items() if _is_possible(name, view, trained)}
 
 
-def _is_possible(name: str, view: Mapping[str, Any], trained: TrainedNetwork) -> bool:
+def _is_possible(name: str, view: Mapping[str, Any], trained: LoadedNetwork) -> bool:
     """Return False, and print the reason, if a network cannot be distortion-aware."""
     try:
         network_for_views(trained.network, view["representation"].get("distortion_aware"))
@@ -103,7 +103,7 @@ def numbers(config: DictConfig, setting: str, least: int) -> list[int]:
 
 
 def _view(
-    config: DictConfig, trained: TrainedNetwork | None, option: str | None = None, **changes: Any
+    config: DictConfig, trained: LoadedNetwork | None, option: str | None = None, **changes: Any
 ) -> dict[str, Any]:
     """Return a view as changes of settings: its representation, and its level if it has one.
 

@@ -33,8 +33,8 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity, is_metric
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
 from tangent_train.rendering.accumulate import NO_OWNERS

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangent_train.checkpoints.content import Align, DepthKind
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least
 from tangent_train.inference.depth import combine_depth
 from tangent_train.rendering.backward import tangent_to_equirect

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from torch import Tensor, nn
 
     from datamodules.core.inputs import Input
-    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.inference.images import InputImage
     from tangent_train.inference.representations import PanoramaViews, PhotoViews
     from tangent_train.rendering import Interpolation
@@ -173,7 +173,7 @@ class RenderedViews:
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         image: InputImage,
         shape: tuple[int, int],
         device: torch.device | str,
@@ -225,7 +225,7 @@ class ViewPredictor:
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         view_batch_size: int | None = None,
@@ -286,7 +286,7 @@ class Predictor(ViewPredictor):
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         view_batch_size: int | None = None,
@@ -314,7 +314,7 @@ class Predictor(ViewPredictor):
 
         Returns:
             The scores. Score k belongs to label k + 1; the last score may belong to no class, see
-            `TrainedNetwork.groups`.
+            `LoadedNetwork.groups`.
         """
         sets = self._sets(image)
         mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)

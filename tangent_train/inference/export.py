@@ -13,11 +13,11 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from models.distortion_aware import make_ordinary
-from tangent_train.checkpoints.trained import (
+from tangent_train.checkpoints.loaded import (
     CHECKSUM_KEY,
     METADATA_KEY,
-    TrainedNetwork,
-    load_trained,
+    LoadedNetwork,
+    load_network,
     metadata_of,
     tensor_checksum,
     write_metadata,
@@ -47,12 +47,12 @@ class Export(NamedTuple):
         difference: Largest difference between its scores and PyTorch's, relative to their range.
     """
 
-    trained: TrainedNetwork
+    trained: LoadedNetwork
     difference: float
 
 
 def export_network(
-    trained: TrainedNetwork,
+    trained: LoadedNetwork,
     path: Path,
     *,
     image_size: tuple[int, int] | None = None,
@@ -107,7 +107,7 @@ def export_network(
 
 
 def _check(
-    trained: TrainedNetwork, path: Path, image_size: tuple[int, int] | None, opset: int | None
+    trained: LoadedNetwork, path: Path, image_size: tuple[int, int] | None, opset: int | None
 ) -> None:
     if path.suffix.lower() not in SUFFIXES:
         expected = f"a name ending in {' or '.join(SUFFIXES)}"
@@ -122,7 +122,7 @@ def _check(
         raise SettingError(
             "image_size and opset", found=(image_size, opset), expected="null for .safetensors"
         )
-    is_aware = make_ordinary(trained.inner) is not trained.inner
+    is_aware = make_ordinary(trained.module) is not trained.module
     if path.suffix.lower() == ".onnx" and (
         is_aware or trained.representation.get("distortion_aware")
     ):
@@ -135,7 +135,7 @@ def _check(
 
 
 def _write_onnx(
-    trained: TrainedNetwork, size: tuple[int, int] | None, path: Path, opset: int | None
+    trained: LoadedNetwork, size: tuple[int, int] | None, path: Path, opset: int | None
 ) -> None:
     with of_extra("export", f"output={path.suffix}"):
         for package in ("onnx", "onnxruntime", "onnxscript"):
@@ -150,7 +150,7 @@ def _write_onnx(
     returns_labels = trained.score_kind == "labels"
     with hide_output():
         program: Any = torch.onnx.export(
-            trained.inner if returns_labels else trained.network,
+            trained.module if returns_labels else trained.network,
             (_random_images(trained, 2, size),),
             dynamo=True,
             input_names=["images"],
@@ -169,9 +169,9 @@ def _write_onnx(
     write_metadata(path, path, written_as)
 
 
-def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
+def _write_safetensors(trained: LoadedNetwork, path: Path) -> None:
     # Copies, because the format supports neither shared memory nor other memory formats.
-    tensors = trained.inner.state_dict()
+    tensors = trained.module.state_dict()
     tensors = {name: tensor.contiguous().clone() for name, tensor in tensors.items()}
     described = {METADATA_KEY: json.dumps(metadata_of(trained))}
     described |= {CHECKSUM_KEY: tensor_checksum(tensors), "format": "pt"}
@@ -180,9 +180,9 @@ def _write_safetensors(trained: TrainedNetwork, path: Path) -> None:
 
 
 @torch.no_grad()
-def _verified(trained: TrainedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
+def _verified(trained: LoadedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
     """Read the file as a user would, and compare its scores with PyTorch's."""
-    exported = load_trained(path, trained.source.trust if trained.source else ())
+    exported = load_network(path, trained.source.trust if trained.source else ())
     rows, columns = trained.image_size
     step = trained.size_multiple
     rows, columns = (max(step, side // step * step) for side in (rows, columns))
@@ -204,6 +204,6 @@ def _verified(trained: TrainedNetwork, fixed_size: tuple[int, int] | None, path:
     return Export(exported, largest)
 
 
-def _random_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> Tensor:
+def _random_images(trained: LoadedNetwork, count: int, size: tuple[int, int]) -> Tensor:
     generator = torch.Generator().manual_seed(count)
     return torch.randn(count, trained.in_channels, *size, generator=generator)

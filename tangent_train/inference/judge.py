@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from torch import nn
 
-    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.rendering.representations.views import Representation
 
 _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
@@ -52,7 +52,7 @@ class NetworkJudge:
         device: Device of the network.
     """
 
-    trained: TrainedNetwork
+    trained: LoadedNetwork
     device: torch.device | str = "cpu"
 
     def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Literal
 
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
@@ -64,7 +64,7 @@ class MappedNetwork:
         unmapped_wins: True if unmapped classes may win, as label 0.
     """
 
-    trained: TrainedNetwork
+    trained: LoadedNetwork
     classes: Mapping[str, Sequence[str]]
     absent: Sequence[str]
     unmapped: Sequence[str]
@@ -123,7 +123,7 @@ def load_label_map(given: str | Path) -> LabelMap:
 
 
 def map_classes(
-    trained: TrainedNetwork,
+    trained: LoadedNetwork,
     label_map: LabelMap,
     unmapped: Unmapped = "unknown",
     targets: Sequence[str] | None = None,

@@ -15,8 +15,8 @@ from torch import Tensor
 from datamodules.core.image_module import Upright
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.panoramas import meters_to_steps
-from tangent_train.checkpoints.content import Align
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.kinds import Align
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError, width_height
 from tangent_train.inference.depth import DepthPredictor
 from tangent_train.inference.engine import Predictor
@@ -96,7 +96,7 @@ def load(
     check_choice("unmapped", unmapped, get_args(Unmapped))
     check_choice("blend", blend, get_args(Blend))
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
-    original = load_trained(Path(path), (trust,) if isinstance(trust, str) else trust)
+    original = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     trained = original
     if label_map is None:
         _check_unset("unmapped", unmapped, "unknown", "without label_map")
@@ -147,7 +147,7 @@ class Network:
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         panoramas: Predictor | DepthPredictor,
         photos: Callable[[], Predictor | DepthPredictor],
         judge: NetworkJudge,

@@ -30,7 +30,7 @@ from tangent_train.rendering.representations.views import PinholeViews
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tangent_train.checkpoints.trained import TrainedNetwork
+    from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.io.gpano import Fill
     from tangent_train.rendering import Blend
     from tangent_train.rendering.representations.views import Views
@@ -105,7 +105,7 @@ class PanoramaViews:
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         levels: Levels = None,
         base_level: int | None = None,
         blend: Blend = "feather",
@@ -189,7 +189,7 @@ class PhotoViews:
 
     def __init__(
         self,
-        trained: TrainedNetwork,
+        trained: LoadedNetwork,
         levels: Levels = None,
         base_level: int | None = None,
         blend: Blend = "feather",
@@ -320,7 +320,7 @@ def _check_single(levels: Sequence[int], base_level: int | None) -> None:
 
 
 def panorama_settings(
-    trained: TrainedNetwork,
+    trained: LoadedNetwork,
     levels: Levels = None,
     base_level: int | None = None,
     views: ViewChoice = None,
@@ -369,7 +369,7 @@ def panorama_settings(
 
 
 def _built(
-    trained: TrainedNetwork, settings: dict[str, Any], source: SettingsFile | None
+    trained: LoadedNetwork, settings: dict[str, Any], source: SettingsFile | None
 ) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
     """Build the representation from settings.
 
@@ -382,7 +382,7 @@ def _built(
 
 
 def _photo_representation(
-    trained: TrainedNetwork, level: int, base_level: int | None
+    trained: LoadedNetwork, level: int, base_level: int | None
 ) -> PerspectiveRepresentation:
     settings = trained.representation
     if settings["_target_"] == _PERSPECTIVE and base_level is None:
@@ -400,7 +400,7 @@ def _photo_representation(
     return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
 
 
-def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
+def check_size(trained: LoadedNetwork, size: tuple[int, int]) -> None:
     """Refuse image sizes that a network does not support.
 
     Args:
@@ -424,7 +424,7 @@ def check_size(trained: TrainedNetwork, size: tuple[int, int]) -> None:
     raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
 
 
-def _fits(trained: TrainedNetwork, size: tuple[int, int]) -> bool:
+def _fits(trained: LoadedNetwork, size: tuple[int, int]) -> bool:
     """Return True if a network supports images of rows and columns."""
     if trained.is_spherical:
         return size == trained.image_size

@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import torch
 
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks.network import PhotoNetwork
 from tangent_train.photo_networks.score_kinds import trial_images, trial_output

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from datamodules.core.inputs import Normalization
 from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import DataError, first_line
 from tangent_train.imports import hide_output, offline

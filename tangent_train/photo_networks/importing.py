@@ -11,19 +11,19 @@ from typing import Any
 import torch
 
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.content import ScoreKind
 from tangent_train.checkpoints.distances import DistanceNetwork
+from tangent_train.checkpoints.kinds import ScoreKind
+from tangent_train.checkpoints.loaded import (
+    LoadedNetwork,
+    load_network,
+    metadata_of,
+    write_metadata,
+)
 from tangent_train.checkpoints.scores import (
     ClassScoreNetwork,
     Groups,
     network_for_views,
     size_multiple_of,
-)
-from tangent_train.checkpoints.trained import (
-    TrainedNetwork,
-    load_trained,
-    metadata_of,
-    write_metadata,
 )
 from tangent_train.config.build import build_from_config, unregistered
 from tangent_train.errors import SettingError, width_height
@@ -56,7 +56,7 @@ def import_network(
     image_size: tuple[int, int] | None = None,
     score_kind: ScoreKind | None = None,
     remark: Callable[[str], object] = lambda sentence: None,
-) -> TrainedNetwork:
+) -> LoadedNetwork:
     """Try a photo network, write it as a checkpoint and read it again.
 
     Args:
@@ -101,12 +101,12 @@ def import_network(
         outputs = {"class_names": tuple(names), "groups": groups, "score_kind": kind}
         tried = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
     multiple = None if network.fixed_size else size_multiple_of(tried, 3)
-    # A network of a fixed size gets square images of its longer side, see `TrainedNetwork`.
+    # A network of a fixed size gets square images of its longer side, see `LoadedNetwork`.
     side = min(network.image_size) if multiple else max(network.image_size)
     seen = photo_network_settings(side, levels, base_level, views)
     size = build_from_config(seen, "representation").image_size
-    described = TrainedNetwork(
-        inner=network.network,
+    described = LoadedNetwork(
+        module=network.network,
         **outputs,
         inputs=("rgb",),
         normalization=network.normalization,
@@ -126,7 +126,7 @@ def import_network(
         else:
             _write_checkpoint(described, temporary)
         # The classes are from the user.
-        trained = load_trained(temporary, unregistered(network.settings))
+        trained = load_network(temporary, unregistered(network.settings))
     source = None if trained.source is None else replace(trained.source, path=path)
     return replace(trained, source=source)
 
@@ -155,7 +155,7 @@ def _groups(
     unknown_classes: Collection[str],
     wins: bool,
 ) -> tuple[list[str], Groups | None]:
-    """Return the names of the labels, and the scores of each, see `TrainedNetwork.groups`."""
+    """Return the names of the labels, and the scores of each, see `LoadedNetwork.groups`."""
     score_names = list(map(composed, score_names))
     unknown_classes = set(map(composed, unknown_classes))
     if missing := unknown_classes - set(score_names):
@@ -204,7 +204,7 @@ def _scores_of(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list
     return indices, [count] if independent else []
 
 
-def _write_checkpoint(described: TrainedNetwork, path: Path) -> None:
+def _write_checkpoint(described: LoadedNetwork, path: Path) -> None:
     content = metadata_of(described)
     names = ("settings", "representation", "level")
     network, representation, level = (content.pop(name) for name in names)

@@ -10,7 +10,7 @@ from typing import Any, get_args
 from torch import nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.content import DepthKind, ScoreKind
+from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.config.build import is_class_name
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json

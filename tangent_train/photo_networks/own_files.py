@@ -9,8 +9,8 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors, tensors_for
-from tangent_train.checkpoints.content import DepthKind
-from tangent_train.checkpoints.trained import completed_settings
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import completed_settings
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.photo_networks.network import USUAL_SIZE, PhotoNetwork, class_names_in

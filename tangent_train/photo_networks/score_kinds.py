@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangent_train.checkpoints.content import ScoreKind
+from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.scores import plain_scores
 from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.photo_networks.network import PhotoNetwork

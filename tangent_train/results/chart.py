@@ -35,13 +35,13 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     """
     record = rows[0].records[0]
     panels: list[_Panel] = []
-    headings = record.main_headings
+    headings = record.main_columns
     for unit in dict.fromkeys(heading.unit for heading in headings.values()):
         shown = {n: h.text for n, h in headings.items() if h.unit == unit}
         means = [[row.score(name) for name in shown] for row in rows]
         panels.append(_Panel("" if panels else title, list(shown.values()), means, unit))
     if score := record.main_of_class:
-        heading, names = record.headings[record.class_means[score]], record.class_names
+        heading, names = record.columns[record.class_means[score]], record.class_names
         classes = [[row.score(score, name) for name in names] for row in rows]
         panels.append(_Panel(f"{heading.class_text} of each class", names, classes, heading.unit))
     return _png(rows, *panels)
@@ -87,7 +87,7 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     plots[0].set_title(f"{panels[0].title}\n{_ERROR_BARS}", loc="left")
     if banded:
         record = next(row for row in rows if row.bands).records[0]
-        heading = record.headings[record.main]
+        heading = record.columns[record.main]
         plots[-1].set_title(f"{heading.text} by latitude", loc="left")
         _band_lines(plots[-1], rows, record.main, heading.unit)
     handles, labels = plots[0].get_legend_handles_labels()

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.published import Comparison
-from tangent_train.results.record import Record
 from tangent_train.results.report import Cell, Report
 from tangent_train.results.rows import Row, check_alike, group_runs
 
@@ -23,7 +23,7 @@ _ROTATIONS = {None: "–", "none": "–", "yaw": "z", "so3": "SO3"}
 """Usual names of no rotation, rotation about the vertical axis, and arbitrary rotation."""
 
 
-def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
+def runs_report(records: Sequence[EvaluationResult], notes: Sequence[str] = ()) -> Report:
     """Report the mean and spread of each group of finished runs, with published scores.
 
     Args:
@@ -39,7 +39,7 @@ def runs_report(records: Sequence[Record], notes: Sequence[str] = ()) -> Report:
     return Report("Report", merged, [*_repeated(rows), *notes, *published.notes])
 
 
-def _differing_facts(records: Sequence[Record]) -> list[str]:
+def _differing_facts(records: Sequence[EvaluationResult]) -> list[str]:
     """Return the facts of the protocols in which evaluations differ, besides the data."""
     names = dict.fromkeys(name for record in records for name in record.protocol)
     return [
@@ -63,7 +63,7 @@ def _repeated(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def transfer_report(
-    stages: Mapping[str, Sequence[Record]], cells: Mapping[str, Cell] | None = None
+    stages: Mapping[str, Sequence[EvaluationResult]], cells: Mapping[str, Cell] | None = None
 ) -> Report:
     """Report a transfer from photos to panoramas, with published scores.
 
@@ -96,7 +96,7 @@ def _photos_of(stage: str) -> str:
     return photos + mark + paper
 
 
-def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) -> Report:
+def levels_report(levels: Mapping[int, Sequence[EvaluationResult]], trained_level: float) -> Report:
     """Report one network at several levels of the panoramas.
 
     This is the paper's third transfer experiment: photos are normalized to the angular resolution
@@ -122,7 +122,7 @@ def levels_report(levels: Mapping[int, Sequence[Record]], trained_level: float) 
     return Report("One network at several levels", compared, [note], change)
 
 
-def _facts(records: Sequence[Record], shown: Sequence[str] = ()) -> dict[str, str]:
+def _facts(records: Sequence[EvaluationResult], shown: Sequence[str] = ()) -> dict[str, str]:
     record = records[0]
     facts = {
         "data": record.data,
@@ -143,7 +143,7 @@ def _facts(records: Sequence[Record], shown: Sequence[str] = ()) -> dict[str, st
     return facts | {"folds": ", ".join(folds) or "–", "runs": str(len(records))}
 
 
-def _inputs(record: Record) -> str:
+def _inputs(record: EvaluationResult) -> str:
     """Return RGB or RGB-D, as in the paper, and further inputs; a dash for shapes."""
     names = record.settings.get("data.inputs")
     if names is None:
@@ -152,7 +152,7 @@ def _inputs(record: Record) -> str:
     return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
 
 
-def _base_level(record: Record) -> str:
+def _base_level(record: EvaluationResult) -> str:
     """Return the base level b of tangent images, or a short name of another representation."""
     base = record.settings.get("representation.base_level")
     if base is not None:

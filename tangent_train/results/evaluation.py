@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,8 +12,9 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
+from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.metrics.segmentation import BAND_EDGES_DEG
-from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Record
+from tangent_train.results.evaluation_result import RESULTS_FILE, EvaluationResult, plain_scores
 from tangent_train.results.tables import Table, score_text
 
 _OTHER_COLUMNS = {
@@ -29,7 +29,7 @@ _OTHER_COLUMNS = {
 def class_entries(
     scores: Mapping[str, NDArray[Any]], confusion: NDArray[np.int64], class_names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return name, scores and most frequent confusion of each class, see `Record.classes`.
+    """Return name, scores and most frequent confusion of each class, see `EvaluationResult`.
 
     Args:
         scores: Scores of the classes ``(K,)`` by name.
@@ -57,7 +57,7 @@ def _taken_for(row: NDArray[np.int64], label: int, class_names: Sequence[str]) -
 
 
 def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return edges and scores of latitude bands, see `Record.latitude_bands`.
+    """Return edges and scores of latitude bands, see `EvaluationResult.latitude_bands`.
 
     Args:
         scores: Scores of the bands, from north to south.
@@ -68,17 +68,12 @@ def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, An
     ]
 
 
-def plain_scores(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace NaN, which JSON lacks, by None."""
-    return {name: None if math.isnan(value) else value for name, value in scores.items()}
-
-
-def headline(record: Record) -> str:
+def headline(record: EvaluationResult) -> str:
     """Return the scores over all images in one line."""
     means = [
         f"{h.text} {score_text(value, h.unit, record.intervals.get(name))}\u00a0{h.unit}".strip()
-        for name, h in record.main_headings.items()
-        if (value := record.means.get(name)) is not None
+        for name, h in record.main_columns.items()
+        if (value := record.scores.get(name)) is not None
     ]
     absent = record.absent
     some = f", {len(record.classes) - len(absent)} of {len(record.classes)} classes"
@@ -87,21 +82,21 @@ def headline(record: Record) -> str:
     return f"{', '.join(means)} over {over}".strip() + legend
 
 
-def summary_lines(record: Record) -> list[str]:
+def summary_lines(record: EvaluationResult) -> list[str]:
     """Return the headline and, below it, the facts of the protocol, if there are any."""
     facts = (f"{name.replace('_', ' ')}: {fact}" for name, fact in record.protocol.items())
     return list(filter(None, (headline(record), "; ".join(facts))))
 
 
-def result_tables(record: Record) -> list[Table]:
+def result_tables(record: EvaluationResult) -> list[Table]:
     """Return a table of scores per class, or over all images, by latitude, and by group.
 
     A class is omitted if it occurs in neither labels nor predictions and its score is undefined.
 
     Args:
-        record: Record of the evaluation.
+        record: EvaluationResult of the evaluation.
     """
-    headings = record.headings
+    headings = record.columns
     tables = [_per_class(record) if record.classes else _over_all(record)]
     bands = [["{}° … {}°".format(*band["latitude_deg"])] for band in record.latitude_bands]
     groups = [[group["group"], str(group["images"])] for group in record.groups]
@@ -114,29 +109,29 @@ def result_tables(record: Record) -> list[Table]:
             [*first, *(score_text(entry[name], headings[name].unit) for name in names)]
             for first, entry in zip(firsts, entries, strict=True)
         ]
-        columns = [*header, *(headings[name].column for name in names)]
+        columns = [*header, *(headings[name].title for name in names)]
         tables += [Table(title, columns, rows)] if rows else []
     return tables
 
 
-def _mean(record: Record, name: str) -> str:
-    unit = record.headings[name].unit
-    return score_text(record.means[name], unit, record.intervals.get(name))
+def _mean(record: EvaluationResult, name: str) -> str:
+    unit = record.columns[name].unit
+    return score_text(record.scores[name], unit, record.intervals.get(name))
 
 
-def _over_all(record: Record) -> Table:
+def _over_all(record: EvaluationResult) -> Table:
     rows = [
-        [heading.column, _mean(record, name)]
-        for name, heading in record.headings.items()
+        [heading.title, _mean(record, name)]
+        for name, heading in record.columns.items()
         if record.latitude_bands or not name.endswith(SOLID_ANGLE)
     ]
     return Table("Scores", ("score", f"over all {record.noun}"), rows)
 
 
-def _per_class(record: Record) -> Table:
+def _per_class(record: EvaluationResult) -> Table:
     mean_of, headings = record.class_means, dict(_OTHER_COLUMNS)
-    headings |= {name: record.headings[mean].class_column for name, mean in mean_of.items()}
-    units = {name: record.headings[mean].unit for name, mean in mean_of.items()}
+    headings |= {name: record.columns[mean].class_title for name, mean in mean_of.items()}
+    units = {name: record.columns[mean].unit for name, mean in mean_of.items()}
     columns = [
         name
         for name in record.classes[0]
@@ -164,7 +159,7 @@ def _cell(value: Any, unit: str) -> str:
     return score_text(value, unit) if value is None or isinstance(value, float) else str(value)
 
 
-def confusion_table(record: Record) -> Table:
+def confusion_table(record: EvaluationResult) -> Table:
     """Return the confusion matrix as a heat map, in percent of the true class."""
     first = len(record.confusion) - len(record.classes)  # without the unknown class
     counts = np.asarray(record.confusion, np.float64)[first:]
@@ -178,19 +173,22 @@ def confusion_table(record: Record) -> Table:
 
 
 def write_results(
-    record: Record, folder: Path, notes: Sequence[str] = (), published: Sequence[Table] = ()
+    record: EvaluationResult,
+    folder: Path,
+    notes: Sequence[str] = (),
+    published: Sequence[Table] = (),
 ) -> None:
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
-        record: Record of the evaluation.
+        record: EvaluationResult of the evaluation.
         folder: Output folder.
         notes: Paragraphs in ``results.md`` below the headline.
         published: Tables of published scores in ``results.md``.
     """
     write_text(folder / RESULTS_FILE, record.json())
     network = {"checkpoint": record.checkpoint, "label_map": record.label_map}
-    lines = [{**entry, **network} for entry in record.classes or [record.means]]
+    lines = [{**entry, **network} for entry in record.classes or [record.scores]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
     tables = "\n".join(table.markdown() for table in (*result_tables(record), *published))
     text = "\n\n".join(["# Results", *summary_lines(record), *notes, tables])

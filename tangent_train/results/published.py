@@ -1,7 +1,7 @@
 """Published scores, beside results of the same protocol.
 
 ``published.csv`` contains published scores with their sources, one score per line, and those of
-single classes of Stanford2D3DS: in percent, or in the unit of the score, see `Heading`.
+single classes of Stanford2D3DS: in percent, or in the unit of the score, see `ScoreColumn`.
 ``protocols.yaml`` contains the facts that make scores
 comparable (`LabeledData.facts`, `Task.facts`), for each ``protocol`` of the scores. A score
 stands beside a result if all facts are the same; else the facts that differ are named.
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import yaml  # type: ignore[import-untyped]
 
-from tangent_train.results.record import Record
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.rows import Row
 from tangent_train.results.tables import Table, score_text
 
@@ -64,7 +64,7 @@ class Publication(NamedTuple):
         """Folds with a score; empty for means over all folds."""
         return tuple(dict.fromkeys(line["fold"] for line in self.lines if line["fold"]))
 
-    def differences(self, record: Record) -> tuple[str, ...]:
+    def differences(self, record: EvaluationResult) -> tuple[str, ...]:
         """Return the facts that differ from those of an evaluation, with both values."""
         published, found = facts(self.protocol), dict(record.protocol)
         found.pop("views_aligned", None)  # of the method
@@ -75,7 +75,7 @@ class Publication(NamedTuple):
         pairs = {n: (published.get(n, "–"), found.get(n, "–")) for n in {**published, **found}}
         return tuple(f"{n}: published {p}, this run {r}" for n, (p, r) in pairs.items() if p != r)
 
-    def row(self, like: Record, shown: Sequence[str] = ()) -> Row:
+    def row(self, like: EvaluationResult, shown: Sequence[str] = ()) -> Row:
         """Return a row with the headings and classes of an evaluation.
 
         Args:
@@ -111,7 +111,7 @@ class Comparison(NamedTuple):
 
     @staticmethod
     def of(
-        records: Sequence[Record], *, transfer: bool = False, shown: Sequence[str] = ()
+        records: Sequence[EvaluationResult], *, transfer: bool = False, shown: Sequence[str] = ()
     ) -> Comparison:
         """Compare evaluations with the published scores on their data sets.
 
@@ -124,7 +124,7 @@ class Comparison(NamedTuple):
         for publication in publications():
             stage, data = publication.stage, facts(publication.protocol)["data"]
             names = {line["score"] for line in publication.lines}
-            on_data = [r for r in records if r.protocol.get("data") == data and names & {*r.means}]
+            on_data = [r for r in records if r.protocol.get("data") == data and names & {*r.scores}]
             if on_data and (stage or publication.trained_on if transfer else not stage):
                 groups[min(map(publication.differences, on_data), key=len)].append(publication)
         same = groups.pop((), [])
@@ -134,30 +134,32 @@ class Comparison(NamedTuple):
         notes += [_difference(groups[some], some, records[0]) for some in nearest]
         return Comparison([publication.row(records[0], shown) for publication in same], notes)
 
-    def tables(self, like: Record) -> list[Table]:
+    def tables(self, like: EvaluationResult) -> list[Table]:
         """Return a table of the rows for one evaluation, or nothing without rows.
 
         Args:
             like: Evaluation with the headings and the fold.
         """
         rows = [row.of_fold(like.fold) if like.fold in row.folds else row for row in self.rows]
-        names = [n for n in like.headings if any(r.score(n).mean is not None for r in rows)]
+        names = [n for n in like.columns if any(r.score(n).mean is not None for r in rows)]
         cells = [
             (
                 row.label,
                 row.facts["input"],
-                *(score_text(row.score(name).mean, like.headings[name].unit) for name in names),
+                *(score_text(row.score(name).mean, like.columns[name].unit) for name in names),
             )
             for row in rows
         ]
-        header = ("", "input", *(like.headings[name].column for name in names))
+        header = ("", "input", *(like.columns[name].title for name in names))
         table = Table("Published, same protocol", header, cells, text_columns=(0, 1))
         return [table] if rows else []
 
 
-def _difference(group: Sequence[Publication], differences: Sequence[str], record: Record) -> str:
+def _difference(
+    group: Sequence[Publication], differences: Sequence[str], record: EvaluationResult
+) -> str:
     """Return a sentence on published scores with the same differences from an evaluation."""
-    sign = -1 if record.headings[record.main].better == "lower" else 1
+    sign = -1 if record.columns[record.main].better == "lower" else 1
     named = [(publication.scores(record.main), publication) for publication in group]
     scores, best = max(named, key=lambda pair: fmean([sign * s for s in pair[0]] or [-math.inf]))
     text = ", ".join(f"{score:g}" for score in scores)
@@ -196,16 +198,18 @@ def _read(name: str) -> str:
     return files("tangent_train.results").joinpath(name).read_text(encoding="utf-8")
 
 
-def _record(like: Record, fold: str, by_score: Mapping[str, Mapping[str, str]]) -> Record:
+def _record(
+    like: EvaluationResult, fold: str, by_score: Mapping[str, Mapping[str, str]]
+) -> EvaluationResult:
     def value(score: str, column: str) -> float | None:
         text = by_score.get(score, {}).get(column)
-        whole = 100 if like.headings[score].unit == "%" else 1
+        whole = 100 if like.columns[score].unit == "%" else 1
         return round(float(text) / whole, 6) if text else None
 
     classes = [
         {"class": c, **{name: value(mean, c) for name, mean in like.class_means.items()}}
         for c in like.class_names
     ]
-    means = {name: value(name, "mean") for name in like.means}
+    means = {name: value(name, "mean") for name in like.scores}
     settings = {"data.fold": int(fold) if fold else None}
-    return Record("", 0, like.headings, means, classes, settings=settings)
+    return EvaluationResult("", 0, like.columns, means, classes, settings=settings)

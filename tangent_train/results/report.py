@@ -11,8 +11,9 @@ from typing import Any
 
 from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.files import csv_text, write_bytes, write_text
+from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.results.chart import grid_png, report_png
-from tangent_train.results.record import SOLID_ANGLE, Band, Record
+from tangent_train.results.evaluation_result import Band, EvaluationResult
 from tangent_train.results.rows import Row
 from tangent_train.results.tables import Table, score_text
 
@@ -60,7 +61,7 @@ class Report:
         return {view: {c: rows.get(c, empty) for c in conditions} for view, rows in grid.items()}
 
     @property
-    def first(self) -> Record:
+    def first(self) -> EvaluationResult:
         """First record; all records have the same scores and classes."""
         return self.rows[0].records[0]
 
@@ -68,7 +69,7 @@ class Report:
     def cell_score(self) -> str:
         """Name of the score in the cells: the main score, by solid angle if that exists."""
         by_angle = self.first.main + SOLID_ANGLE
-        return by_angle if by_angle in self.first.headings else self.first.main
+        return by_angle if by_angle in self.first.columns else self.first.main
 
     def tables(self) -> list[Table]:
         """Return the tables of views in conditions, of means, of classes and of latitude bands."""
@@ -76,13 +77,13 @@ class Report:
         tables = [*self._views(), self._overall(), *self._per_class()]
         if banded:
             bands, name = banded[0].bands, self.first.main
-            heading = self.first.headings[name]
+            heading = self.first.columns[name]
             rows = [
                 (row.label, *(score_text(row.score(name, b).mean, heading.unit) for b in bands))
                 for row in banded
             ]
             header = ("", *(f"{south:g}° … {north:g}°" for south, north in bands))
-            tables.append(Table(f"{heading.column} by latitude", header, rows))
+            tables.append(Table(f"{heading.title} by latitude", header, rows))
         return tables
 
     def _views(self) -> Iterator[Table]:
@@ -94,15 +95,15 @@ class Report:
             (view, *(self._cell(row, name, 0) for row in by_condition.values()))
             for view, by_condition in grid.items()
         ]
-        title = f"{self.title}: {self.first.headings[name].column}"
+        title = f"{self.title}: {self.first.columns[name].title}"
         yield Table(title, ("", *conditions), rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
 
     @property
     def _legend(self) -> str:
-        return "Percent. " * all(h.unit == "%" for h in self.first.headings.values()) + _LEGEND
+        return "Percent. " * all(h.unit == "%" for h in self.first.columns.values()) + _LEGEND
 
     def _overall(self) -> Table:
-        scores = self.first.main_headings
+        scores = self.first.main_columns
         names = dict.fromkeys(name for row in self.rows for name in row.facts)
         facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
         alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]
@@ -111,7 +112,7 @@ class Report:
         texts = range(len(columns))
         for name, heading in scores.items():
             cells = [self._cell(row, name, len(row.folds)) for row in self.rows]
-            columns.append((heading.column, cells))
+            columns.append((heading.title, cells))
             if self.compared and not name.endswith(SOLID_ANGLE):
                 columns.append(("change", [_change(row.kept(name).mean) for row in self.rows]))
         header, cells_of = zip(*columns, strict=True)
@@ -131,7 +132,7 @@ class Report:
                 and any(row.score(name, c).mean is not None for c in classes)
             ]
             if rows:
-                title = self.first.headings[mean].class_column
+                title = self.first.columns[mean].class_title
                 yield Table(f"{title[:1].upper()}{title[1:]}", ("", *classes), rows)
 
     def _cell(self, row: Row, name: str, folds: int, part: str | None = None) -> str:
@@ -140,7 +141,7 @@ class Report:
         if score.mean is None:
             return "–"
         mean = name if part is None else self.first.class_means[name]
-        text = partial(score_text, unit=self.first.headings[mean].unit)
+        text = partial(score_text, unit=self.first.columns[mean].unit)
         over_folds = "" if score.over_folds is None else f" ± {text(score.over_folds)}"
         over_seeds = "" if score.over_seeds is None else f" (± {text(score.over_seeds)})"
         count = f" of {score.folds}" if score.folds < folds else ""
@@ -171,7 +172,7 @@ class Report:
         columns = list(dict.fromkeys(key for figure in figures for key in figure))
         write_text(folder / f"{name}.csv", csv_text(columns, figures))
         if self.grid:
-            heading = self.first.headings[self.cell_score]
+            heading = self.first.columns[self.cell_score]
             title = f"{self.title}: {heading.text}"
             png = grid_png(title, self.grid, self.cell_score, heading.unit)
         else:
@@ -189,12 +190,12 @@ class Report:
             for fold, part in [*scopes, ("mean", row)]:
                 facts = {"row": row.label, **row.facts, "fold": fold}
                 entries: list[tuple[str, str | Band | None, str]]
-                entries = [("mean", None, name) for name in first.headings]
+                entries = [("mean", None, name) for name in first.columns]
                 entries += [(c, c, name) for c in first.class_names for name in first.class_means]
                 entries += [
                     ("mean", band, name)
                     for band in row.bands
-                    for name in first.headings
+                    for name in first.columns
                     if name in row.records[0].latitude_bands[0]
                 ]
                 for class_name, section, name in entries:

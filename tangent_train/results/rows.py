@@ -17,8 +17,9 @@ from typing import Any, NamedTuple
 
 from tangent_train.config.setting_rules import may_differ
 from tangent_train.errors import DataError
+from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.metrics.segmentation import Interval
-from tangent_train.results.record import RESULTS_FILE, SOLID_ANGLE, Band, Record
+from tangent_train.results.evaluation_result import RESULTS_FILE, Band, EvaluationResult
 
 
 class Statistic(NamedTuple):
@@ -60,7 +61,7 @@ class Row:
     """
 
     label: str
-    records: tuple[Record, ...]
+    records: tuple[EvaluationResult, ...]
     facts: Mapping[str, str] = field(default_factory=dict)
     partner: Row | None = None
     published: bool = False
@@ -153,7 +154,7 @@ def average(values: Iterable[tuple[int | None, float]]) -> Statistic:
     )
 
 
-def check_alike(records: Sequence[Record]) -> None:
+def check_alike(records: Sequence[EvaluationResult]) -> None:
     """Check that evaluations have the same scores and the same classes.
 
     Raises:
@@ -161,7 +162,7 @@ def check_alike(records: Sequence[Record]) -> None:
     """
     first = records[0]
     for record in records:
-        if (record.headings, record.class_names) != (first.headings, first.class_names):
+        if (record.columns, record.class_names) != (first.columns, first.class_names):
             raise DataError(
                 record.folder / RESULTS_FILE,
                 found=_contents(record),
@@ -170,12 +171,12 @@ def check_alike(records: Sequence[Record]) -> None:
             )
 
 
-def _contents(record: Record) -> str:
+def _contents(record: EvaluationResult) -> str:
     classes = f", classes {', '.join(record.class_names)}" * bool(record.classes)
-    return f"scores {', '.join(record.headings)}{classes}"
+    return f"scores {', '.join(record.columns)}{classes}"
 
 
-def group_runs(records: Sequence[Record]) -> list[Row]:
+def group_runs(records: Sequence[EvaluationResult]) -> list[Row]:
     """Group evaluations that differ only in fold and seed.
 
     Args:
@@ -189,7 +190,7 @@ def group_runs(records: Sequence[Record]) -> list[Row]:
         DataError: The runs have different scores or classes.
     """
     check_alike(records)
-    members: dict[str, list[Record]] = defaultdict(list)
+    members: dict[str, list[EvaluationResult]] = defaultdict(list)
     for record in records:
         members[json.dumps(_identity(record), sort_keys=True, default=str)].append(record)
     labels = _labels([group[0] for group in members.values()])
@@ -199,7 +200,7 @@ def group_runs(records: Sequence[Record]) -> list[Row]:
     ]
 
 
-def _identity(record: Record) -> dict[str, Any]:
+def _identity(record: EvaluationResult) -> dict[str, Any]:
     """Return the settings that are equal in all runs of a row."""
     # A network without settings is identified by its file.
     network = {"checkpoint": record.checkpoint} if "network" in record.settings else {}
@@ -211,7 +212,7 @@ def _identity(record: Record) -> dict[str, Any]:
     }
 
 
-def _labels(firsts: Sequence[Record], shown: int | None = 3) -> list[str]:
+def _labels(firsts: Sequence[EvaluationResult], shown: int | None = 3) -> list[str]:
     """Return names with the settings that differ: the first few, or all if they are needed."""
     labels = []
     for record in firsts:

@@ -17,12 +17,12 @@ from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import Metric, SumMetric
 
 from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.checkpoints.content import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.scores import network_for_views
 from tangent_train.errors import SettingError, at_least
-from tangent_train.results.evaluation import plain_scores
+from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
 from tangent_train.results.html.page import EncodedImage, encode_image
-from tangent_train.results.record import Heading, Record
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
@@ -65,7 +65,7 @@ class Task(lightning.LightningModule, ABC):
         monitor: Score on the validation split that selects the best epoch.
         depth_kind: Kind of the network's output, if it predicts distances; else None.
         takes: Input and output of a network for this task, for messages.
-        headings: Headings of the scores over a split, in the order of the tables.
+        columns: Names and units of the scores over a split, in the order of the tables.
         metric: Metric of a split, see `build_metric`.
         result: Value of `metric` after the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
@@ -80,7 +80,7 @@ class Task(lightning.LightningModule, ABC):
     predicts: ClassVar[str] = ""
     monitor: ClassVar[str]
     takes: ClassVar[str]
-    headings: ClassVar[Mapping[str, Heading]]
+    columns: ClassVar[Mapping[str, ScoreColumn]]
     depth_kind: DepthKind | None = None
     result: Any
     evaluated: int
@@ -149,12 +149,12 @@ class Task(lightning.LightningModule, ABC):
 
     @classmethod
     def mode_of(cls, monitor: str) -> Literal["max", "min"]:
-        """Return ``min`` for a loss and for errors, see `Heading.better`; else ``max``.
+        """Return ``min`` for a loss and for errors, see `ScoreColumn.better`; else ``max``.
 
         Args:
             monitor: Name of a logged value, e.g. ``val/miou``.
         """
-        heading = cls.headings.get(monitor.partition("/")[2])
+        heading = cls.columns.get(monitor.partition("/")[2])
         is_error = heading is not None and heading.better == "lower"
         return "min" if is_error or monitor.endswith("loss") else "max"
 
@@ -200,16 +200,16 @@ class Task(lightning.LightningModule, ABC):
         """
         return {}
 
-    def record(self, result: Any, noun: str) -> Record:
-        """Return the record of the last evaluation: `logged_scores` under their `headings`.
+    def evaluation_result(self, result: Any, noun: str) -> EvaluationResult:
+        """Return the last evaluation: `logged_scores` under their `columns`.
 
         Args:
             result: Value of `metric`.
             noun: Plural name of the images: panoramas, photos, shapes.
         """
         scores = plain_scores(self.logged_scores(result))
-        means = scores | {name: None for name in self.headings if name not in scores}
-        return Record(noun, self.evaluated, self.headings, means)
+        means = scores | {name: None for name in self.columns if name not in scores}
+        return EvaluationResult(noun, self.evaluated, self.columns, means)
 
     @property
     def facts(self) -> dict[str, str]:
@@ -435,9 +435,9 @@ class Task(lightning.LightningModule, ABC):
             for total in self._losses:
                 total.reset()
         scores = self.logged_scores(self.result)
-        if scores.keys() - self.headings.keys():
-            name = f"headings of {type(self).__name__}"
-            raise SettingError(name, found=[*self.headings], expected=f"those of {[*scores]}")
+        if scores.keys() - self.columns.keys():
+            name = f"columns of {type(self).__name__}"
+            raise SettingError(name, found=[*self.columns], expected=f"those of {[*scores]}")
         # All processes have the same scores, which the mean over processes does not change.
         for name, score in scores.items():
             key = f"{stage}/{name}"

@@ -10,7 +10,7 @@ import pytest
 import torch
 from lightning.pytorch.demos.boring_classes import BoringModel
 
-from datamodules.core import progress
+from tangent_train import progress
 from tangent_train.callbacks.progress import ProgressBar
 
 

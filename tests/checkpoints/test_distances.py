@@ -11,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from datamodules.core.labels import DISTANCE
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import (
     DistanceNetwork,
     along_rays,
@@ -20,8 +19,9 @@ from tangent_train.checkpoints.distances import (
     from_distance,
     is_disparity,
 )
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import describe_network, load_network
 from tangent_train.checkpoints.scores import size_multiple_of
-from tangent_train.checkpoints.trained import describe_network, load_trained
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
 from tangent_train.inference.label_maps import load_label_map, map_classes
@@ -134,7 +134,7 @@ def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path:
     """The checkpoint of a run contains no kind: it is that of `DepthTask`."""
     changes = {} if kind is None else {"depth_kind": kind}
     path = write_depth_checkpoint(tmp_path / "net.ckpt", **changes)
-    trained, described = load_trained(path), describe_network(path)
+    trained, described = load_network(path), describe_network(path)
     assert described is not None
     assert trained.depth_kind == described.depth_kind == (kind or "log_distance")
     assert (trained.predicts, trained.class_names, trained.size_multiple) == (DISTANCE, (), 1)
@@ -143,4 +143,4 @@ def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path:
         map_classes(trained, load_label_map("ade20k_to_stanford2d3ds"), "unknown")
     path = write_depth_checkpoint(tmp_path / "wrong.ckpt", depth_kind="inverse")
     with pytest.raises(DataError, match="depth_kind='inverse'"):
-        load_trained(path)
+        load_network(path)

@@ -31,7 +31,7 @@ from tangent_train.cli.compose import path_text
 from tangent_train.cli.stored import stored_run
 from tangent_train.cli.trials import find_fault
 from tangent_train.console import print_text
-from tangent_train.results.record import load_record
+from tangent_train.results.evaluation_result import load_result
 from tangent_train.results.tables import Table
 from tangent_train.tasks.segmentation import SegmentationTask
 from tests.cli.tiny_runs import SETTINGS, SMALL_ROOMS, Run, results
@@ -183,7 +183,7 @@ def test_an_evaluation_repeats_the_figures_exactly(
     shutil.copy(run_folder / "checkpoints" / "best.ckpt", odd)
     run("evaluate", f"checkpoint={odd}", rooms, "hydra.run.dir=again")
     assert results(tmp_path / "again") == results(run_folder)
-    again, before = (load_record(folder).settings for folder in (tmp_path / "again", run_folder))
+    again, before = (load_result(folder).settings for folder in (tmp_path / "again", run_folder))
     differing = {n for n in again.keys() | before.keys() if again.get(n) != before.get(n)}
     assert differing == {"checkpoint", "trainer.accelerator"}, "the processor is chosen anew"
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tests.cli.tiny_runs import Run
 from tests.tasks.small_networks import save_checkpoint
 
@@ -33,7 +33,7 @@ def test_the_suffix_selects_the_format(
         r"largest difference from PyTorch: \d\.\de[+-]\d\d of the range of the scores\n",
         printed,
     )
-    assert load_trained(path).in_channels == 4
+    assert load_network(path).in_channels == 4
     kept = [p for p in tmp_path.rglob("*") if p.is_file()]
     assert kept == [path]  # and no folder of Hydra's
 

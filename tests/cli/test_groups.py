@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from datamodules.core.loading import gathered_order, share_of_process
-from tangent_train.results.record import load_record
+from tangent_train.results.evaluation_result import load_result
 from tests.cli.tiny_runs import Run, results
 from tests.datamodules.cityscapes.street_format import write_synpass
 
@@ -26,9 +26,9 @@ def test_weathers_and_times_are_rows_of_the_results(run: Run, tmp_path: Path) ->
     alone = results(tmp_path / "fog")
     assert found[1]["images"] == alone["images"] == 2
     for name in ("miou", "macc", "miou_solid_angle", "macc_solid_angle"):
-        assert found[1][name] == pytest.approx(alone[name], abs=1e-12)
+        assert found[1][name] == pytest.approx(alone["scores"][name], abs=1e-12)
     assert found[1]["miou"] != found[3]["miou"]
-    assert load_record(tmp_path / "whole").groups == found
+    assert load_result(tmp_path / "whole").groups == found
     table = (tmp_path / "whole" / "results.md").read_text().partition("By group")[2]
     assert f"| fog | 2 | {100 * found[1]['miou']:.1f} |" in table
 

@@ -17,7 +17,7 @@ from torchvision import models as torchvision_models
 
 import tangent_train as tt
 from models import UNet
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.inference.engine import Predictor
@@ -59,7 +59,7 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     printed = capsys.readouterr().out
     assert "3 classes: dark, green, bright\n" in printed
     assert f"background: {'written as unknown' if wins else 'never win'}" in printed
-    trained = load_trained(here / "ours.onnx")
+    trained = load_network(here / "ours.onnx")
     assert trained.class_names == ("unknown", "dark", "green", "bright")
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255], [110, 90, 110]], np.uint8)
@@ -83,7 +83,7 @@ def test_a_file_for_images_that_are_not_square(
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
     assert f"image size: {size[1]} × {size[0]} (width × height)\n" in capsys.readouterr().out
-    trained = load_trained(here / "ours.onnx")
+    trained = load_network(here / "ours.onnx")
     assert trained.fixed_size == size
     assert trained.image_size == (max(size), max(size))
     with pytest.raises(SystemExit, match=f"found 65 × 64 .*expected {size[1]} × {size[0]} .*the"):
@@ -103,7 +103,7 @@ def test_any_network_is_given_one_size_if_asked(here: Path, run: Run) -> None:
     torch.save({"model": {f"module.{n}": t for n, t in network.state_dict().items()}}, "state.pt")
     given = ("network=unet_small", "weights=state.pt", "classes=classes.json", "normalization=unit")
     run("import", *given, "image_size=[32,64]", "output=net.ckpt")
-    trained = load_trained(here / "net.ckpt")
+    trained = load_network(here / "net.ckpt")
     assert (trained.fixed_size, trained.image_size) == ((32, 64), (64, 64))
     for wrong in ("image_size=0", "image_size=[32,64,3]"):
         with pytest.raises(SystemExit, match=r"size: found .*; expected \[rows,columns\], or"):
@@ -123,7 +123,7 @@ def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: P
     file.parent.mkdir(parents=True, exist_ok=True)
     torch.save(network.state_dict(), file)
     run("import", *given)
-    assert load_trained(here / "net.ckpt").class_names[1] == "__background__"
+    assert load_network(here / "net.ckpt").class_names[1] == "__background__"
 
 
 def _no_internet(*_: object, **__: object) -> None:
@@ -137,14 +137,14 @@ def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: 
     given = ("weights=state.pt", "classes=classes.json", "normalization=imagenet")
     size = ("levels=6", "base_level=1", "unknown_classes=[background]")
     run("import", "network=unet_small", *given, *size, "output=net.ckpt")
-    trained = load_trained(here / "net.ckpt")
+    trained = load_network(here / "net.ckpt")
     assert trained.normalization.mean == (0.485, 0.456, 0.406)
     images = torch.randn(2, 3, 32, 48)
     with torch.no_grad():
         expected = network(images)[:, [1, 2, 3, 0]]
         torch.testing.assert_close(trained.network(images), expected)
         run("export", "checkpoint=net.ckpt", "output=again.safetensors")
-        again = load_trained(here / "again.safetensors")
+        again = load_network(here / "again.safetensors")
         assert again.class_names == trained.class_names
         torch.testing.assert_close(again.network(images), expected)
 
@@ -161,9 +161,9 @@ def test_a_network_of_ones_own_is_imported(here: Path, run: Run, capsys: Capture
     run("import", "--config-dir", "own", "network=mine", *given)
     scores_by_hand = "tests.tasks.small_networks.with_statistics"
     assert f"trust=[{scores_by_hand}]" in capsys.readouterr().out
-    assert load_trained(here / "net.ckpt", [scores_by_hand]).class_names == ("unknown", *NAMES)
+    assert load_network(here / "net.ckpt", [scores_by_hand]).class_names == ("unknown", *NAMES)
     with pytest.raises(DataError, match=f"trust={scores_by_hand}"):
-        load_trained(here / "net.ckpt")
+        load_network(here / "net.ckpt")
 
 
 def test_torchvision_gives_the_scores_of_its_own_transform(
@@ -178,7 +178,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     run("import", *arguments, "output=net.ckpt")
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
-    trained = load_trained(here / "net.ckpt")
+    trained = load_network(here / "net.ckpt")
     assert (trained.image_size, trained.level) == ((520, 520), 9)
     photo = torch.randint(0, 256, (3, 520, 520), dtype=torch.uint8)
     mean, std = (torch.tensor(v)[:, None, None] for v in vars(trained.normalization).values())
@@ -209,7 +209,7 @@ def test_an_onnx_file_predicts_depth(
     assert "depth: metric_z\nthe network returns z-depth in meters\n" in printed
     assert "panoramas: 16 views of 32 × 32 (130° wide" in printed
     assert printed.splitlines()[-1].startswith("panoramas"), "no remarks"
-    trained = load_trained(here / "ours.onnx")
+    trained = load_network(here / "ours.onnx")
     found = trained.depth_kind, trained.predicts, trained.class_names
     assert found == ("metric_z", "distance", ())
     images = torch.rand(2, 3, 32, 32)
@@ -233,7 +233,7 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
         "it returns negative numbers, unusual for relative_disparity, from -"
         in capsys.readouterr().out
     )
-    trained = load_trained(here / "net.ckpt")
+    trained = load_network(here / "net.ckpt")
     assert trained.depth_kind == "relative_disparity"
     images = torch.randn(2, 3, 32, 32)
     with torch.no_grad():
@@ -277,7 +277,7 @@ def test_settings_of_depth_and_of_classes_exclude_each_other(
 # Default views.
 
 
-def _angles_deg(trained: TrainedNetwork) -> list[int]:
+def _angles_deg(trained: LoadedNetwork) -> list[int]:
     """Width of the views of each level."""
     section = trained.representation
     grids = [TangentGrid(section["base_level"], n, section["dim"]) for n in section["levels"]]
@@ -309,9 +309,9 @@ def test_an_onnx_file_of_any_size_gets_wide_views(
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, *size))
     run("import", *OF_ONNX, "output=ours.onnx")
     assert f"panoramas: 16 views of {side} × {side} (130° wide" in capsys.readouterr().out
-    assert load_trained(here / "ours.onnx").level == levels[0]
+    assert load_network(here / "ours.onnx").level == levels[0]
     run("import", *OF_ONNX, "output=tangent.onnx", "views=tangent")
-    trained = load_trained(here / "tangent.onnx")
+    trained = load_network(here / "tangent.onnx")
     section = trained.representation
     assert (section["base_level"], section["levels"], section["dim"]) == (0, levels, side)
     assert trained.level == levels[0]
@@ -349,7 +349,7 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
     run("import", *OF_ONNX, "output=plain.onnx")
     run("import", *OF_ONNX, "output=level.onnx", "views=horizontal_economy")
     assert "panoramas: 12 views of 32 × 32 (130° wide, 0.1 pixels" in capsys.readouterr().out
-    trained = load_trained(here / "level.onnx")
+    trained = load_network(here / "level.onnx")
     assert (trained.level, trained.photo_side, trained.image_size) == (5, 32, (32, 32))
     assert trained.representation["dim"] == 32
     rgb = _write_room()
@@ -372,7 +372,7 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         "tangent_economy_16": (40, (32, 32)),
     }
     for option, (count, size) in sizes.items():
-        views = PanoramaViews(load_trained(here / "plain.onnx"), views=option)
+        views = PanoramaViews(load_network(here / "plain.onnx"), views=option)
         assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
     twice = PanoramaViews(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
     assert twice.description().startswith("36 views of 32 × 32 (110° wide")
@@ -417,11 +417,11 @@ def test_an_unknown_size_is_512(here: Path, run: Run) -> None:
     torch.save(UNet(3, 4, (16, 32, 64, 128, 256)).state_dict(), here / "state.pt")
     given = ("network=unet_small", "weights=state.pt", "classes=classes.json", "normalization=unit")
     run("import", *given, "output=net.ckpt")
-    trained = load_trained(here / "net.ckpt")
+    trained = load_network(here / "net.ckpt")
     assert (trained.fixed_size, trained.image_size) == (None, (512, 512))
     assert (trained.level, trained.representation["dim"]) == (9, 512)
     run("import", *given, "image_size=256", "output=small.ckpt")
-    assert load_trained(here / "small.ckpt").level == 8
+    assert load_network(here / "small.ckpt").level == 8
     assert sum(map(len, PanoramaViews(trained).representation.view_sets())) == 16
     for settings, (count, side) in {
         (None, None): (40, 512),
@@ -448,7 +448,7 @@ def test_levels_and_base_level_of_an_import(
     given: tuple[str, ...], expected: tuple[int, list[int], int], here: Path, run: Run
 ) -> None:
     run("import", *OF_ONNX, *given, "output=ours.onnx")
-    section = load_trained(here / "ours.onnx").representation
+    section = load_network(here / "ours.onnx").representation
     assert (section["base_level"], section["levels"], section["dim"]) == expected
 
 
@@ -462,7 +462,7 @@ def test_photos_keep_their_angular_resolution(
     """Crops of photos do not have the angle of the views of panoramas."""
     write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, size, size))
     run("import", *OF_ONNX, f"fov={fov}", "output=ours.onnx")
-    trained = load_trained(here / "ours.onnx")
+    trained = load_network(here / "ours.onnx")
     assert trained.photo_level == level
     camera = camera_matrix_from_fov(fov, (size, size))
     (views,) = PhotoViews(trained)(
@@ -538,6 +538,6 @@ def test_unusable_files_are_one_clear_message(
 def test_classes_by_place_and_the_kind_of_scores(here: Path, run: Run) -> None:
     (here / "classes.json").write_text(json.dumps({"3": "d", "0": "a", "1": "b", "2": "c"}))
     run("import", *OF_ONNX, "output=ours.onnx", "scores=sigmoid_logits")
-    trained = load_trained(here / "ours.onnx")
+    trained = load_network(here / "ours.onnx")
     assert trained.class_names == ("unknown", "a", "b", "c", "d")
     assert (trained.score_kind, trained.groups) == ("sigmoid_logits", [[0], [1], [2], [3], [4]])

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import SMALL_ROOMS, Run
 from tests.decoded import decoded
@@ -51,16 +51,16 @@ def test_a_task_of_ones_own_trains_evaluates_reports_and_resumes(
     assert scores[best["epoch"]] == min(scores), "the smallest error is the best"
     assert json.loads((folder / "validation.json").read_text())["best"] == min(scores)
     results = json.loads((folder / "results.json").read_text())
-    assert 0 < results["mae"] < 1
+    assert 0 < results["scores"]["mae"] < 1
     assert (results["noun"], results["images"], results["classes"]) == ("panoramas", 2, [])
-    text = f"mean absolute error {results['mae']:.3g} over 2 panoramas"
+    text = f"mean absolute error {results['scores']['mae']:.3g} over 2 panoramas"
     assert text in (folder / "results.md").read_text()
     assert text in (folder / "report.html").read_text()
     (panel,) = (folder / "panels").iterdir()
     assert (decoded(panel.read_bytes()) == (255, 0, 0)).all(-1).any(), "its own picture"
 
     run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", TRUST, "hydra.run.dir=again")
-    assert json.loads(Path("again/results.json").read_text())["mae"] == results["mae"]
+    assert json.loads(Path("again/results.json").read_text())["scores"]["mae"] == results["scores"]["mae"]
     upright = ["data.upright=auto", "hydra.run.dir=upright"]  # by the images alone
     run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", TRUST, *upright)
     assert Path("upright/results.json").is_file()
@@ -69,11 +69,11 @@ def test_a_task_of_ones_own_trains_evaluates_reports_and_resumes(
     assert "mean absolute error" in capsys.readouterr().out
     with Path("report/report.csv").open(newline="") as file:
         lines = [(row["fold"], row["score"], float(row["mean"])) for row in csv.DictReader(file)]
-    assert lines == [(fold, "mae", results["mae"]) for fold in ("1", "mean")]
+    assert lines == [(fold, "mae", results["scores"]["mae"]) for fold in ("1", "mean")]
     assert Path("report/report.png").stat().st_size > 5000
 
     run("train", f"resume={folder}", "trainer.max_epochs=4", TRUST)
     assert read_checkpoint(folder / "checkpoints" / "last.ckpt")["epoch"] == 3
     assert json.loads((folder / "validation.json").read_text())["best"] <= min(scores)
     with pytest.raises(DataError, match=r"predicts something else; expected .* pixel_classes"):
-        load_trained(folder / "checkpoints" / "last.ckpt", ["toy_regression.ShareOfClass"])
+        load_network(folder / "checkpoints" / "last.ckpt", ["toy_regression.ShareOfClass"])

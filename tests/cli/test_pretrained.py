@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.pretrained import with_pretrained_network
 from tangent_train.cli.run import build
 from tangent_train.config.build import build_from_config
@@ -86,7 +86,7 @@ def test_the_network_is_the_file_s_unless_one_is_typed(
     monkeypatch: Patch,
     capsys: Capture,
 ) -> None:
-    export_network(load_trained(imported), tmp_path / "net.safetensors")
+    export_network(load_network(imported), tmp_path / "net.safetensors")
     for path in (imported, tmp_path / "net.safetensors"):
         settings, source = _begun(monkeypatch, path, *overrides, "data.inputs=[rgb]")
         assert settings["network"]["widths"] == widths
@@ -171,7 +171,7 @@ def test_fine_tuning_leaves_a_run_of_its_own(
     choices = content["config"]["choices"]
     assert "network" not in choices, "it is of no option"
     assert choices["experiment"] == "rooms/demo"
-    trained = load_trained(checkpoint)
+    trained = load_network(checkpoint)
     assert trained.class_names == tuple(content["class_names"])
     assert trained.normalization == Normalization.of("imagenet", 3)
     run("evaluate", f"checkpoint={checkpoint}", rooms, "hydra.run.dir=again")

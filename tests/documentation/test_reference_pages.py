@@ -9,11 +9,12 @@ from dataclasses import fields
 from itertools import chain
 from pathlib import Path
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import TangentGrid
 from tangent_train.inference.label_maps import __file__ as label_maps
 from tangent_train.io.camera_files import CameraFile, write_cameras
-from tangent_train.results.record import Heading, Record
+from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.results.evaluation_result import EvaluationResult
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
@@ -50,12 +51,12 @@ def test_data_sets_names_every_option() -> None:
 
 
 def test_file_formats_names_every_field_of_results() -> None:
-    record = Record("panoramas", 1, {"miou": Heading("mIoU")}, {"miou": 0.5})
+    record = EvaluationResult("panoramas", 1, {"miou": ScoreColumn("mIoU")}, {"miou": 0.5})
     assert not missing(set(json.loads(record.json())), "file_formats.md")
 
 
 def test_file_formats_names_every_field_of_an_exported_network() -> None:
-    names = {field.name for field in fields(TrainedNetwork)} - {"inner", "source"}
+    names = {field.name for field in fields(LoadedNetwork)} - {"module", "source"}
     assert not missing(names, "file_formats.md")
 
 

@@ -146,7 +146,7 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         batch.rotation[0].numpy(),
         area=SphereArea.of_numbers(batch.area[0].numpy()),
     )
-    trained = trained_network(KINDS[of], inner=network, fill="reflect")
+    trained = trained_network(KINDS[of], module=network, fill="reflect")
     views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"))
     if "rotations" in KINDS[of]:
         views = PanoramaViews(trained, None, None, views.blend, 2)

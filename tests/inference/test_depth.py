@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 import tangent_train as tt
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import from_distance, is_metric
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
@@ -176,10 +176,10 @@ class RedIsFar(nn.Module):
         return from_distance(distance, self.kind, self.lengths)
 
 
-def depth_network(kind: DepthKind = "metric_distance", **changes: Any) -> TrainedNetwork:
+def depth_network(kind: DepthKind = "metric_distance", **changes: Any) -> LoadedNetwork:
     """Return a network whose distance in meters is 4 · red (0 to 1), times a scale per view."""
     settings: dict[str, Any] = {
-        "inner": RedIsFar(kind),
+        "module": RedIsFar(kind),
         "class_names": (),
         "depth_kind": kind,
         "normalization": Normalization([0.0] * 3, [1.0] * 3),
@@ -245,9 +245,9 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
     return loaded(depth_network(), monkeypatch)
 
 
-def loaded(trained: TrainedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Network:
+def loaded(trained: LoadedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Network:
     """Return a network as `load` does, without a file."""
-    monkeypatch.setattr("tangent_train.inference.network.load_trained", lambda *_: trained)
+    monkeypatch.setattr("tangent_train.inference.network.load_network", lambda *_: trained)
     return tt.load("net.ckpt", **settings)
 
 

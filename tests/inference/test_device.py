@@ -9,7 +9,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage
@@ -55,11 +55,11 @@ CASES: dict[str, tuple[dict[str, Any], tuple[str, ...], InputImage, dict[str, An
 }
 
 
-def _case(name: str) -> tuple[TrainedNetwork, InputImage, Any]:
+def _case(name: str) -> tuple[LoadedNetwork, InputImage, Any]:
     representation, inputs, image, settings = CASES[name]
     network = torch.nn.Conv2d(sum(INPUTS[name] for name in inputs), 3, 1).eval()
     channels = 4 if "depth" in inputs else 3
-    trained = trained_network(representation, channels, inner=network, inputs=inputs)
+    trained = trained_network(representation, channels, module=network, inputs=inputs)
     kind = PanoramaViews if image.camera_matrix is None else PhotoViews
     return trained, image, kind(trained, **settings)
 

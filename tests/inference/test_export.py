@@ -20,7 +20,7 @@ from safetensors.torch import save_file
 
 from models import UNet, initialize
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.export import SUFFIXES, export_network
 from tests.inference.trained import TANGENT
@@ -29,13 +29,13 @@ from tests.tasks.small_networks import NAMES, UNET, small_trained
 
 
 @pytest.fixture(scope="module")
-def trained() -> TrainedNetwork:
+def trained() -> LoadedNetwork:
     """A small UNet."""
     return small_trained()
 
 
 @pytest.fixture(scope="module")
-def files(trained: TrainedNetwork, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def files(trained: LoadedNetwork, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """Its exported files by suffix; tests must not change them."""
     folder = tmp_path_factory.mktemp("exported")
     paths = {suffix: folder / f"net{suffix}" for suffix in SUFFIXES}
@@ -53,7 +53,7 @@ def _metadata(path: Path) -> Any:
 
 
 def test_onnxruntime_computes_what_pytorch_does(
-    trained: TrainedNetwork, files: dict[str, Path]
+    trained: LoadedNetwork, files: dict[str, Path]
 ) -> None:
     session = onnxruntime.InferenceSession(files[".onnx"], providers=["CPUExecutionProvider"])
     assert [i.name for i in session.get_inputs()] == ["images"]
@@ -66,13 +66,13 @@ def test_onnxruntime_computes_what_pytorch_does(
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_everything_known_of_a_network_comes_back(
-    suffix: str, trained: TrainedNetwork, files: dict[str, Path]
+    suffix: str, trained: LoadedNetwork, files: dict[str, Path]
 ) -> None:
-    path, again = files[suffix], load_trained(files[suffix])
+    path, again = files[suffix], load_network(files[suffix])
     known = ("class_names", "inputs", "normalization", "level", "representation", "image_size")
     for name in (*known, "size_multiple", "fixed_size", "fill"):
         assert getattr(again, name) == getattr(trained, name)
-    assert isinstance(again.inner, OnnxNetwork) == (suffix == ".onnx")
+    assert isinstance(again.module, OnnxNetwork) == (suffix == ".onnx")
     assert not again.network.training
     assert path.stat().st_mode & 0o777 == 0o644
     assert _metadata(path) == {
@@ -99,8 +99,8 @@ def test_tensors_keep_their_names_for_other_programs(tmp_path: Path) -> None:
     trained.network.to(memory_format=torch.channels_last)
     path = tmp_path / "net.safetensors"
     export_network(trained, path)
-    assert isinstance(trained.inner, UNet)
-    config_section = trained.inner.state_dict()
+    assert isinstance(trained.module, UNet)
+    config_section = trained.module.state_dict()
     written = load_file(path)
     assert written.keys() == config_section.keys()
     for name, tensor in config_section.items():
@@ -113,12 +113,12 @@ def test_only_a_safetensors_file_can_be_exported_again(
 ) -> None:
     trained, trust = small_trained(config_section("Tied")), config_section("Tied").values()
     export_network(trained, tmp_path / "net.safetensors")
-    export_network(load_trained(tmp_path / "net.safetensors", trust), tmp_path / "net.onnx")
+    export_network(load_network(tmp_path / "net.safetensors", trust), tmp_path / "net.onnx")
     images = some_images(trained, 2, (32, 36))
-    scores = load_trained(tmp_path / "net.onnx").network(images).detach()
+    scores = load_network(tmp_path / "net.onnx").network(images).detach()
     assert_same(scores, scores_of(trained, images))
     with pytest.raises(SettingError, match="checkpoint: found an exported network"):
-        export_network(load_trained(files[".onnx"]), tmp_path / "x.onnx")
+        export_network(load_network(files[".onnx"]), tmp_path / "x.onnx")
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -139,7 +139,7 @@ def test_networks_that_are_hard_to_export_are_exported(
     trained = small_trained(config_section(network), image_size=image_size)
     path = tmp_path / f"net{suffix}"
     export_network(trained, path)
-    again = load_trained(path, config_section(network).values())
+    again = load_network(path, config_section(network).values())
     dynamic = network == "TwoSizes" and suffix == ".safetensors"
     assert (again.fixed_size, again.image_size) == (None if dynamic else fixed, image_size)
     images = some_images(trained, 3, size)
@@ -159,7 +159,7 @@ def test_depth_networks_are_exported_and_read_back(suffix: str, tmp_path: Path) 
     )
     path = tmp_path / f"net{suffix}"
     assert export_network(trained, path).difference < 1e-5
-    again = load_trained(path)
+    again = load_network(path)
     assert (again.depth_kind, again.predicts, again.class_names) == (
         "relative_disparity",
         "distance",
@@ -177,7 +177,7 @@ def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
     trained = small_trained(config_section("Tied"))
     path = tmp_path / "net.onnx"
     export_network(trained, path, image_size=(7, 9), opset=18)
-    again = load_trained(path)
+    again = load_network(path)
     assert (again.fixed_size, again.image_size) == ((7, 9), (32, 32))
     shape = onnxruntime.InferenceSession(path).get_inputs()[0].shape
     assert shape == ["batch", 4, 7, 9]
@@ -215,13 +215,13 @@ def test_other_files_are_refused(files: dict[str, Path], tmp_path: Path) -> None
     onnx.helper.set_model_props(model, {"tangent_train": text})
     onnx.save(model, path)
     with pytest.raises(DataError, match=r"net\.onnx: found no inputs in 'tangent_train'"):
-        load_trained(path)
+        load_network(path)
     path = tmp_path / "net.safetensors"
     save_file({"a": torch.zeros(2)}, path)
     with pytest.raises(
         DataError, match=r"found no JSON in 'tangent_train' of its metadata.* tangent-import"
     ):
-        load_trained(path)
+        load_network(path)
     path.write_bytes(b"\x10\0\0\0\0\0\0\0nothing")
     with pytest.raises(DataError, match="an unreadable file"):
-        load_trained(path)
+        load_network(path)

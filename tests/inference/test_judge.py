@@ -58,7 +58,7 @@ class SkyOfVertices(Sky):
 
 def _judge(network: Sky | None = None, **changes: Any) -> NetworkJudge:
     changes |= {
-        "inner": network or Sky(),
+        "module": network or Sky(),
         "class_names": ("unknown", "up", "down"),
         "normalization": PLAIN,
     }
@@ -115,7 +115,7 @@ def test_a_network_of_whole_spheres_gets_its_view_in_every_direction(
     representation: dict[str, Any], network: Sky, size: tuple[int, int]
 ) -> None:
     names = ("unknown", "up", "down")
-    trained = trained_network(representation, inner=network, class_names=names, fixed_size=size)
+    trained = trained_network(representation, module=network, class_names=names, fixed_size=size)
     judge = NetworkJudge(replace(trained, normalization=PLAIN))
     ups = AXES @ random_rotation(np.random.default_rng(1)).T
     for true in range(6):

@@ -26,8 +26,8 @@ from datamodules.structured3d.classes import CLASSES as STRUCTURED3D
 from datamodules.synpass.panoramas import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.scores import Groups
-from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.label_maps import LabelMap, Unmapped, load_label_map, map_classes
 from tests.inference.trained import TANGENT, trained_network
@@ -57,10 +57,10 @@ SHIPPED = {
 }
 
 
-def _trained(names: Sequence[str], groups: Groups | None = None) -> TrainedNetwork:
+def _trained(names: Sequence[str], groups: Groups | None = None) -> LoadedNetwork:
     """A network whose scores are its images."""
     class_names = ("unknown", *names)
-    return trained_network(TANGENT, inner=nn.Identity(), class_names=class_names, groups=groups)
+    return trained_network(TANGENT, module=nn.Identity(), class_names=class_names, groups=groups)
 
 
 @pytest.mark.parametrize("name", SHIPPED)

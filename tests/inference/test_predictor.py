@@ -20,8 +20,8 @@ from datamodules.core.inputs import normalize
 from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.samples import render_inputs
 from models import make_distortion_aware
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.scores import size_multiple_of
-from tangent_train.checkpoints.trained import TrainedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
@@ -46,7 +46,7 @@ SGD = functools.partial(torch.optim.SGD, lr=1.0)
 
 
 def _labels(
-    trained: TrainedNetwork, image: InputImage, per_forward: int | None = None, **settings: Any
+    trained: LoadedNetwork, image: InputImage, per_forward: int | None = None, **settings: Any
 ) -> NDArray[np.unsignedinteger]:
     kind = PanoramaViews if image.camera_matrix is None else PhotoViews
     predictor = Predictor(trained, kind(trained, **settings), "cpu", per_forward)
@@ -149,7 +149,7 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     network = small_context().eval()
     awake(network)
     image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
-    trained = trained_network(TANGENT, inner=network)
+    trained = trained_network(TANGENT, module=network)
     labels = _labels(trained, image, per_forward)
     task = SegmentationTask(network, made, trained.class_names, SGD).eval()
     (views,) = made.view_sets()
@@ -165,7 +165,7 @@ def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> Non
     plain = trained_network(ERP)
     aware = trained_network(ERP | {"distortion_aware": True})
     image = InputImage(_blocks(32, 64))
-    converted = trained_network(ERP, inner=make_distortion_aware(plain.inner))
+    converted = trained_network(ERP, module=make_distortion_aware(plain.module))
     expected = _labels(converted, image)
     np.testing.assert_array_equal(_labels(aware, image), expected)
     assert (_labels(plain, image) != expected).mean() > 0.01
@@ -184,7 +184,7 @@ def test_elevation_follows_the_zenith() -> None:
         network.weight.zero_()
         network.weight[0, 3], network.weight[2, 3] = -1, 1
         network.bias.copy_(torch.tensor([0.0, -9, 0]))  # type: ignore[union-attr]
-    trained = trained_network(TANGENT, inner=network, inputs=("rgb", "elevation"))
+    trained = trained_network(TANGENT, module=network, inputs=("rgb", "elevation"))
     labels = _labels(trained, InputImage(sphere(32)))
     assert (labels[:15] == 2).all()
     assert (labels[17:] == 0).all()
@@ -260,7 +260,7 @@ def _photo(rgb: NDArray[np.uint8], fov_deg: float, **more: Any) -> InputImage:
     return InputImage(rgb, camera_matrix=camera_matrix_from_fov(fov_deg, size), **more)
 
 
-def _radians_per_pixel(trained: TrainedNetwork, **settings: Any) -> float:
+def _radians_per_pixel(trained: LoadedNetwork, **settings: Any) -> float:
     (found,) = PhotoViews(trained, **settings)(_photo(_blocks(12, 12), 90.0))
     left, _, right, _ = found.sets[0].boxes[0]  # type: ignore[attr-defined]
     return float(right - left) / 6 / PhotoViews(trained, **settings).image_size[1]
@@ -281,7 +281,7 @@ def test_photos_with_the_networks_pixels_are_labeled_pixel_by_pixel(
 ) -> None:
     """Crops aligned with the photo's pixels and a network without context: labels must not move."""
     network = color_network(channels, kernel=1)
-    trained = trained_network(PERSPECTIVE, channels, inner=network)
+    trained = trained_network(PERSPECTIVE, channels, module=network)
     pixel = 2 * math.tan(math.radians(22.5)) / 24
     image = _photo(_blocks(*size), 2 * math.degrees(math.atan(pixel * size[1] / 2)))
     inputs = [torch.from_numpy(image.rgb)[None]]
@@ -315,7 +315,7 @@ def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> Non
 
 def test_a_photo_of_a_telescope_needs_little_memory() -> None:
     """The photo is far smaller than a crop: mirrored at full resolution it has 14,000² pixels."""
-    trained = trained_network(PERSPECTIVE, inner=color_network(kernel=1))
+    trained = trained_network(PERSPECTIVE, module=color_network(kernel=1))
     rgb = np.zeros((600, 800, 3), np.uint8)
     rgb[:, 400:] = 255
     (views,) = PhotoViews(trained)(_photo(rgb, 2.5))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.cli.run import inputs_and_classes
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import equirect_directions
@@ -49,10 +49,10 @@ def color_network(channels: int = 3, kernel: int = 3) -> nn.Conv2d:
 
 def trained_network(
     representation: dict[str, Any], channels: int = 3, **changes: Any
-) -> TrainedNetwork:
+) -> LoadedNetwork:
     """Return a network trained with a representation."""
     settings = {
-        "inner": color_network(channels),
+        "module": color_network(channels),
         "class_names": CLASS_NAMES,
         "inputs": ("rgb", "depth")[: channels - 2],
         "normalization": RGB_NORMALIZATION if channels == 3 else RGBD_NORMALIZATION,
@@ -60,7 +60,7 @@ def trained_network(
         "representation": representation,
         "image_size": build_from_config(representation, "representation").image_size,
     }
-    return TrainedNetwork(**(settings | changes))
+    return LoadedNetwork(**(settings | changes))
 
 
 def write_checkpoint(

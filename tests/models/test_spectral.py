@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import sph_harm_y
 from torch import Tensor
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.run import build
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
@@ -68,7 +68,7 @@ def test_networks_of_torch_harmonics_commute_with_rotations_about_the_vertical(n
 
 def test_a_checkpoint_is_read_without_trust_and_works_in_mixed_precision(tmp_path: Path) -> None:
     save_checkpoint(tmp_path / "net.ckpt", "network=sfno", "level=3")
-    network: Any = load_trained(tmp_path / "net.ckpt").network
+    network: Any = load_network(tmp_path / "net.ckpt").network
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert network(torch.zeros(1, 4, 16, 32)).shape == (1, 13, 16, 32)
 

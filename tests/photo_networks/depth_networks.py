@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from tangent_train.checkpoints.content import DepthKind
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.photo_networks import PhotoNetwork
 from tests.photo_networks.huggingface_networks import Made, transformers
 
@@ -187,7 +187,7 @@ def own_depth(folder: Path, image: Any, fov_deg: float | None = None) -> Tensor:
 
 
 @torch.no_grad()
-def depth_of(network: PhotoNetwork | TrainedNetwork, image: Any) -> Tensor:
+def depth_of(network: PhotoNetwork | LoadedNetwork, image: Any) -> Tensor:
     """``(h, w)`` depth of an imported network, before or after it is saved."""
     rgb = torch.from_numpy(image.copy()).permute(2, 0, 1) / 255
     mean, std = (

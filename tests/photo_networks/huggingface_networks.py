@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.photo_networks import huggingface, import_network
 
 transformers: Any = import_module("transformers")  # its types leave no room for `**settings`
@@ -137,7 +137,7 @@ def own_logits(network: Any, processor: Any) -> Tensor:
     return torch.nn.functional.interpolate(logits, (_SIDE, _SIDE), mode="bilinear")[0]
 
 
-def imported(folder: Path, **settings: Any) -> TrainedNetwork:
+def imported(folder: Path, **settings: Any) -> LoadedNetwork:
     """Import the network and read its checkpoint."""
     given: dict[str, Any] = {"classes": None, "normalization": None} | settings
     network = huggingface.load(model=str(folder), **given)
@@ -145,7 +145,7 @@ def imported(folder: Path, **settings: Any) -> TrainedNetwork:
 
 
 @torch.no_grad()
-def imported_scores(trained: TrainedNetwork) -> Tensor:
+def imported_scores(trained: LoadedNetwork) -> Tensor:
     """Return scores ``(K, h, w)`` of the imported network for the photo."""
     rgb = torch.from_numpy(photo()).permute(2, 0, 1) / 255
     mean, std = (

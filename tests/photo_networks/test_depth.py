@@ -15,9 +15,9 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
 from models.huggingface import HuggingFaceDepthNetwork, architecture
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import depth_of_output
-from tangent_train.checkpoints.trained import describe_network
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import describe_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import PhotoNetwork, huggingface, import_network
 from tangent_train.photo_networks.depth_kinds import declared_kind, try_depth
@@ -130,7 +130,7 @@ def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:
     saved(depth.depth_pro, tmp_path)
     trained = imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
-    assert "fov_model" not in json.dumps([*trained.inner.state_dict()])
+    assert "fov_model" not in json.dumps([*trained.module.state_dict()])
     change_json(tmp_path / "preprocessor_config.json", size={"height": 128, "width": 128})
     with pytest.raises(
         SettingError, match=r"network: found SettingError \(.*expected 64 × 64.*image of 128 × 128"

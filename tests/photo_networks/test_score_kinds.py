@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.trained import TrainedNetwork, load_trained
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.export import export_network
@@ -41,10 +41,10 @@ def _network(path: Path, names: tuple[str, ...] = NAMES, **settings: Any) -> Pho
     return PhotoNetwork(OnnxNetwork(path), None, names, UNIT, (16, 24), **settings)
 
 
-def _imported(path: Path, names: tuple[str, ...] = NAMES, **settings: Any) -> TrainedNetwork:
+def _imported(path: Path, names: tuple[str, ...] = NAMES, **settings: Any) -> LoadedNetwork:
     output = path.with_name("imported.onnx")
     import_network(_network(path, names), output, levels=5, base_level=0, **settings)
-    return load_trained(output)
+    return load_network(output)
 
 
 def _images(*size: int) -> Tensor:
@@ -245,7 +245,7 @@ def test_one_score_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Path
     trained = import_network(photo, tmp_path / "net.ckpt", levels=5, base_level=0)
     if suffix != "ckpt":
         export_network(trained, tmp_path / f"net.{suffix}")
-    again, images = load_trained(tmp_path / f"net.{suffix}"), _images(32, 48)
+    again, images = load_network(tmp_path / f"net.{suffix}"), _images(32, 48)
     with torch.no_grad():
         expected = network(images).sigmoid()
         found = again.network(images).softmax(dim=1)
@@ -336,7 +336,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     trained = import_network(photo, tmp_path / "net.ckpt", **settings)
     if suffix != "ckpt":
         export_network(trained, tmp_path / f"net.{suffix}")
-    again, images = load_trained(tmp_path / f"net.{suffix}", [name]), _images(32, 48)
+    again, images = load_network(tmp_path / f"net.{suffix}", [name]), _images(32, 48)
     assert again.score_kind == "labels"
     expected = np.array([1, 2, 0, 3])[network(images)]
     labels = again.labels(again.network(images).argmax(dim=1).byte())

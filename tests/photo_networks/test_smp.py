@@ -11,7 +11,7 @@ import segmentation_models_pytorch  # type: ignore[import-untyped]
 import torch
 from segmentation_models_pytorch import encoders
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import PhotoNetwork, import_network, smp
 from tests.photo_networks.huggingface_networks import change_json, imported_scores, photo
@@ -111,7 +111,7 @@ def test_a_network_of_one_size_gets_images_of_this_size(tmp_path: Path) -> None:
     with pytest.raises(SettingError, match=r"image of 512 × 512 .* set image_size=\[rows"):
         import_network(network, tmp_path / "net.ckpt")
     import_network(network, tmp_path / "net.ckpt", image_size=(224, 224), levels=9, base_level=0)
-    trained = load_trained(tmp_path / "net.ckpt")
+    trained = load_network(tmp_path / "net.ckpt")
     assert (trained.fixed_size, trained.image_size) == ((224, 224), (512, 512))
     images = torch.rand(1, 3, 224, 448)
     with torch.no_grad():

@@ -10,8 +10,8 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from tangent_train.config.setting_rules import flat_settings
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.published import facts
-from tangent_train.results.record import Record
 from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")
@@ -39,7 +39,7 @@ def made_record(
     bands: Sequence[float] = (),
     protocol: Mapping[str, str] = {},
     **settings: Any,
-) -> Record:
+) -> EvaluationResult:
     """Make a record with one value for all scores of a class, and the means of these.
 
     Args:
@@ -54,13 +54,13 @@ def made_record(
         OmegaConf.update(config, name.replace("__", "."), value)
     flat = dict(flat_settings(OmegaConf.to_container(config)))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
-    headings, mean = SegmentationTask.headings, sum(present) / len(present)
-    of_class = [heading.of_class for heading in headings.values()]
-    return Record(
+    columns, mean = SegmentationTask.columns, sum(present) / len(present)
+    of_class = [heading.of_class for heading in columns.values()]
+    return EvaluationResult(
         "panoramas",
         5,
-        headings,
-        {"miou": mean, **dict.fromkeys(headings, mean)},
+        columns,
+        {"miou": mean, **dict.fromkeys(columns, mean)},
         [
             {"class": name, "iou": value, **dict.fromkeys(of_class, value), "share": 0.1}
             for name, value in zip(names, scores, strict=True)
@@ -75,7 +75,7 @@ def made_record(
     )
 
 
-def write_run(folder: Path, record: Record) -> Path:
+def write_run(folder: Path, record: EvaluationResult) -> Path:
     """The run that a record is of: its results and settings."""
     folder.mkdir(parents=True)
     (folder / "results.json").write_text(record.json())
@@ -86,7 +86,7 @@ def write_run(folder: Path, record: Record) -> Path:
     return folder
 
 
-def without_solid_angle(record: Record) -> Record:
+def without_solid_angle(record: EvaluationResult) -> EvaluationResult:
     """As photos are scored."""
-    means = {k: None if k.endswith("_solid_angle") else v for k, v in record.means.items()}
-    return replace(record, means=means)
+    means = {k: None if k.endswith("_solid_angle") else v for k, v in record.scores.items()}
+    return replace(record, scores=means)

@@ -22,7 +22,7 @@ from tangent_train.results.evaluation import (
     summary_lines,
     write_results,
 )
-from tangent_train.results.record import Record
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.tasks import SegmentationTask
 from tests.tasks.shapes import shape_task
 
@@ -45,36 +45,36 @@ def _matrices(pixels: dict[tuple[int, int], int] | None = None) -> SegmentationC
 
 def _record(
     counts: SegmentationCounts | None = None, absent: Any = "skip", noun: str = "panoramas"
-) -> Record:
+) -> EvaluationResult:
     """The record of seven images."""
     task = SegmentationTask(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
     task.evaluated = 7
-    return task.record(counts or _matrices(), noun)
+    return task.evaluation_result(counts or _matrices(), noun)
 
 
-def _record_of_shapes() -> Record:
+def _record_of_shapes() -> EvaluationResult:
     task = shape_task(nn.Identity(), SHAPES)
     task.evaluated = 16
-    return task.record(SHAPE_MATRIX, "shapes")
+    return task.evaluation_result(SHAPE_MATRIX, "shapes")
 
 
 def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
     write_results(_record(), tmp_path)
     read = json.loads((tmp_path / "results.json").read_text())
     assert (read["images"], read["noun"]) == (7, "panoramas")
-    assert read["headings"]["miou"] == {
+    assert read["columns"]["miou"] == {
         "text": "mIoU", "unit": "%", "of_class": "iou", "class_text": "IoU",
         "better": "higher", "is_main": True,
     }  # fmt: skip
-    assert read["macc"] == read["macc_solid_angle"] == (0.9 + 0.5) / 2
-    assert read["miou"] == (90 / 150 + 50 / 110) / 2
+    assert read["scores"]["macc"] == read["scores"]["macc_solid_angle"] == (0.9 + 0.5) / 2
+    assert read["scores"]["miou"] == (90 / 150 + 50 / 110) / 2
     assert [entry["class"] for entry in read["classes"]] == ["wall", "floor", "=sofa"]
     assert read["classes"][2]["iou"] is None, "absent: undefined"
     assert (read["classes"][1]["taken_for"], read["classes"][1]["taken_for_share"]) == ("wall", 0.5)
     assert read["latitude_bands"][2] == {
         "latitude_deg": [0, 30],
-        "miou": read["miou"],
-        "macc": read["macc"],
+        "miou": read["scores"]["miou"],
+        "macc": read["scores"]["macc"],
     }
     assert read["latitude_bands"][0]["miou"] is None
     assert read["confusion"][1] == [0, 90, 10, 0]
@@ -115,7 +115,7 @@ def test_photos_have_neither_solid_angles_nor_latitudes() -> None:
         solid_angle=none, bands=np.zeros((6, 4, 4), np.int64), of_images=of_images
     )
     record = _record(matrices, "zero", "photos")
-    assert record.means["miou_solid_angle"] is None
+    assert record.scores["miou_solid_angle"] is None
     assert not record.latitude_bands
     (table,) = result_tables(record)
     assert not [name for name in table.header if "solid angle" in name]
@@ -175,7 +175,7 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
 
 def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
     record = _record_of_shapes()
-    assert record.means == {"accuracy": 13 / 16, "class_accuracy": 0.75}
+    assert record.scores == {"accuracy": 13 / 16, "class_accuracy": 0.75}
     write_results(record, tmp_path)
     text = (tmp_path / "results.md").read_text()
     assert "| mug | 4 | 25.0 | bottle | 75.0 |" in text

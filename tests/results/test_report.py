@@ -15,8 +15,8 @@ from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import runs_report, transfer_report
+from tangent_train.results.evaluation_result import EvaluationResult, load_result
 from tangent_train.results.published import Comparison, facts, publications, published_lines
-from tangent_train.results.record import Record, load_record
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
 from tangent_train.tasks import ClassificationTask, DepthTask
@@ -26,7 +26,7 @@ from tests.results.made_records import PROTOCOL, made_record, without_solid_angl
 REAL = CLASSES
 
 
-def _runs_report(*records: Record) -> Report:
+def _runs_report(*records: EvaluationResult) -> Report:
     return runs_report(records, ["a note"])
 
 
@@ -65,7 +65,7 @@ def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
 
 
 def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
-    def run(found: dict[str, tuple[float, float]], **settings: Any) -> Record:
+    def run(found: dict[str, tuple[float, float]], **settings: Any) -> EvaluationResult:
         return replace(made_record([0.1, 0.5, 0.5], **settings), intervals=found)
 
     intervals = {"miou": (0.25, 0.31)}  # a mean of few images may lie outside
@@ -215,8 +215,8 @@ def test_reports_of_shapes_name_their_rotations() -> None:
         "representation.base_level": 0,
     }
     means = {"accuracy": 0.8, "class_accuracy": 0.7}
-    headings = ClassificationTask.headings
-    record = Record("shapes", 120, headings, means, classes, settings=settings)
+    columns = ClassificationTask.columns
+    record = EvaluationResult("shapes", 120, columns, means, classes, settings=settings)
     aligned = replace(record, protocol=facts("paper_modelnet40"))
     rotated = replace(record, protocol={**aligned.protocol, "test_rotation": "so3"})
     assert Comparison.of([rotated]).rows == []
@@ -253,8 +253,8 @@ def test_published_depth_has_its_units_and_the_smallest_error_is_named(
     uncached = publications.__wrapped__
     monkeypatch.setattr("tangent_train.results.published.publications", uncached)
     protocol = facts("stanford2d3ds_depth")
-    means = dict.fromkeys(DepthTask.headings, 0.25)
-    record = Record("panoramas", 2, DepthTask.headings, means, protocol=protocol)
+    means = dict.fromkeys(DepthTask.columns, 0.25)
+    record = EvaluationResult("panoramas", 2, DepthTask.columns, means, protocol=protocol)
     aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
     (table,) = Comparison.of([aligned]).tables(aligned)
     assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
@@ -268,20 +268,20 @@ def test_published_depth_has_its_units_and_the_smallest_error_is_named(
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
-    headings = DepthTask.headings
-    means = dict.fromkeys(headings, 0.25)
+    columns = DepthTask.columns
+    means = dict.fromkeys(columns, 0.25)
     protocol = {"data": "Stanford2D3DS", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}
     records = []
     for number, alignment in enumerate(("none", "median in distance")):
         folder = tmp_path / str(number)
-        written = Record("panoramas", 2, headings, means, protocol=protocol)
+        written = EvaluationResult("panoramas", 2, columns, means, protocol=protocol)
         written = replace(written, protocol=protocol | {"alignment": alignment})
         write_text(folder / "results.json", written.json())
         write_settings(folder / "config.yaml", settings | {"task": {"alignment": alignment}})
-        records.append(load_record(folder))
-    assert records[0].headings == headings
-    assert records[0].means == means
+        records.append(load_result(folder))
+    assert records[0].columns == columns
+    assert records[0].scores == means
     assert Comparison.of(records) == ([], [])
     report = runs_report(records)
     header, rows = report.tables()[0].header, report.tables()[0].rows
@@ -291,4 +291,4 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
     )
     assert [row[-6:-3] for row in rows] == [("0.25", "25.0", "0.25")] * 2
     assert {"none", "median in distance"} <= {cell for row in rows for cell in row}
-    assert {line["score"] for line in report.figures()} == {*headings}, "the CSV file has all"
+    assert {line["score"] for line in report.figures()} == {*columns}, "the CSV file has all"

@@ -7,13 +7,13 @@ from dataclasses import replace
 import pytest
 
 from tangent_train.errors import DataError
-from tangent_train.results.record import Record
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.rows import Row, Statistic, group_runs
 from tests.results.made_records import made_record, without_solid_angle
 
 
 @pytest.fixture
-def three_folds() -> list[Record]:
+def three_folds() -> list[EvaluationResult]:
     """Folds 1 (three seeds), 2 (one), 3 (two, without sofas)."""
     return [
         *(
@@ -28,7 +28,9 @@ def three_folds() -> list[Record]:
     ]
 
 
-def test_seeds_are_averaged_within_folds_and_then_the_folds(three_folds: list[Record]) -> None:
+def test_seeds_are_averaged_within_folds_and_then_the_folds(
+    three_folds: list[EvaluationResult],
+) -> None:
     (row,) = group_runs(three_folds[::-1])
     assert row.folds == (1, 2, 3)
     wall = row.score("iou", "wall")
@@ -40,7 +42,7 @@ def test_seeds_are_averaged_within_folds_and_then_the_folds(three_folds: list[Re
     assert wall.folds == 3
 
 
-def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[Record]) -> None:
+def test_a_class_absent_from_a_fold_is_left_out_there(three_folds: list[EvaluationResult]) -> None:
     (row,) = group_runs(three_folds)
     assert row.score("accuracy", "sofa")[:4] == pytest.approx((0.6, 0.02**0.5, 0, 2))
     assert row.of_fold(3).score("iou", "sofa") == Statistic(None, None, None, 0)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
@@ -12,18 +11,15 @@ from typing import Any
 import onnx
 import pytest
 import torch
-import yaml  # type: ignore[import-untyped]
 from safetensors.torch import load_file, save_file
 
-from tangent_train.checkpoints.content import read_settings
-from tangent_train.checkpoints.trained import METADATA_KEY, describe_network, load_trained
+from tangent_train.checkpoints.loaded import METADATA_KEY, describe_network, load_network
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.run import build
 from tangent_train.cli.stored import StoredRun, stored_run
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.camera_files import read_cameras
-from tangent_train.results.record import load_record
 from tests.cli.tiny_runs import run_command
 from tests.security.attacks import (
     attacks,
@@ -58,7 +54,7 @@ def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
     all_places += [("normalization",), ("normalization", "mean")]
     for place, value in sampled(list(attacks(forbidden)), all_places):
         torch.save(replaced(lighter, place, value), path)
-        for use in (load_trained, evaluated, describe_network):
+        for use in (load_network, evaluated, describe_network):
             _nothing_happens(use, path, forbidden, (place, value))
 
 
@@ -101,7 +97,7 @@ def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbi
     assert ("data", "mask") in at
     for config in second_readings(content["config"], at, forbidden):
         torch.save(lighter | {"config": config}, path)
-        for use in (load_trained, evaluated, describe_network):
+        for use in (load_network, evaluated, describe_network):
             _nothing_happens(use, path, forbidden, config)
 
 
@@ -127,28 +123,12 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         onnx.helper.set_model_props(model, {METADATA_KEY: text})
         onnx.save(model, other)
         for path in (one, other):
-            _nothing_happens(load_trained, path, forbidden, (place, value))
+            _nothing_happens(load_network, path, forbidden, (place, value))
         _nothing_happens(describe_network, one, forbidden, (place, value))
     for place, text in _named_twice(described, forbidden, json.dumps):
         save_file(tensors, one, {METADATA_KEY: text})
         with pytest.raises(DataError, match="is repeated"):
-            pytest.fail(f"{place}: {load_trained(one)}")
-
-
-def test_in_the_settings_of_a_run(run: Path, forbidden: Path) -> None:
-    folder = forbidden.parent / "theirs"
-    shutil.copytree(run, folder, ignore=shutil.ignore_patterns("tensorboard", "checkpoints"))
-    settings = read_settings(run / "config.yaml")
-    for place, value in sampled(list(json_attacks(forbidden)), list(places(settings))):
-        (folder / "config.yaml").write_text(yaml.safe_dump(replaced(settings, place, value)))
-        _nothing_happens(load_record, folder, forbidden, (place, value))
-    for place, text in _named_twice(settings, forbidden, yaml.safe_dump):
-        (folder / "config.yaml").write_text(text)
-        with pytest.raises(DataError, match=r"config\.yaml: found YAMLError: a repeated name"):
-            pytest.fail(f"{place}: {load_record(folder)}")
-    (folder / "config.yaml").write_text(f"<<: {{name: x}}\n{yaml.safe_dump(settings)}")
-    with pytest.raises(DataError, match=r"config\.yaml: found ConstructorError"):
-        load_record(folder)
+            pytest.fail(f"{place}: {load_network(one)}")
 
 
 def test_in_lists_of_cameras_and_results_of_keypoints(

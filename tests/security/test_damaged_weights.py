@@ -10,7 +10,7 @@ import pytest
 
 from models import initialize
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import color_network, write_checkpoint
@@ -34,12 +34,12 @@ def test_damaged_networks_are_refused(
     if name != path.name:
         run_command(monkeypatch, "export", f"checkpoint={path}", f"output={name}")
         path = tmp_path / name
-    load_trained(path)
+    load_network(path)
     weights = color_network().weight.detach()
     _flip(path, weights[1, 2, 0, 1].numpy().tobytes(), bit)
     found = rf"{name}: found a damaged file, whose checksum is wrong; .* Copy the original"
     with pytest.raises(DataError, match=found):
-        load_trained(path)
+        load_network(path)
     if name == "x.ckpt":
         uses: tuple[Callable[[], Any], ...] = (
             lambda: read_checkpoint(path),

@@ -15,7 +15,7 @@ import yaml  # type: ignore[import-untyped]
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
-from tangent_train.checkpoints.trained import METADATA_KEY
+from tangent_train.checkpoints.loaded import METADATA_KEY
 from tangent_train.rendering import TangentRepresentation
 from tests.cli.tiny_runs import run_command
 from tests.models.onnx_files import write_linear

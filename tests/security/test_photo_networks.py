@@ -13,7 +13,7 @@ import segmentation_models_pytorch  # type: ignore[import-untyped]
 import torch
 from transformers import quantizers
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import smp
@@ -66,7 +66,7 @@ def test_undeclared_settings_are_left_out_or_refused(
             for place in places:
                 torch.save(_with(content, ("config", "network", "config", *place), attack), hostile)
                 with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
-                    load_trained(hostile)
+                    load_network(hostile)
         assert happened == [], attack
 
 

@@ -20,7 +20,7 @@ from torch import nn
 from datamodules.core.store import Store
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tangent_train.io.image_files import short_names
 from tangent_train.io.pixel_files import read_array, write_pixels
@@ -81,7 +81,7 @@ def _read_store(path: Path) -> None:
 @pytest.mark.parametrize("make", CREATORS)
 def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
     readers: tuple[Any, ...] = (
-        load_trained,
+        load_network,
         read_checkpoint,
         read_tensors,
         read_array,
@@ -143,7 +143,7 @@ def test_networks_are_one_file(run: Path, tmp_path: Path) -> None:
     tensor.ClearField("raw_data")
     (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
     with pytest.raises(DataError, match=r"x\.onnx: found tensors in other files"):
-        load_trained(tmp_path / "x.onnx")
+        load_network(tmp_path / "x.onnx")
 
 
 class Saving(nn.Module):
@@ -175,6 +175,6 @@ def test_programs_of_torchscript_are_refused(
     path.write_bytes(b"".join(parts.get(order, [honest, program])))
     refused = pytest.raises(DataError, match=r"x\.pt: found a damaged file")
     with watched(forbidden) as happened, refused:
-        load_trained(path)
+        load_network(path)
     assert not happened
     assert not (forbidden / "x").exists()

@@ -15,7 +15,7 @@ from torch import nn
 from models import initialize
 from tangent_train.callbacks.checkpoints import BestCheckpoint
 from tangent_train.checkpoints.content import read_settings
-from tangent_train.checkpoints.trained import completed_settings, load_trained
+from tangent_train.checkpoints.loaded import completed_settings, load_network
 from tangent_train.cli.run import build
 from tangent_train.config import build as registry
 from tangent_train.config.build import SettingsFile, build_from_config
@@ -147,12 +147,12 @@ def test_terminals_get_no_commands(content: dict[str, Any], run: Path, tmp_path:
     evil = "a.b\x1b]0;owned\x07\n\x1b[31mtrust me"
     path = with_config(content, tmp_path, network={"_target_": evil})
     with pytest.raises(DataError) as refused:
-        load_trained(path)
+        load_network(path)
     assert "\x1b" not in str(refused.value)
     for name in (evil, "a\nb"):
         torch.save(content | {"class_names": [name] * 14}, path)
         with pytest.raises(DataError, match="class_names="):
-            load_trained(path)
+            load_network(path)
     settings = read_settings(run / "config.yaml") | {"name": evil}
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(settings))
     with pytest.raises(DataError, match=r"settings\.name="):
@@ -211,8 +211,8 @@ def _with_network(content: dict[str, Any], path: Path, **settings: Any) -> Path:
 def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_path: Path) -> None:
     path = _with_network(content, tmp_path / "x.ckpt")
     with pytest.raises(DataError, match=f"trust={OWN}"):
-        load_trained(path)
-    assert load_trained(path, [OWN]).in_channels == 3
+        load_network(path)
+    assert load_network(path, [OWN]).in_channels == 3
     for text in (f"trust={OWN}", f"trust=['{OWN}',my.Other]", f"network._target_={OWN}"):
         build(*settled(path, text))
     with pytest.raises(DataError, match=f"trust={OWN}"):
@@ -220,7 +220,7 @@ def test_ones_own_network_is_trusted_by_its_name(content: dict[str, Any], tmp_pa
     # Its arguments may be any plain values, but objects inside are still checked.
     path = _with_network(content, tmp_path / "x.ckpt", inner={"a": [{"_target_": _FIRE}]})
     with pytest.raises(DataError, match=rf"network\.inner\.a\.0\._target_={_FIRE}"):
-        load_trained(path, [OWN])
+        load_network(path, [OWN])
 
 
 @pytest.mark.parametrize("section", ["optimizer", "scheduler"])

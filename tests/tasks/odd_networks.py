@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from tangent_train.checkpoints.trained import TrainedNetwork
+from tangent_train.checkpoints.loaded import LoadedNetwork
 
 
 class Tied(nn.Module):
@@ -66,12 +66,12 @@ def config_section(name: str) -> dict[str, Any]:
     return {"_target_": f"{__name__}.{name}"}
 
 
-def some_images(trained: TrainedNetwork, count: int, size: tuple[int, int]) -> Tensor:
+def some_images(trained: LoadedNetwork, count: int, size: tuple[int, int]) -> Tensor:
     """Normalized images of its channels."""
     return torch.randn(count, trained.normalization.channels, *size)
 
 
-def scores_of(trained: TrainedNetwork, images: Tensor) -> Tensor:
+def scores_of(trained: LoadedNetwork, images: Tensor) -> Tensor:
     """Return PyTorch's scores of images."""
     with torch.no_grad():
         scores: Tensor = trained.network(images)

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import Normalization
+from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
-from tangent_train.checkpoints.trained import TrainedNetwork, completed_settings
 from tangent_train.cli.run import build, inputs_and_classes
 from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.tasks import SegmentationTask
@@ -34,7 +34,7 @@ def with_statistics(network: nn.Module, seed: int = 0) -> nn.Module:
 
 def small_trained(
     settings: Mapping[str, Any] = UNET, image_size: tuple[int, int] = (32, 32)
-) -> TrainedNetwork:
+) -> LoadedNetwork:
     """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
     network = with_statistics(build_from_config(settings, "network")).eval()
@@ -42,7 +42,7 @@ def small_trained(
     return trained_network(
         TANGENT | {"level": 5},
         channels=4,
-        inner=network,
+        module=network,
         class_names=NAMES,
         normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
         image_size=image_size,

@@ -47,8 +47,8 @@ class Oracle(nn.Module):
 
 def test_a_score_without_a_heading_is_refused_at_the_first_validation() -> None:
     task = shape_task(Oracle())
-    task.headings = {"accuracy": task.headings["accuracy"]}  # type: ignore[misc]
-    with pytest.raises(SettingError, match=r"headings of ClassificationTask: found .*class_acc"):
+    task.columns = {"accuracy": task.columns["accuracy"]}  # type: ignore[misc]
+    with pytest.raises(SettingError, match=r"columns of ClassificationTask: found .*class_acc"):
         quiet_trainer().validate(task, datamodule=Shapes(3), verbose=False)
 
 

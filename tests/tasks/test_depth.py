@@ -13,8 +13,8 @@ from torch import Tensor, nn
 
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
-from tangent_train.checkpoints.content import DepthKind
 from tangent_train.checkpoints.distances import DistanceNetwork, from_distance, is_metric
+from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.metrics.depth import depth_scores
@@ -106,12 +106,12 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     assert scores["val/absrel"] < 0.09
     assert scores["val/delta1"] > 0.9
     assert scores["val/missing"] == 0
-    record = task.record(task.result, "panoramas")
+    record = task.evaluation_result(task.result, "panoramas")
     assert next(band["latitude_deg"] for band in record.latitude_bands) == [60, 90]
-    assert record.intervals.keys() == record.means.keys() == task.headings.keys()
+    assert record.intervals.keys() == record.scores.keys() == task.columns.keys()
     assert task.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
     with_unknown = np.concatenate([task.result, np.zeros_like(task.result[:1])])
-    assert task.scores_of(with_unknown, [3]).keys() == record.means.keys()
+    assert task.scores_of(with_unknown, [3]).keys() == record.scores.keys()
     if is_metric(kind):
         images[:, 0] += np.log(1.1)
         loss = task.loss_sum((images,), truth) / near.sum()
@@ -141,7 +141,7 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     result, task.evaluated = task.metric.compute(), 1
     assert task.logged_scores(result)["absrel"] < 1e-3
     assert "views_aligned" not in task.facts
-    (table,) = result_tables(task.record(result, "photos"))
+    (table,) = result_tables(task.evaluation_result(result, "photos"))
     assert not any("solid angle" in name for name, _ in table.rows)
 
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
@@ -66,9 +66,9 @@ def test_the_best_epoch_has_the_smallest_error_and_is_reported(folder: Path, run
     assert content["protocol"]["alignment"] == "none"
     assert content["protocol"]["range"] == "0 to ∞ m"
     assert len(content["latitude_bands"]) == 6
-    assert content["headings"]["absrel"]["better"] == "lower"
+    assert content["columns"]["absrel"]["better"] == "lower"
     low, high = content["intervals"]["absrel"]
-    assert low <= content["absrel"] <= high
+    assert low <= content["scores"]["absrel"] <= high
     assert "AbsRel" in (folder / "whole" / "report.html").read_text()
     assert len(list((folder / "whole" / "panels").iterdir())) == 1
     run("report", "whole")
@@ -124,7 +124,7 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
         run("train", *tuned, "hydra.run.dir=refused")
     run("train", *tuned, "task.alignment=affine", "hydra.run.dir=relative")
     assert "Output of the network: relative_disparity" in capsys.readouterr().out
-    trained = load_trained(Path("relative/checkpoints/best.ckpt"))
+    trained = load_network(Path("relative/checkpoints/best.ckpt"))
     assert trained.depth_kind == "relative_disparity"
     assert results(Path("relative"))["protocol"]["alignment"] == "affine in disparity"
 
@@ -173,9 +173,9 @@ def test_a_transfer_compares_views_and_their_alignment(run: Run) -> None:
     for path in Path("runs/transfer/mine").rglob("results.json"):
         stages[path.parent.name] = results(path.parent)
     assert stages.keys() == {"P", "S", "S-unaligned", "S-erp", "P-FT-1", "S-FT-1"}
-    assert stages["S"]["absrel"] != stages["S-unaligned"]["absrel"]
-    assert stages["P"]["absrel_solid_angle"] is None
+    assert stages["S"]["scores"]["absrel"] != stages["S-unaligned"]["scores"]["absrel"]
+    assert stages["P"]["scores"]["absrel_solid_angle"] is None
     text = Path("runs/transfer/mine/transfer.md").read_text()
     assert "AbsRel ↓" in text
     assert "S-unaligned" in text
-    assert torch.isfinite(torch.tensor([s["absrel"] for s in stages.values()])).all()
+    assert torch.isfinite(torch.tensor([s["scores"]["absrel"] for s in stages.values()])).all()

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from tangent_train.checkpoints.trained import load_trained
+from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli.run import build
 from tangent_train.files import config_folder
 from tangent_train.inference.export import SUFFIXES, export_network
@@ -57,10 +57,10 @@ def test_every_kind_of_network_can_be_exported_for_images_of_any_size(
     shallow = [DEPTH[network]] if network in DEPTH else []
     level = ["level=5", "representation.erp_height=32"]
     save_checkpoint(tmp_path / "net.ckpt", f"network={network}", *level, *shallow)
-    trained = load_trained(tmp_path / "net.ckpt")
+    trained = load_network(tmp_path / "net.ckpt")
     path = tmp_path / f"net{suffix}"
     assert export_network(trained, path).trained.fixed_size is None
-    again, step = load_trained(path), trained.size_multiple
+    again, step = load_network(path), trained.size_multiple
     for count, size in ((1, (64, 96)), (5, (32 + step, 64))):
         images = some_images(trained, count, size)
         assert_same(again.network(images).detach(), scores_of(trained, images))

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from tangent_train.results.record import load_record
+from tangent_train.results.evaluation_result import load_result
 from tests.cli.test_commands import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.datamodules.data_files import write_png
@@ -110,11 +110,11 @@ def test_depth_of_two_processes_is_that_of_one(
     assert logged[1].keys() == logged[0].keys()
     for name in ("train/loss", "val/loss", "val/absrel"):
         assert logged[1][name] == pytest.approx(logged[0][name], rel=1e-5), name
-    first, second = (load_record(tmp_path / name) for name in ("one", "two"))
+    first, second = (load_result(tmp_path / name) for name in ("one", "two"))
     assert second.images == first.images == 5
     assert second.protocol == first.protocol
     assert second.protocol["views_aligned"] == "scale"
-    assert second.means == pytest.approx(first.means, rel=1e-4)
+    assert second.scores == pytest.approx(first.scores, rel=1e-4)
     for name, interval in first.intervals.items():
         assert second.intervals[name] == pytest.approx(interval, rel=1e-4)
     for bands in zip(first.latitude_bands, second.latitude_bands, strict=True):

@@ -65,14 +65,14 @@ def test_panoramas_without_a_labeled_pixel_do_not_count(
     panels = PredictionPanels(tmp_path / "panels", count=2)
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
-    record = task.record(task.result, data.noun)
+    record = task.evaluation_result(task.result, data.noun)
     write_results(record, tmp_path / "results")
     written = json.loads((tmp_path / "results" / "results.json").read_text())
     assert written["images"] == 5
     assert len(list((tmp_path / "panels").iterdir())) == 2
     assert np.sum(written["confusion"]) == 0
     unknown = None if absent == "skip" else 0
-    assert written["miou"] == unknown
+    assert written["scores"]["miou"] == unknown
     assert {row["iou"] for row in written["classes"]} == {unknown}
     assert np.isnan(logged["test/miou"]) == (absent == "skip")
     for name in ("results.csv", "results.md"):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanAbsoluteError
 
-from tangent_train.results.record import Heading
+from tangent_train.metrics.score_columns import ScoreColumn
 from tangent_train.tasks.base import Task
 
 
@@ -19,7 +19,7 @@ class ShareOfClass(Task):
 
     monitor = "val/mae"
     takes = "images (n, C, h, w) to numbers (n, 1, h, w)"
-    headings: ClassVar = {"mae": Heading("mean absolute error", "", better="lower")}
+    columns: ClassVar = {"mae": ScoreColumn("mean absolute error", "", better="lower")}
 
     def __init__(self, *arguments: Any, class_name: str, **settings: Any) -> None:
         super().__init__(*arguments, **settings)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.checkpoints.content import read_checkpoint
+from tangent_train.checkpoints.loaded import completed_settings, load_network
 from tangent_train.checkpoints.scores import size_multiple_of
-from tangent_train.checkpoints.trained import completed_settings, load_trained
 from tangent_train.errors import DataError
 from tests.tasks.odd_networks import Looking, OneSize
 from tests.tasks.small_networks import save_checkpoint
@@ -36,7 +36,7 @@ def test_a_network_computes_what_its_task_does(
 ) -> None:
     path = tmp_path / "best.ckpt"
     task = save_checkpoint(path, *overrides)
-    trained = load_trained(path)
+    trained = load_network(path)
     assert trained.inputs == (("rgb", "depth") if "network=unet" in overrides else ("rgb",))
     images = torch.randn(2, trained.in_channels, *size)
     with torch.no_grad():
@@ -107,7 +107,7 @@ def test_files_that_cannot_be_loaded_are_explained(
     content["config"] |= changed
     torch.save(content, path)
     with pytest.raises(DataError, match=rf"(?s)^{re.escape(str(path))}: found {message}"):
-        load_trained(path, ["no_such.Net", "torch.nn.Convolution"])
+        load_network(path, ["no_such.Net", "torch.nn.Convolution"])
 
 
 @pytest.mark.parametrize(

@@ -24,11 +24,10 @@ from tangent_train.checkpoints.content import (
     GROUPS,
     INPUTS,
     NORMALIZATION,
-    DepthKind,
-    ScoreKind,
     read_checkpoint,
 )
 from tangent_train.checkpoints.distances import DistanceNetwork
+from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.scores import ClassScoreNetwork, Groups, size_multiple_of
 from tangent_train.config.build import (
     SettingsFile,
@@ -67,11 +66,11 @@ _TRAINED = "a checkpoint written by tangent-train"
 
 
 @dataclass(frozen=True)
-class TrainedNetwork:
+class LoadedNetwork:
     """A trained network with everything needed to use it.
 
     Attributes:
-        inner: Network as it was trained or imported, in evaluation mode; see `network`.
+        module: Network as it was trained or imported, in evaluation mode; see `network`.
         class_names: Names of the K + 1 labels, the unknown class first; score k is that of label
             k + 1. Empty for depth networks.
         inputs: Inputs of the network, see `datamodules.core.inputs.Input`.
@@ -87,15 +86,15 @@ class TrainedNetwork:
             trained on; None for other networks.
         groups: Indices of a photo network's scores for each class, and in a last group those of no
             class: where they win, the label is 0. None if each score is a class.
-        score_kind: Kind of the output of `inner`, if it predicts classes.
+        score_kind: Kind of the output of `module`, if it predicts classes.
         depth_kind: Kind of the output of a depth network; None for networks of classes.
         fill: Colors outside the area of partial panoramas in the training.
-        settings: Complete section of the config that builds `inner`; None if only the computation
+        settings: Complete section of the config that builds `module`; None if only the computation
             is known (ONNX).
         source: File that `representation` and `settings` come from.
     """
 
-    inner: nn.Module
+    module: nn.Module
     class_names: tuple[str, ...]
     inputs: tuple[Input, ...]
     normalization: Normalization
@@ -122,8 +121,8 @@ class TrainedNetwork:
         count = len(self.class_names) - 1
         tile = None if self.is_spherical else self.fixed_size
         if self.depth_kind is not None:
-            return DistanceNetwork(self.inner, self.depth_kind, tile).eval()
-        return ClassScoreNetwork(self.inner, count, self.groups, tile, self.score_kind).eval()
+            return DistanceNetwork(self.module, self.depth_kind, tile).eval()
+        return ClassScoreNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
 
     @property
     def predicts(self) -> str:
@@ -189,9 +188,9 @@ class NetworkDescription:
         class_names: Names of the labels.
         inputs: Inputs of the network; None for shapes.
         normalization: ``mean`` and ``std`` of the inputs.
-        groups: Indices of scores, see `TrainedNetwork`.
-        score_kind: Kind of the output, see `TrainedNetwork`.
-        depth_kind: Kind of the output of a depth network, see `TrainedNetwork`.
+        groups: Indices of scores, see `LoadedNetwork`.
+        score_kind: Kind of the output, see `LoadedNetwork`.
+        depth_kind: Kind of the output of a depth network, see `LoadedNetwork`.
         settings: Section of a config that builds the network. Settings that depend on the data (see
             `completed_settings`) and those of other pretrained weights are null.
     """
@@ -249,7 +248,7 @@ def completed_settings(
     return complete(settings)
 
 
-def load_trained(path: Path, trust: Collection[str] = ()) -> TrainedNetwork:
+def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
     """Load a trained network, on the CPU and in evaluation mode, from a file of this package.
 
     Args:
@@ -317,10 +316,10 @@ def _without_data_settings(section: Any) -> Any:
     }
 
 
-def metadata_of(trained: TrainedNetwork) -> dict[str, Any]:
+def metadata_of(trained: LoadedNetwork) -> dict[str, Any]:
     """Return the metadata of a network as plain values.
 
-    These are the fields of `TrainedNetwork`, except for ``inner`` and ``source``;
+    These are the fields of `LoadedNetwork`, except for ``module`` and ``source``;
     ``normalization`` is a mapping of ``mean`` and ``std``; ``tangent_train_version`` is added.
     """
     content = {name: getattr(trained, name) for name in _KINDS}
@@ -333,7 +332,7 @@ def _check_tensors(path: Path, metadata: Mapping[str, str], checksum: str) -> No
     check_sum(path, metadata.get(CHECKSUM_KEY, checksum) == checksum)
 
 
-def write_metadata(source: Path, path: Path, trained: TrainedNetwork) -> None:
+def write_metadata(source: Path, path: Path, trained: LoadedNetwork) -> None:
     """Write an ONNX file with the metadata of a network, and the checksum of its tensors.
 
     Args:
@@ -356,14 +355,14 @@ def tensor_checksum(tensors: Mapping[str, Tensor]) -> str:
     return crc32_of(tensor.numpy().data for tensor in ordered)
 
 
-def _from_onnx(source: SettingsFile) -> TrainedNetwork:
+def _from_onnx(source: SettingsFile) -> LoadedNetwork:
     network = OnnxNetwork(source.path)
     described = _parse_metadata(source.path, network.metadata) | {"settings": None}
     _check_tensors(source.path, network.metadata, network.checksum)
     return _build_trained(described, network, source)
 
 
-def _from_safetensors(source: SettingsFile) -> TrainedNetwork:
+def _from_safetensors(source: SettingsFile) -> LoadedNetwork:
     metadata = _metadata(source.path)
     described = _parse_metadata(source.path, metadata)
     tensors = load_file(source.path)
@@ -371,7 +370,7 @@ def _from_safetensors(source: SettingsFile) -> TrainedNetwork:
     return _build_trained(described, _build_network(described, tensors, source), source)
 
 
-def _from_checkpoint(source: SettingsFile) -> TrainedNetwork:
+def _from_checkpoint(source: SettingsFile) -> LoadedNetwork:
     """Load a network, and find by trial the sizes of images that it takes."""
     path = source.path
     content = read_checkpoint(path)
@@ -435,7 +434,7 @@ def _build_network(
 
 def _build_trained(
     described: Mapping[str, Any], network: nn.Module, source: SettingsFile
-) -> TrainedNetwork:
+) -> LoadedNetwork:
     # Built to refuse an impossible representation before it is used.
     representation = build_from_config(described["representation"], "representation", source)
     rows, columns = described.get("image_size", representation.image_size)
@@ -443,7 +442,7 @@ def _build_trained(
     if fixed is not None and min(fixed) < 1:
         raise ValueError(f"fixed_size={fixed}")
     known = {
-        "inner": network,
+        "module": network,
         "class_names": tuple(described["class_names"]),
         "inputs": tuple(described["inputs"]),
         "normalization": Normalization(normalization.get("mean", ()), normalization.get("std", ())),
@@ -452,7 +451,7 @@ def _build_trained(
         "fill": described["fill"] or "mean",  # exports of older versions lack it
         "source": source,
     }
-    return TrainedNetwork(**{**described, **known})
+    return LoadedNetwork(**{**described, **known})
 
 
 def _parse_metadata(path: Path, metadata: Mapping[str, str]) -> dict[str, Any]:

@@ -1,0 +1,41 @@
+"""Kinds of output of networks, and the corrections of depth views."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "labels"]
+"""Output of a network.
+
+* `logits`: scores before a softmax over the K classes.
+* `probabilities`: scores after that softmax.
+* `sigmoid_logits`: scores before a sigmoid of each class. A score of 0 is appended at index K,
+  "none of the classes", which wins where no class has a probability above ½.
+* `sigmoid`: probabilities after that sigmoid, with the same index K.
+* `labels`: label maps ``(B, h, w)`` or ``(B, 1, h, w)``. NaN and values outside 0 … K − 1 belong to
+  index K.
+"""
+
+Align = Literal["none", "scale", "affine", "grid"]
+"""Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
+
+DepthKind = Literal[
+    "log_distance",
+    "metric_distance",
+    "metric_z",
+    "canonical_inverse",
+    "relative_depth",
+    "relative_disparity",
+]
+"""Output of a depth network, a channel of values at the pixels of its images.
+
+* `log_distance`: natural logarithm of the distance along the ray in meters; trained by `DepthTask`.
+* `metric_distance`: distance along the ray in meters.
+* `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
+* `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of
+  Depth Pro; z-depth is proportional to the focal length.
+* `relative_depth`: z-depth up to a scale and a shift per image.
+* `relative_disparity`: 1 / z-depth up to a scale and a shift per image.
+
+In views that are not pinhole images (equirectangular images, icospheres), z-depth is the distance.
+"""
