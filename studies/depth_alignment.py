@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from studies.output import COLORS, Row, save, save_table
 from tangent_train.checkpoints.distances import distance_of, from_distance
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.inference.alignment import align, sample_views, sphere_points
+from tangent_train.heads.alignment import align, sample_views, sphere_points
 from tangent_train.io.pixel_files import read_depth_m
 from tangent_train.rendering import HorizontalRepresentation
 

@@ -12,8 +12,8 @@ from lightning.pytorch.callbacks import Callback
 
 from tangent_train.errors import at_least
 from tangent_train.files import write_bytes
+from tangent_train.heads.pictures import evenly_spread
 from tangent_train.results.html import EncodedImage
-from tangent_train.results.pictures import evenly_spread
 
 
 class PredictionPanels(Callback):

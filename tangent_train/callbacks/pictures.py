@@ -9,7 +9,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from tangent_train.errors import at_least
-from tangent_train.results.pictures import evenly_spread
+from tangent_train.heads.pictures import evenly_spread
 
 _MOST_ROWS = 256
 """Larger images are reduced: a log contains the pictures of all validations."""

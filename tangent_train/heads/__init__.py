@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
-from tangent_train.heads.base import Head, Heading, PredictedImage, Scores
+from tangent_train.heads.base import Head, PredictedImage, Scores
 from tangent_train.heads.classes import ClassesHead
 from tangent_train.heads.distance import DistanceHead
 from tangent_train.heads.image_class import ImageClassHead
 
 __all__ = [
+    "HEADS",
     "ClassesHead",
     "DistanceHead",
     "Head",
-    "Heading",
     "ImageClassHead",
     "PredictedImage",
     "Scores",
@@ -21,11 +21,17 @@ __all__ = [
 ]
 
 
+HEADS: dict[str, type[ClassesHead | DistanceHead]] = {
+    head.kind: head for head in (ClassesHead, DistanceHead)
+}
+"""Heads of networks from files, by the kind of labels that these predict."""
+
+
 def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
     """Return the head of a network from a file.
 
     Args:
-        loaded: `TrainedNetwork`.
+        loaded: `LoadedNetwork`.
         **settings: Settings of the head, see `Head.predict_settings`.
     """
     if loaded.depth_kind is not None:

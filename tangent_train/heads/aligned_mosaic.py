@@ -11,8 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.geometry import (
     SphereArea,
     equirect_to_lonlat,

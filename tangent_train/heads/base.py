@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from torchmetrics import Metric
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
+from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.segmentation import Interval
 from tangent_train.rendering import Blend
 from tangent_train.rendering.representations.views import Views
 
@@ -23,67 +25,6 @@ RGB = NDArray[np.uint8]
 
 Painter = Callable[[RGB, NDArray[Any]], RGB]
 """Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
-
-Interval = tuple[float, float]
-
-_Value = TypeVar("_Value")
-
-SOLID_ANGLE = "_solid_angle"
-"""Suffix of the name of a score by solid angle; without it, it is the name of the same score by
-pixels."""
-
-
-class Heading(NamedTuple):
-    """Name and unit of a score in reports.
-
-    Attributes:
-        text: Name of the score in reports.
-        unit: ``%`` for a share of 1, which is printed in percent; else a unit, or "".
-        of_class: Key of the score of one class that this score is the mean of, or "".
-        class_text: Name of that score in reports.
-        better: ``higher``, or ``lower`` for errors.
-        is_main: True if reports of several runs and headlines contain the score; all scores are in
-            the files and in the tables of a run.
-    """
-
-    text: str
-    unit: str = "%"
-    of_class: str = ""
-    class_text: str = ""
-    better: str = "higher"
-    is_main: bool = True
-
-    @property
-    def column(self) -> str:
-        """Heading of a column with the score."""
-        return f"{self.text} {self.unit}".strip() + " ↓" * (self.better == "lower")
-
-    @property
-    def class_column(self) -> str:
-        """Heading of a column with the score of one class."""
-        return f"{self.class_text} {self.unit}".strip()
-
-
-def by_solid_angle(scores: Mapping[str, _Value]) -> dict[str, _Value]:
-    """Rename scores to those by solid angle."""
-    return {name + SOLID_ANGLE: value for name, value in scores.items()}
-
-
-def with_solid_angle(headings: Mapping[str, Heading]) -> dict[str, Heading]:
-    """Add the headings of the same scores by solid angle.
-
-    Args:
-        headings: Headings of scores by pixels.
-    """
-    return dict(headings) | {
-        name + SOLID_ANGLE: heading._replace(
-            text=f"{heading.text} by solid angle",
-            of_class=heading.of_class and heading.of_class + SOLID_ANGLE,
-            class_text=heading.class_text and f"{heading.class_text} by solid angle",
-        )
-        for name, heading in headings.items()
-    }
-
 
 class Scores(NamedTuple):
     """Scores of a split, shares of 1 or in a unit; NaN if undefined.
@@ -155,7 +96,7 @@ class Head(nn.Module, ABC):
 
     Attributes:
         kind: Kind of the labels that are learned and predicted, see `datamodules.core.labels`.
-        headings: Headings of the scores over a split, in the order of the tables.
+        columns: Names and units of the scores over a split, in the order of the tables.
         main_score: Score that selects the best epoch.
         takes: Input and output of a network for this head, for messages.
         num_outputs: Number of channels of the network's output.
@@ -164,12 +105,12 @@ class Head(nn.Module, ABC):
         suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
             predicted pixels, from which pictures are made. All but the last are usual.
         summary: Name of the summary of an image in the summary file.
-        columns: Names in the summary of an image that ``summary.csv`` lists.
+        summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
     """
 
     kind: ClassVar[str]
-    headings: ClassVar[Mapping[str, Heading]]
+    columns: ClassVar[Mapping[str, ScoreColumn]]
     main_score: ClassVar[str]
     takes: ClassVar[str]
     predict_settings: ClassVar[Sequence[str]] = ()
@@ -178,7 +119,7 @@ class Head(nn.Module, ABC):
     num_outputs: int
     is_metric: bool = True
     suffixes: Mapping[str, str] = MappingProxyType({})
-    columns: Sequence[str] = ()
+    summary_columns: Sequence[str] = ()
 
     def __init__(self, class_names: Sequence[str] = ()) -> None:
         super().__init__()
@@ -248,18 +189,17 @@ class Head(nn.Module, ABC):
         return {}
 
     def mode_of(self, monitor: str) -> str:
-        """Return ``min`` for a loss and for errors, see `Heading.better`; else ``max``.
+        """Return ``min`` for a loss and for errors, see `ScoreColumn.better`; else ``max``.
 
         Args:
             monitor: Name of a logged value, e.g. ``val/miou``.
         """
-        heading = self.headings.get(monitor.partition("/")[2])
-        is_error = heading is not None and heading.better == "lower"
+        column = self.columns.get(monitor.partition("/")[2])
+        is_error = column is not None and column.better == "lower"
         return "min" if is_error or monitor.endswith("loss") else "max"
 
     # From views to a panorama
 
-    @abstractmethod
     def mosaic(
         self,
         shape: tuple[int, int],
@@ -280,8 +220,8 @@ class Head(nn.Module, ABC):
             area: Area of a partial panorama; None for the whole sphere.
             camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
         """
+        raise NotImplementedError
 
-    @abstractmethod
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return the prediction ``(n, h, w)`` of single crops of a photo.
 
@@ -289,6 +229,7 @@ class Head(nn.Module, ABC):
             outputs: Outputs of the network ``(n, C, h, w)``.
             ray_lengths: See `targets`.
         """
+        raise NotImplementedError
 
     def comparable(
         self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None

@@ -21,15 +21,11 @@ from tangent_train.errors import SettingError
 from tangent_train.heads.base import (
     RGB,
     Head,
-    Heading,
-    Interval,
     Painter,
     PredictedImage,
     Scores,
     SummaryTable,
-    by_solid_angle,
     solid_angles,
-    with_solid_angle,
 )
 from tangent_train.heads.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
 from tangent_train.heads.pictures import (
@@ -39,8 +35,10 @@ from tangent_train.heads.pictures import (
     prediction_panel,
 )
 from tangent_train.io.pixel_files import array_file, read_pixels, write_pixels
+from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.metrics.segmentation import (
     AbsentClass,
+    Interval,
     SegmentationCounts,
     SegmentationMetric,
     bootstrap_intervals,
@@ -77,10 +75,10 @@ class ClassesHead(Head):
     """
 
     kind: ClassVar[str] = PIXEL_CLASSES
-    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
-            "macc": Heading("mAcc", "%", "accuracy", "accuracy"),
-            "miou": Heading("mIoU", "%", "iou", "IoU"),
+            "macc": ScoreColumn("mAcc", "%", "accuracy", "accuracy"),
+            "miou": ScoreColumn("mIoU", "%", "iou", "IoU"),
         }
     )
     main_score: ClassVar[str] = "miou"
@@ -113,7 +111,7 @@ class ClassesHead(Head):
         if not 0 <= min_share < 1 or (min_share and not min_confidence):
             expected = "0 to below 1, with min_confidence, which it lowers for single classes"
             raise SettingError("min_share", found=min_share, expected=expected)
-        self.columns = self.class_names
+        self.summary_columns = self.class_names
         self.num_outputs = len(classes)
         self.weighting = class_weights
         self.label_smoothing = label_smoothing

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, ClassVar, get_args
 
 import numpy as np
@@ -16,7 +15,6 @@ from torch import Tensor
 
 from datamodules.core.labels import DISTANCE
 from datamodules.core.panoramas import STEPS_PER_M
-from tangent_train.checkpoints.content import Align, DepthKind
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,
@@ -25,6 +23,7 @@ from tangent_train.checkpoints.distances import (
     is_disparity,
     is_metric,
 )
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
 from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
@@ -32,15 +31,11 @@ from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.heads.base import (
     RGB,
     Head,
-    Heading,
-    Interval,
     Painter,
     PredictedImage,
     Scores,
     SummaryTable,
-    by_solid_angle,
     solid_angles,
-    with_solid_angle,
 )
 from tangent_train.heads.losses import DepthLoss, log_error_sum
 from tangent_train.heads.pictures import (
@@ -60,6 +55,8 @@ from tangent_train.metrics.depth import (
     mean_depth_scores,
     scaled_and_shifted,
 )
+from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
+from tangent_train.metrics.segmentation import Interval
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 
@@ -113,17 +110,17 @@ class DistanceHead(Head):
     """
 
     kind: ClassVar[str] = DISTANCE
-    headings: ClassVar[Mapping[str, Heading]] = with_solid_angle(
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
-            "absrel": Heading("AbsRel", "", better="lower"),
-            "delta1": Heading("δ1"),
-            "rmse": Heading("RMSE", "m", better="lower"),
-            "mae": Heading("MAE", "m", better="lower", is_main=False),
-            "sqrel": Heading("SqRel", "m", better="lower", is_main=False),
-            "rmse_log": Heading("RMSElog", "", better="lower", is_main=False),
-            "delta2": Heading("δ2", is_main=False),
-            "delta3": Heading("δ3", is_main=False),
-            "missing": Heading("missing", better="lower", is_main=False),
+            "absrel": ScoreColumn("AbsRel", "", better="lower"),
+            "delta1": ScoreColumn("δ1"),
+            "rmse": ScoreColumn("RMSE", "m", better="lower"),
+            "mae": ScoreColumn("MAE", "m", better="lower", is_main=False),
+            "sqrel": ScoreColumn("SqRel", "m", better="lower", is_main=False),
+            "rmse_log": ScoreColumn("RMSElog", "", better="lower", is_main=False),
+            "delta2": ScoreColumn("δ2", is_main=False),
+            "delta3": ScoreColumn("δ3", is_main=False),
+            "missing": ScoreColumn("missing", better="lower", is_main=False),
         }
     )
     main_score: ClassVar[str] = "absrel"
@@ -132,7 +129,7 @@ class DistanceHead(Head):
     num_outputs = 1
     summary: ClassVar[str] = "depth"
     unknown: ClassVar[float] = math.nan
-    columns = ("unit", *_ROWS)
+    summary_columns = ("unit", *_ROWS)
 
     def __init__(
         self,

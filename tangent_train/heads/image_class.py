@@ -10,8 +10,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from datamodules.core.labels import IMAGE_CLASS
-from tangent_train.heads.base import Head, Heading, HeadMosaic, Scores
+from tangent_train.heads.base import Head, Scores
 from tangent_train.metrics.classification import ClassificationMetric, classification_scores
+from tangent_train.metrics.score_columns import ScoreColumn
 
 
 class ImageClassHead(Head):
@@ -23,9 +24,9 @@ class ImageClassHead(Head):
     """
 
     kind: ClassVar[str] = IMAGE_CLASS
-    headings: ClassVar[Mapping[str, Heading]] = {
-        "accuracy": Heading("accuracy"),
-        "class_accuracy": Heading("mean over classes", "%", "accuracy", "accuracy"),
+    columns: ClassVar[Mapping[str, ScoreColumn]] = {
+        "accuracy": ScoreColumn("accuracy"),
+        "class_accuracy": ScoreColumn("mean over classes", "%", "accuracy", "accuracy"),
     }
     main_score: ClassVar[str] = "accuracy"
     takes: ClassVar[str] = "views of shapes (B, N, C, h, w) to logits of classes (B, K)"
@@ -56,11 +57,3 @@ class ImageClassHead(Head):
         return Scores(
             means, {"images": found.counts, "accuracy": found.of_class}, confusion=result
         )
-
-    def mosaic(self, *_: Any, **__: Any) -> HeadMosaic:
-        """Not used: a shape has one class."""
-        raise NotImplementedError
-
-    def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Not used: a shape has one class."""
-        raise NotImplementedError

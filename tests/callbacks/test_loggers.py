@@ -26,7 +26,7 @@ from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
 from tangent_train.cli.trainer import build_trainer
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.results.pictures import prediction_panel
+from tangent_train.heads.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
 from tests.decoded import decoded
 from tests.running import composed_settings

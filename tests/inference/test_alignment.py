@@ -26,7 +26,7 @@ from tangent_train.geometry import (
     perspective_directions,
     random_rotation,
 )
-from tangent_train.inference.alignment import (
+from tangent_train.heads.alignment import (
     Alignment,
     ViewSamples,
     align,

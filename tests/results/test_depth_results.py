@@ -18,7 +18,7 @@ from tangent_train.io.gpano import area_of_angles, whole_area
 from tangent_train.io.palette import distance_colors
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 from tangent_train.results.depth_results import DepthResults, points_of, spread_pixels
-from tangent_train.results.pictures import colorize_distance, distance_picture
+from tangent_train.heads.pictures import colorize_distance, distance_picture
 from tangent_train.results.predictions import PredictedImage
 
 RNG = np.random.default_rng(0)
