@@ -99,7 +99,7 @@ class Manifest:
         wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
         if path.is_file():
             cls._check_same(path, wanted)
-        elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        elif folder.exists() and any(path.name[0] != "." for path in folder.iterdir()):
             raise SettingError(
                 "output",
                 found=f"{folder}, which holds other files",

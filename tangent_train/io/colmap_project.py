@@ -6,8 +6,8 @@ of one name in several folders were taken at the same time. So these folders hav
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +44,12 @@ def flat_names(names: Sequence[str]) -> dict[str, str]:
     return flat
 
 
-@dataclass
+@dataclass(frozen=True)
 class ColmapProject:
-    """COLMAP project that is being written.
+    """Project for COLMAP.
 
-    Args:
-        folder: New folder.
+    Attributes:
+        folder: Output folder.
         grid: Views of every panorama.
         level: Level s, see `shrink_to_level`.
         faces: Indices of the rendered images.
@@ -63,26 +63,23 @@ class ColmapProject:
     faces: Sequence[int]
     suffix: str
     interpolation: Interpolation
-    _panoramas: dict[str, str] = field(init=False, default_factory=dict)
 
     @property
     def _prefixes(self) -> dict[str, int]:
         """Faces by prefix of their images."""
         return {f"{face_name(self.grid, face)}/": face for face in self.faces}
 
-    def add(
+    def write_images(
         self,
         name: str,
-        file: str,
         image: NDArray[Any],
         counts: NDArray[np.uint8],
         progress: Callable[[float], object],
     ) -> None:
-        """Render a panorama.
+        """Render the images and masks of a panorama.
 
         Args:
             name: Name of the images, from `flat_names`.
-            file: File name of the panorama in the rig.
             image: ``(H, W)`` or ``(H, W, C)``.
             counts: ``(H', W')``, 0 where pixels are ignored.
             progress: See `write_each`.
@@ -101,8 +98,12 @@ class ColmapProject:
             write_pixels(self.folder / "masks" / f"{path}.png", mask)
 
         write_each(render, self._prefixes, progress)
-        self._panoramas[name + self.suffix] = file
 
-    def write_rig(self) -> None:
-        """Write the ``rig_config.json`` of the panoramas that were added."""
-        write_rig(self.folder / RIG_FILE, self.grid, self._prefixes, self._panoramas)
+    def write_rig(self, panoramas: Mapping[str, str]) -> None:
+        """Write ``rig_config.json``.
+
+        Args:
+            panoramas: File of each panorama by the name of its images.
+        """
+        files = {f"{name}{self.suffix}": file for name, file in panoramas.items()}
+        write_rig(self.folder / RIG_FILE, self.grid, self._prefixes, files)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
-import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import PinholeGrid, equirect_shape
 from tangent_train.io import camera_files
 from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, whole_area
@@ -104,48 +101,25 @@ def write_tangent_folder(
     interpolation: Interpolation,
     progress: Callable[[float], object],
 ) -> None:
-    """Render tangent images to a folder, which appears when it is complete.
+    """Render tangent images to a folder; files of the same names are replaced.
 
     Args:
-        folder: New folder, or a folder of an earlier run, which is replaced.
+        folder: Output folder.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
         cameras: Content of ``cameras.json``.
         interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
     Raises:
-        SettingError: The panorama cannot be rendered, the files cannot hold its pixels, or the
-            folder holds other files.
+        SettingError: The panorama cannot be rendered, or the files cannot hold its pixels.
     """
 
     def render(file: str, face: int) -> None:
         (pixels,) = equirect_to_tangent(image, cameras.grid, [face], interpolation)
-        write_pixels(unfinished / file, pixels)
+        write_pixels(folder / file, pixels)
 
-    with replaced_folder(folder) as unfinished:
-        write_each(render, dict(zip(cameras.files, cameras.faces, strict=True)), progress)
-        camera_files.write_cameras(unfinished / camera_files.CAMERAS_FILE, cameras)
-
-
-@contextmanager
-def replaced_folder(folder: Path) -> Iterator[Path]:
-    """Return a context that fills a folder; the folder appears when the context succeeds.
-
-    Args:
-        folder: New folder, or a folder that holds only files of an earlier run.
-
-    Raises:
-        SettingError: The folder holds other files.
-    """
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = Path(tempfile.mkdtemp(dir=folder.parent, prefix=".partial-"))
-    try:
-        unfinished.chmod(0o755)
-        yield unfinished
-        _remove_earlier(folder)
-        unfinished.rename(folder)
-    finally:
-        shutil.rmtree(unfinished, ignore_errors=True)
+    write_each(render, dict(zip(cameras.files, cameras.faces, strict=True)), progress)
+    camera_files.write_cameras(folder / camera_files.CAMERAS_FILE, cameras)
 
 
 def write_each(
@@ -161,30 +135,3 @@ def write_each(
     with closing(in_threads(lambda face: write(*face), faces.items())) as written:
         for _ in written:
             progress(1 / len(faces))
-
-
-def _remove_earlier(folder: Path) -> None:
-    """Remove a folder that holds only the files of an earlier run."""
-    there = {path.relative_to(folder) for path in folder.rglob("*") if not path.is_dir()}
-    if there:
-        written = _written(folder)
-        if there - written:
-            raise SettingError(
-                "output",
-                found=f"{folder / min(there - written)}, which is not a tangent image of {folder}",
-                expected="a folder that may be replaced",
-                remedy="Move the file, or choose another output.",
-            )
-    if folder.exists():
-        shutil.rmtree(folder)
-
-
-def _written(folder: Path) -> set[Path]:
-    if (folder / camera_files.RIG_FILE).is_file():
-        images = camera_files.read_rig(folder / camera_files.RIG_FILE).images
-        masks = (Path("masks", f"{image}.png") for image in images)
-        return {Path(camera_files.RIG_FILE), *(Path("images", image) for image in images), *masks}
-    return {
-        Path(camera_files.CAMERAS_FILE),
-        *map(Path, camera_files.read_cameras(folder / camera_files.CAMERAS_FILE).files),
-    }

@@ -155,9 +155,9 @@ def test_masks_by_name_and_classes_to_ignore(
     render_with(output=tmp_path / "by_name", mask=tmp_path / "masks", **settings)
     settings["mask"] = tmp_path / "labeled"
     render_with(output=tmp_path / "by_class", mask_classes=["person", "sky"], **settings)
-    by_name, by_class = (contents(tmp_path / name) for name in ("by_name", "by_class"))
+    by_name, by_class = (contents(tmp_path / name / "masks") for name in ("by_name", "by_class"))
     assert by_name == by_class
-    first, second = (by_name[f"masks/face_004/{name}.png"] for name in FRAMES)
+    first, second = (by_name[f"face_004/{name}.png"] for name in FRAMES)
     assert first != second
     message = refused(output=tmp_path / "no", mask_classes=["tripod"], **settings)
     assert "mask_classes: found tripod; expected of wall, sky, person" in message
@@ -176,7 +176,7 @@ def test_the_missing_part_of_a_panorama_is_ignored(tmp_path: Path) -> None:
     settings = {"input": tmp_path / "part.jpg", "base_level": 0, "colmap": True}
     render_with(output=tmp_path / "out", **settings)
     render_with(output=tmp_path / "masked", mask=tmp_path / "white.png", **settings)
-    assert contents(tmp_path / "masked") == contents(tmp_path / "out")
+    assert contents(tmp_path / "masked" / "masks") == contents(tmp_path / "out" / "masks")
     grid = TangentGrid(0, 5)
     for face, directions in enumerate(grid.directions()):
         path = tmp_path / "out" / "masks" / f"face_{face:03}" / "part.png.png"
@@ -233,40 +233,14 @@ def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refuse
     assert not (tmp_path / "poses.json").exists()
 
 
-# Existing files and refused settings.
-
-
-def test_earlier_projects_are_kept_without_overwrite(
-    project: Path, panoramas: Path, refused: Refused
-) -> None:
-    settings = {"input": panoramas, "output": project, "colmap": True, "base_level": 0}
-    before = contents(project)
-    assert "project, which exists" in refused(**settings)
-    (project / "database.db").write_text("mine")
-    assert "project/database.db, which is not a tangent image" in refused(
-        overwrite=True, **settings
-    )
-    (project / "database.db").unlink()
-    assert contents(project) == before
-    render_with(overwrite=True, faces=[3], **settings)
-    assert [path.name for path in (project / "images").iterdir()] == ["face_003"]
-    # Images of the project are not taken for panoramas.
-    tan = project.parent / "tan"
-    render_with(input=project.parent, output=tan, base_level=0)
-    assert {*tan.rglob("cameras.json")} == {
-        tan / "in" / n / "room/cameras.json" for n in ("hall", "kitchen")
-    }
+# Refused settings.
 
 
 def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
     settings = {"input": panoramas, "output": tmp_path / "out", "colmap": True}
-    assert "format: found npy" in refused(format="npy", **settings)
-    assert "figure: found a.png; expected null with colmap" in refused(figure="a.png", **settings)
-    assert "mask_classes: found sky; expected mask=" in refused(mask_classes=["sky"], **settings)
     write_pixels(tmp_path / "mask.jpg", smooth(16))
     message = refused(mask=tmp_path / "mask.jpg", **settings)
     assert "mask.jpg: found JPEG or WebP, which blur masks" in message
     write_pixels(panoramas / "hall__room.png", smooth(16))
     assert "hall/room, which is called hall__room too" in refused(**settings)
     assert not (tmp_path / "out").exists()
-    assert not list(tmp_path.glob(".partial*"))

@@ -1,0 +1,130 @@
+"""Build networks and representations that a file describes.
+
+Any file may come from a stranger. Three rules make building safe: only networks and representations
+of the packages below are built (and those that the user trusts); arguments are plain values, and
+texts are words, never paths or addresses; arguments that name weights or checkpoints are null,
+because the file holds the tensors.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from functools import partial
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+from tangent_train.errors import DataError
+from tangent_train.imports import offline
+
+_PACKAGES = ("models", "segmentation_models_pytorch", "timm", "torch.nn", "torchvision.models")
+"""Packages whose subclasses of `torch.nn.Module` a file may name."""
+
+_VIEWS = "tangent_train.rendering.representations"
+"""Package whose classes a file may name."""
+
+_FUNCTIONS = (
+    *("models.stem.widen_stem", "timm.models._factory.create_model"),
+    *("models.tables.face_neighbors", "models.tables.gnomonic_taps"),
+    *("models.tables.hexagonal_rings", "models.tables.mapped_samples"),
+    "models.tables.mesh_operators",
+)
+"""Functions that a file may name, besides torchvision's functions that build networks."""
+
+_WORD = re.compile(r"([A-Za-z0-9][\w.+ -]*)?", re.ASCII)
+_WEIGHTS = re.compile("weights|pretrained|checkpoint")
+
+
+def build_from_file(section: Any, place: str, path: Path, trust: Collection[str] = ()) -> Any:
+    """Build the network or representation that a section in a file describes.
+
+    Args:
+        section: Section with ``_target_`` and its arguments by name, which may be sections too.
+        place: Name of the section, for messages.
+        path: File, for messages.
+        trust: Packages of the user whose classes and functions the file may name too.
+
+    Raises:
+        DataError: The section names something else, or has arguments that are not allowed, or its
+            class does not accept them.
+    """
+    try:
+        with offline():
+            return _build(section, place, tuple(trust))
+    except DataError as error:
+        raise DataError(
+            path, found=error.found, expected=error.expected, remedy=error.remedy
+        ) from error
+    except Exception as error:  # of the class, for arguments that it does not accept
+        found = f"{place} cannot be built ({type(error).__name__}: {error})"
+        raise DataError(path, found=found, expected="arguments that its class accepts") from error
+
+
+def _build(section: Any, place: str, trust: tuple[str, ...]) -> Any:
+    target = section.get("_target_") if isinstance(section, Mapping) else None
+    if not isinstance(target, str):
+        raise DataError(place, found=f"{place}={section!r}", expected="a section with a _target_")
+    is_trusted = _is_inside(target, trust)
+    function = resolve_name(target) if is_trusted else _allowed(target, place)
+    arguments = {
+        name: _argument(name, value, f"{place}.{name}", trust, is_trusted=is_trusted)
+        for name, value in section.items()
+        if name not in ("_target_", "_partial_", "_convert_", "_recursive_")
+    }
+    make = partial(function, **arguments)
+    return make if section.get("_partial_") is True else make()
+
+
+def _allowed(target: str, place: str) -> Any:
+    """Return the class or function that a file names, if it may name it."""
+    if _is_inside(target, (*_PACKAGES, "tangent_train.rendering")):
+        named = resolve_name(target)
+        # The name may lead to another module through an import there.
+        module = getattr(named, "__module__", None) or ""
+        if isinstance(named, type):
+            from torch import nn
+
+            is_network = issubclass(named, nn.Module) and _is_inside(module, _PACKAGES)
+            if is_network or _is_inside(module, (_VIEWS,)):
+                return named
+        elif f"{module}.{getattr(named, '__name__', '')}" in _FUNCTIONS or _is_builder(named):
+            return named
+    raise DataError(
+        place,
+        found=f"{place}._target_={target}, which would be called",
+        expected=f"a network of {', '.join(_PACKAGES)}, or a representation",
+        remedy=f"If you know this class, and trust the author of the file: trust={target}",
+    )
+
+
+def _is_builder(function: Any) -> bool:
+    """Return True for a registered function of torchvision that builds a network."""
+    from torchvision.models import get_model_builder, list_models
+
+    name = getattr(function, "__name__", "")
+    return name in list_models() and get_model_builder(name) is function
+
+
+def _is_inside(name: str, packages: Collection[str]) -> bool:
+    return any(name == package or name.startswith(f"{package}.") for package in packages)
+
+
+def _argument(
+    name: str, value: Any, place: str, trust: tuple[str, ...], *, is_trusted: bool
+) -> Any:
+    if _WEIGHTS.search(name):
+        return None
+    if isinstance(value, Mapping) and "_target_" in value:
+        return _build(value, place, trust)
+    if isinstance(value, Mapping):
+        return {
+            n: _argument(str(n), v, f"{place}.{n}", trust, is_trusted=is_trusted)
+            for n, v in value.items()
+        }
+    if isinstance(value, list | tuple):
+        return [_argument("", v, place, trust, is_trusted=is_trusted) for v in value]
+    is_plain = value is None or isinstance(value, bool | int | float)
+    if is_plain or (isinstance(value, str) and (is_trusted or _WORD.fullmatch(value))):
+        return value
+    raise DataError(place, found=f"{place}={value!r}", expected="numbers and words")

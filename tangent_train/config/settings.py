@@ -1,0 +1,500 @@
+"""Settings of the commands: name, type, default and comment, once.
+
+A command's class gives Hydra the defaults (`register`), validates what Hydra composed (`validate`),
+and feeds ``--help`` and the reference page with its comments. Options of groups (``data=…``) are
+YAML files; their types are those of the class that they build.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar
+
+from hydra.core.config_store import ConfigStore
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic.fields import FieldInfo
+
+from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
+from tangent_train.errors import SettingError
+from tangent_train.files import config_folder
+
+
+def _existing(path: Path) -> Path:
+    if not path.exists():
+        raise ValueError("an existing file or folder")
+    return path
+
+
+def _as_list(value: Any) -> Any:
+    return value if value is None or isinstance(value, list | tuple) else [value]
+
+
+_Item = TypeVar("_Item")
+OneOrMore = Annotated[tuple[_Item, ...], BeforeValidator(_as_list)]
+"""A list; a single value is a list of it."""
+
+ExistingPath = Annotated[Path, AfterValidator(_existing)]
+Section = dict[str, Any]
+"""Settings of an option of a group."""
+
+Views = str | Section | None
+Blend = Literal["feather", "nearest"]
+Unmapped = Literal["unknown", "never"]
+
+
+class Settings(BaseModel):
+    """Base of all settings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+
+class ImageSettings(Settings):
+    """Settings of commands that read images and videos."""
+
+    input: str | Path | None
+    """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
+    every: int = 1
+    """videos: use the first and then every n-th frame"""
+    area: tuple[float, float, float, float] | None = None
+    """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
+    sphere"""
+
+
+class PredictSettings(ImageSettings):
+    """Settings of tangent-predict."""
+
+    checkpoint: ExistingPath
+    """network, written by tangent-train, tangent-import or tangent-export"""
+    input: str | Path
+    """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
+    output: Path
+    """folder for the results"""
+    label_map: str | Path | None = None
+    """maps the classes to those of another data set: ade20k_to_stanford2d3ds, …, or a JSON file;
+    null = off"""
+    unmapped: Unmapped = "unknown"
+    """pixels where a class without a mapping wins: unknown (label 0) | never (the best mapped
+    class)"""
+    depth: ExistingPath | None = None
+    """folder of depth images with the names of the inputs, for networks with depth"""
+    depth_scale: float = 1000
+    """units per meter in depth files of integers, read or written"""
+    projection: Literal["equirectangular", "perspective"] = "equirectangular"
+    """equirectangular | perspective (photos)"""
+    fill: Literal["black", "mean", "edge", "reflect"] | None = None
+    """colors outside the area, in views that leave it: black | mean (color) | edge (nearest pixel)
+    | reflect; null: as trained"""
+    fov: float | None = None
+    """photos: horizontal field of view in degrees; null = from EXIF"""
+    views: Views = None
+    """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
+    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null = those of
+    the checkpoint"""
+    levels: OneOrMore[int] | None = None
+    """level s, or a list of levels of tangent images to average over; null = levels of the
+    checkpoint"""
+    base_level: int | None = None
+    """base level b: 20·4^b images; null = that of the checkpoint, 0 for imported networks"""
+    blend: Blend = "feather"
+    """joins overlapping images: feather (weighted mean) | nearest"""
+    rotations: int = 1
+    """number of rotations about the vertical to average over"""
+    upright: Literal["pose", "auto"] | None = None
+    """align with gravity: pose (GPano tags) | auto (the same, else estimated); null = off"""
+    max_tilt_deg: float = 60
+    """upright=auto: largest tilt to consider, in degrees"""
+    mask: float | ExistingPath | None = None
+    """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
+    a folder of them; null = none"""
+    min_confidence: float = 0
+    """pixels with a lower confidence (0 to 1) become unknown (0)"""
+    min_share: float = 0
+    """keep at least this share of each class's pixels, the most confident, below min_confidence
+    too; found on up to 32 images"""
+    align: Align | None = None
+    """depth: brings the views to one scale: none | scale | affine | grid (scales that vary within a
+    view); null: by the network's kind of depth"""
+    depth_format: Literal["png", "npy", "exr"] | None = None
+    """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
+    points: int | None = None
+    """depth, write=[points]: points of an image, at most; null = 500000"""
+    write: OneOrMore[str] | None = None
+    """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
+    (PLY); null = all but the last of either; color and overlay of a video are videos"""
+    report: int = 12
+    """images to show in report.html; 0 = no report"""
+    overwrite: bool = False
+    """true: replace earlier results"""
+    resume: bool = False
+    """true: keep existing results and predict the other images"""
+    shard: str | int | None = None
+    """part of the images to predict, e.g. 3/16, for several machines; null = all"""
+    view_batch_size: int | None = None
+    """images per forward pass; null = as many as have 2^20 pixels"""
+    device: str = "auto"
+    """auto | cpu | cuda | cuda:1 | mps"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+
+class RenderSettings(ImageSettings):
+    """Settings of tangent-render."""
+
+    input: str | Path | None = None
+    """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
+    output: Path | None = None
+    """folder for the tangent images; with back=, the file of the panorama"""
+    overwrite: bool = False
+    """true: replace earlier results"""
+    views: Views = None
+    """views: tangent | horizontal | horizontal_economy | cubemap, or 'views={option: horizontal,
+    fov: 110}'; null = tangent"""
+    base_level: int | None = None
+    """base level b: 20·4^b tangent images; null = 1"""
+    level: int | None = None
+    """level s, the angular resolution; null = from the rows of each panorama"""
+    dim: int | None = None
+    """tangent images: side in pixels; smaller crops them, larger adds a margin; null = 2^(s−b).
+    Other views: see views"""
+    faces: OneOrMore[int] | None = None
+    """indices of the images to write, e.g. [0,5]; null = all"""
+    rotation: tuple[float, float, float] | None = None
+    """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
+    format: str = "png"
+    """png | jpg | webp | tif | npy"""
+    interpolation: Literal["bilinear", "nearest"] = "bilinear"
+    """bilinear | nearest (for labels and depth)"""
+    colmap: bool = False
+    """true: one project for COLMAP of all panoramas: images, masks and rig_config.json"""
+    mask: float | ExistingPath | None = None
+    """colmap=true: pixels to ignore: a latitude (-60: below it), a PNG file (black) or a folder of
+    them; null = none"""
+    mask_classes: OneOrMore[str] | None = None
+    """classes to ignore, e.g. [person]; mask is then a folder with labels/ and classes.json"""
+    figure: Path | None = None
+    """PNG file of one panorama and its tangent images; output is then optional"""
+    back: ExistingPath | None = None
+    """folder of results on the tangent images of one panorama, or a folder of such folders"""
+    poses: ExistingPath | None = None
+    """sparse model of COLMAP; the poses of its panoramas are written as JSON"""
+    cameras: ExistingPath | None = None
+    """back=: cameras.json or its folder; null = with the results. poses=: the project; null = two
+    folders up"""
+    blend: Blend = "feather"
+    """joins overlapping images: feather (weighted mean) | nearest; labels and depth are not
+    averaged"""
+    height: int | None = None
+    """rows of the panorama; null = those of the original"""
+    kind: Literal["auto", "color", "labels", "depth", "features"] = "auto"
+    """kind of the results: auto | color | labels | depth | features"""
+    z_depth: bool = False
+    """true: convert z-depth to distance from the center"""
+
+
+class ExportSettings(Settings):
+    """Settings of tangent-export."""
+
+    checkpoint: ExistingPath
+    """network, written by tangent-train, tangent-import or this command (.safetensors)"""
+    output: Path
+    """file: .onnx or .safetensors"""
+    image_size: tuple[int, int] | None = None
+    """fixed size of the images: [height, width]; null = any size that the network accepts"""
+    opset: int | None = None
+    """ONNX operator set; null = default of the exporter"""
+    overwrite: bool = False
+    """true: replace an existing file"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+
+class ImportSettings(Settings):
+    """Settings of tangent-import."""
+
+    library: Literal["torchvision", "huggingface", "smp", "onnx"] | None = None
+    """torchvision | huggingface | smp | onnx; null for an option of the group network"""
+    network: Section | None = None
+    """an option of configs/network, with weights of your own"""
+    model: str | Path | None = None
+    """name of the network in the library or on the hub, or a folder written by save_pretrained"""
+    weights: str | Path | None = None
+    """torchvision: DEFAULT, another name, or a file; options of configs/network: a state dict"""
+    file: ExistingPath | None = None
+    """library=onnx: the ONNX file"""
+    classes: ExistingPath | None = None
+    """JSON list of class names in the order of the scores; null = from the model"""
+    normalization: str | dict[str, tuple[float, ...]] | None = None
+    """imagenet | unit | symmetric | {mean: […], std: […]}; null = from the model"""
+    unknown_classes: OneOrMore[str] = ()
+    """classes whose pixels are unknown, e.g. [background]"""
+    unknown_wins: bool = True
+    """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
+    scores: ScoreKind | None = None
+    """output of the network: logits | probabilities | sigmoid_logits | sigmoid | labels; null =
+    detected"""
+    depth: DepthKind | None = None
+    """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
+    relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
+    or it predicts classes"""
+    image_size: OneOrMore[int] | None = None
+    """fixed size of the images: [rows,columns] or the side; null = from the model"""
+    views: Views = None
+    """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
+    erp_distortion_aware | cubemap, or 'views={option: horizontal, fov: 110}'; null =
+    horizontal_wide, or tangent with levels or base_level"""
+    levels: OneOrMore[int] | None = None
+    """level s, or a list of levels of tangent images; null = from the side of its images, for
+    tangent images two, e.g. [9, 8]"""
+    base_level: int | None = None
+    """base level b: 20·4^b tangent images; null = the fewest, 0 for wide ones"""
+    fov: float = 60
+    """horizontal field of view of its photos in degrees; predictions on photos use it"""
+    output: Path
+    """file: .ckpt, or .onnx for library=onnx"""
+    overwrite: bool = False
+    """true: replace an existing file"""
+
+
+class KeypointSettings(Settings):
+    """Settings of tangent-keypoints."""
+
+    data: Section | None = None
+    """pairs of a data set: synthrooms_pairs | stanford2d3ds_pairs | zind_pairs; unused with left=
+    or input="""
+    output: Path
+    """folder for the results; with the same settings, interrupted results are continued"""
+    left: ExistingPath | None = None
+    """first panorama of a pair of your own, with right="""
+    right: ExistingPath | None = None
+    """second panorama of that pair"""
+    input: str | Path | None = None
+    """folder of your panoramas, or pattern, e.g. 'holiday/*.jpg'"""
+    pairing: Literal["consecutive", "all"] = "consecutive"
+    """pairs from input: consecutive (each panorama with the next) | all"""
+    base_level: OneOrMore[int] = (0, 1, 2)
+    """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
+    level: int | None = None
+    """level s, the angular resolution, at most that of the panorama; null = from its rows"""
+    margin: int = 32
+    """pixels added around tangent images, so that keypoints at borders are found"""
+    ratio: float = 0.8
+    """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 = off
+    ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 = off"""
+    mutual: bool = True
+    """true: mutual nearest neighbors only"""
+    max_error_deg: float = 1
+    """largest error of inliers of the two-view geometry, in degrees"""
+    seed: int = 0
+    """seed of random samples and rotations"""
+    controls: bool = True
+    """true: also the panorama at the resolution of the tangent images, a cube map, and the right
+    panorama rotated"""
+    max_pairs: int | None = None
+    """compare the first pairs only; null = all"""
+    pictures: int = 2
+    """pairs whose matches are drawn"""
+    export: bool = False
+    """true: write keypoints and matches as COLMAP databases"""
+
+
+class RunSettings(Settings):
+    """Settings of a run, which experiments may set."""
+
+    data: Section
+    """data set"""
+    representation: Section
+    """views of a panorama that the network is given"""
+    network: Section | None = None
+    """network that is trained"""
+    task: Section
+    """segmentation | classification | depth"""
+    optimizer: Section | None = None
+    """adam | adamw"""
+    scheduler: Section | None = None
+    """schedule of the learning rate"""
+    trainer: Section
+    """default | ddp (several processes)"""
+    logger: Section | None = None
+    """csv | tensorboard | wandb | mlflow | many | none"""
+    callbacks: Section | None = None
+    """early_stopping | model_summary; null = none"""
+    name: str = "run"
+    """first folder below runs/"""
+    seed: int = 0
+    """seed of initial weights, order, images and augmentation"""
+    level: int = 5
+    """level s, the angular resolution: panoramas of 2^(s+1) rows"""
+    panels: int = 6
+    """test images drawn as panels and shown in report.html (segmentation and depth)"""
+    validation_images: int = 4
+    """validation images shown by loggers that can show images (segmentation and depth)"""
+    checkpoint_every_n_steps: int | None = 500
+    """training steps between checkpoints, besides those of every epoch; null = every epoch only"""
+    ema: float | None = None
+    """decay of the average of the weights, e.g. 0.999; the average is evaluated and stored; null =
+    off"""
+
+
+class TrainSettings(RunSettings):
+    """Settings of tangent-train."""
+
+    init_from: ExistingPath | None = None
+    """fine-tuning: checkpoint, state dict or safetensors that the network starts from; null = new
+    weights"""
+    resume: ExistingPath | None = None
+    """folder of an interrupted run, which is continued with its settings"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+
+class EvaluateSettings(RunSettings):
+    """Settings of tangent-evaluate."""
+
+    checkpoint: ExistingPath
+    """network, written by tangent-train, tangent-import or tangent-export"""
+    label_map: str | Path | None = None
+    """maps the classes of the network to those of the data: ade20k_to_stanford2d3ds, …, or a JSON
+    file; null = same classes"""
+    unmapped: Unmapped = "unknown"
+    """pixels where a class without a mapping wins: unknown (counted as wrong) | never (the best
+    mapped class)"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+
+class PrepareSettings(RunSettings):
+    """Settings of tangent-prepare."""
+
+    shard: str | int | None = None
+    """part of the store to prepare, e.g. 3/16, for several machines; null = all"""
+
+
+class PhotoSettings(Settings):
+    """Settings of the photos of a transfer."""
+
+    data: Section | None = None
+    """data set of the photos; null with checkpoint= only"""
+    representation: Section
+    """crops of the photos"""
+
+
+class FineTuningOptimizer(Settings):
+    """Changes of the optimizer in fine-tuning."""
+
+    lr: float | None = None
+    """learning rate; null = a tenth of optimizer.lr"""
+
+
+class FineTuningSettings(Settings):
+    """Settings of the fine-tuning of a transfer."""
+
+    epochs: OneOrMore[int] = (1, 10)
+    """epochs of each fine-tuning: [1, 10] gives P-FT-1, S-FT-1, P-FT-10, S-FT-10; [] = none"""
+    optimizer: FineTuningOptimizer = FineTuningOptimizer()
+    """optimizer of the fine-tuning; other settings are those of optimizer"""
+    scheduler: Section | None = None
+    """schedule of the learning rate in fine-tuning"""
+
+
+class TransferSettings(RunSettings):
+    """Settings of tangent-transfer."""
+
+    name: str = "transfer"
+    """folder below runs/transfer; the same name continues an interrupted transfer"""
+    level: int = 8
+    """level s of the panoramas and of the crops of photos"""
+    seeds: OneOrMore[int] | None = None
+    """one transfer per seed, e.g. [0, 1, 2]; null = seed"""
+    folds: OneOrMore[int] | None = None
+    """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, or no folds"""
+    checkpoint: ExistingPath | None = None
+    """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
+    label_map: str | Path | None = None
+    """maps the classes of such a file to those of the data: ade20k_to_stanford2d3ds, …, or a JSON
+    file; null = same"""
+    unmapped: Unmapped = "unknown"
+    """pixels where a class without a mapping wins: unknown (counted as wrong) | never (the best
+    mapped class)"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+    compare: OneOrMore[str | Section] = ("erp", "cubemap")
+    """further views to evaluate P on: names of representations, or settings, e.g. {name: fine,
+    option: erp, rows: 1024}"""
+    conditions: OneOrMore[str | Section] = ("upright",)
+    """test conditions: upright, or settings of data, e.g. {name: tilted-45, test_rotation: 45,
+    upright: auto}"""
+    fine_tuning: FineTuningSettings
+    """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
+    study_levels: OneOrMore[int] | None = None
+    """evaluate P only, on panoramas of these levels, e.g. [5, 6, 7, 8, 9, 10]; null = off"""
+    study_max_rows: int = 512
+    """rows of the stored panoramas; finer levels are rendered from them"""
+    photos: PhotoSettings
+    """the photos"""
+
+
+SETTINGS: Mapping[str, type[Settings]] = {
+    "check": RunSettings,
+    "evaluate": EvaluateSettings,
+    "export": ExportSettings,
+    "import": ImportSettings,
+    "keypoints": KeypointSettings,
+    "predict": PredictSettings,
+    "prepare": PrepareSettings,
+    "render": RenderSettings,
+    "train": TrainSettings,
+    "transfer": TransferSettings,
+}
+"""Settings by the name of the command."""
+
+
+def comment(field: FieldInfo) -> str:
+    """Return the comment of a setting in one line."""
+    return " ".join((field.description or "").split())
+
+
+def register(command: str) -> None:
+    """Give Hydra the default settings of a command, as the config ``settings``."""
+    ConfigStore.instance().store("settings", _defaults(SETTINGS[command]))
+
+
+def _defaults(kind: type[Settings]) -> dict[str, Any]:
+    """Return the defaults of a command's settings; ``???`` marks those that must be given.
+
+    The groups are left out, because the defaults list of the command chooses their options.
+    """
+    values: dict[str, Any] = {}
+    for name, field in kind.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
+            values[name] = _defaults(field.annotation)
+        elif not (config_folder() / name).is_dir():
+            values[name] = "???" if field.is_required() else field.default
+    return values
+
+
+def validate(command: str, values: Mapping[str, Any]) -> Any:
+    """Return the settings of a command as an object of its class.
+
+    Args:
+        command: Name of the command, e.g. predict.
+        values: Composed settings, resolved.
+
+    Raises:
+        SettingError: A setting is missing, unknown, or of another type.
+    """
+    try:
+        return SETTINGS[command].model_validate({n: v for n, v in values.items() if v != "???"})
+    except ValidationError as error:
+        first, *_ = errors = error.errors(include_url=False)
+    name, fields, value = "", SETTINGS[command].model_fields, values
+    for part in first["loc"]:
+        if not isinstance(value, Mapping) or (part not in value and first["type"] != "missing"):
+            break
+        name, value = f"{name}.{part}".lstrip("."), value.get(str(part))
+    if first["type"] == "missing":
+        raise SettingError(name, found="nothing", expected=comment(fields[name]))
+    of_setting = [e for e in errors if e["loc"][: name.count(".") + 1] == tuple(name.split("."))]
+    expected = dict.fromkeys(str(e.get("ctx", {}).get("error") or e["msg"]) for e in of_setting)
+    kinds = [text.removeprefix("Input should be ") for text in expected]
+    raise SettingError(name, found="null" if value is None else value, expected=" or ".join(kinds))
