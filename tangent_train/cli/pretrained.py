@@ -75,10 +75,11 @@ def with_pretrained_network(
         trust = parse_settings(Trust, settings).trust
         source = SettingsFile(path, trust, settings.keys() - {"network"})
         notes.append(f"Network of {path}: {target} (another: network=…)")
-    if description.depth_kind is not None and "depth_kind" in changed["task"]:
-        kind = changed["task"]["depth_kind"] or description.depth_kind
-        changed["task"] = changed["task"] | {"depth_kind": kind}
-        notes.append(f"Output of the network: {kind} (another: task.depth_kind=…)")
+    head = changed["task"]["head"]
+    if description.depth_kind is not None and "depth_kind" in head:
+        kind = head["depth_kind"] or description.depth_kind
+        changed["task"] = changed["task"] | {"head": head | {"depth_kind": kind}}
+        notes.append(f"Output of the network: {kind} (another: task.head.depth_kind=…)")
     normalization = _normalization(description, changed["data"])
     if normalization is not None:
         changed["data"] = changed["data"] | {"normalization": normalization}
@@ -153,7 +154,7 @@ def _normalization(
 def _heads(run: Run) -> set[str]:
     """Return the names of the tensors whose shape depends on the number of classes."""
     section, data = run.settings["network"], run.data
-    outputs = run.task.num_outputs(data.num_classes)
+    outputs = run.task.head.num_outputs
     more = completed_settings(section, data.in_channels, outputs + 1, restored=True)
     larger = build_from_config(more, "network", run.source).state_dict()
     tensors = run.task.network.state_dict()

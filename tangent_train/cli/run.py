@@ -113,8 +113,8 @@ class Run:
         # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
         config = {name: value for name, value in self.settings.items() if name != "logger"}
         contents = {
-            "predicts": self.task.predicts,
-            "depth_kind": self.task.depth_kind,
+            "predicts": self.task.head.kind,
+            "depth_kind": getattr(self.task.head, "depth_kind", None),
             "config": config,
             **inputs_and_classes(self.data),
         }
@@ -132,13 +132,13 @@ class Run:
             content = read_checkpoint(checkpoint)
             check_fits(self.data, content, checkpoint)
             self._load(content["state_dict"], checkpoint)
-        by_classes = self.task.predicts == PIXEL_CLASSES  # else upright=auto is by the image alone
+        by_classes = self.task.head.kind == PIXEL_CLASSES  # else upright=auto is by the image alone
         if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        record = self.task.evaluation_result(self.task.result, noun) if tested else None
+        record = self.task.evaluation_result(noun) if tested else None
         images = record.images if record else 0
         if record and images == total:
             record = replace(record, groups=self._groups(trainer.world_size))
@@ -159,7 +159,7 @@ class Run:
                 places[group].append(place)
         return [
             {"group": group, "images": len(some)}
-            | plain_scores(self.task.scores_of(self.task.result, some))
+            | plain_scores(self.task.head.scores_of(self.task.result, some))
             for group, some in sorted(places.items())
         ]
 
@@ -200,7 +200,7 @@ class Run:
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         record = replace(
             record,
-            protocol={**self.data.facts, **self.task.facts},
+            protocol={**self.data.facts, **self.task.head.facts},
             checkpoint=name,
             label_map=self.settings.get("label_map"),
             settings=dict(flat_settings(self.settings)),
@@ -213,7 +213,7 @@ class Run:
             f"Evaluation of {checkpoint.name}",
             tables=[*tables, *([confusion_table(record)] if record.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
-            class_names=self.task.class_names,
+            class_names=self.task.head.class_names,
             notes=[*summary, *notes],
         )
         for line in (*self.notes, *summary):
@@ -244,13 +244,12 @@ def build(
     """
     data = build_data(settings, source)
     restored = settings.get("resume") is not None or settings.get("checkpoint") is not None
-    count_outputs = getattr(resolve_target(settings["task"], "task", source), "num_outputs", int)
-    outputs = count_outputs(data.num_classes)
+    head = _build_head(settings, data, source)
     section = completed_settings(
-        settings.get("network"), data.in_channels, outputs, restored=restored
+        settings.get("network"), data.in_channels, head.num_outputs, restored=restored
     )
     network = build_from_config(section, "network", source)
-    task = _build_task(settings, data, network, source, trains=trains)
+    task = _build_task(settings, data, network, head, source, trains=trains)
     try_network(task, data.in_channels)
     if trains:
         try_training(task, data, settings)
@@ -265,12 +264,11 @@ def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) 
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = open_data(settings, source)
     data.check_classes()
-    task = resolve_target(settings["task"], "task", source)
-    needed = getattr(task, "labels", data.labels)
+    needed = resolve_target(settings["task"]["head"], "task.head", source).kind
     if needed != data.labels:
         raise SettingError(
             "task",
-            found=f"{getattr(task, '__name__', task)}, which needs {needed}",
+            found=f"a head for {needed}",
             expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
         )
     return data
@@ -284,9 +282,10 @@ def open_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -
         source: File that settings come from, see `build_from_config`.
     """
     representation = build_from_config(settings["representation"], "representation", source)
-    task, data_set = (resolve_target(settings[s], s, source) for s in ("task", "data"))
+    head = resolve_target(settings["task"]["head"], "task.head", source)
+    data_set = resolve_target(settings["data"], "data", source)
     is_images = isinstance(data_set, type) and issubclass(data_set, ImageDataModule)
-    has_distances = is_images and getattr(task, "labels", None) == DISTANCE
+    has_distances = is_images and head.kind == DISTANCE
     given: dict[str, Any] = {"labels": DISTANCE} if has_distances else {}
     given["representation"] = representation
     return build_from_config(settings["data"], "data", source, **given)
@@ -308,9 +307,9 @@ def build_trained(
     Raises:
         SettingError: The network does not fit the data, or the label map fits neither of them.
     """
-    task = resolve_target(settings["task"], "task", source)
+    kind = resolve_target(settings["task"]["head"], "task.head", source).kind
     remedy = "Choose the task of the network: task=segmentation for classes, task=depth for depth."
-    trained.check_predicts(getattr(task, "predicts", ""), remedy)
+    trained.check_predicts(kind, remedy)
     data = build_data(settings, source)
     notes = []
     if settings.get("label_map") is not None:
@@ -320,7 +319,9 @@ def build_trained(
         trained, notes = mapped.trained, [f"Label map {label_map.name}: {mapped}."]
     check_fits(data, inputs_and_classes(trained), settings["checkpoint"])
     check_size(trained, data.representation.image_size)
-    task = _build_task(settings, data, trained.network, source, trains=False)
+    given = {} if trained.depth_kind is None else {"depth_kind": trained.depth_kind}
+    head = _build_head(settings, data, source, **given)
+    task = _build_task(settings, data, trained.network, head, source, trains=False)
     return data, task, notes
 
 
@@ -353,10 +354,18 @@ def inputs_and_classes(data: Any) -> dict[str, Any]:
     return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
 
 
+def _build_head(
+    settings: Mapping[str, Any], data: Any, source: SettingsFile | None, **given: Any
+) -> Any:
+    section = settings["task"]["head"]
+    return build_from_config(section, "task.head", source, class_names=data.class_names, **given)
+
+
 def _build_task(
     settings: Mapping[str, Any],
     data: Any,
     network: nn.Module,
+    head: Any,
     source: SettingsFile | None,
     *,
     trains: bool,
@@ -370,12 +379,12 @@ def _build_task(
         scheduler = build_from_config(section, "scheduler", source)
         parts["scheduler"] = Schedule(scheduler, **timing)
     return build_from_config(
-        settings["task"],
+        {name: value for name, value in settings["task"].items() if name != "head"},
         "task",
         source,
         network=network,
         representation=data.representation,
-        class_names=data.class_names,
+        head=head,
         **parts,
     )
 

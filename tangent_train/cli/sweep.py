@@ -84,12 +84,13 @@ def run_job(
 def _check_direction(config: DictConfig, direction: object) -> None:
     """Refuse to search for the worst score: errors are minimized."""
     with elsewhere():  # imports torch
-        task = resolve_target(OmegaConf.to_container(config.task), "task")
-    if isinstance(direction, str) and hasattr(task, "mode_of"):
-        expected = f"{task.mode_of(task.monitor)}imize"
+        head = resolve_target(OmegaConf.to_container(config.task.head), "task.head")
+    if isinstance(direction, str):
+        is_error = head.columns[head.main_score].better == "lower"
+        expected = "minimize" if is_error else "maximize"
         if direction != expected:
             raise SettingError(
                 "hydra.sweeper.direction",
                 found=direction,
-                expected=f"{expected}, for {task.monitor}",
+                expected=f"{expected}, for val/{head.main_score}",
             )

@@ -62,7 +62,7 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
     checkpoints = run.folder / "checkpoints"
     needed = _settings_to_type_again(_remember(run))
     last = LastCheckpoint(checkpoints, settings["checkpoint_every_n_steps"], needed)
-    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.mode_of(run.task.monitor))
+    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
     trainer = run.trainer([last, best])
     if settings["ema"] is not None:  # the first callback: the saved average has the last step
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings["ema"])

@@ -65,7 +65,7 @@ def build_trainer(
     if epochs not in (None, -1):
         at_least("trainer.max_epochs", epochs, 1)
     loggers = _build_entries(settings, "logger", {"save_dir": str(folder), **_logger_names(folder)})
-    monitor = {"monitor": task.monitor, "mode": task.mode_of}
+    monitor = {"monitor": task.monitor, "mode": task.head.mode_of}
     plugins = section.pop("plugins", None) or []
     numbered = dict(enumerate(plugins if isinstance(plugins, list) else [plugins]))
     own_plugins = _build_entries({"trainer.plugins": numbered}, "trainer.plugins", {})

@@ -144,10 +144,14 @@ class PixelTask(Task):
         for fields in zip(*batch, strict=True):
             sample: EvaluationSample[Tensor] = EvaluationSample(*fields)
             truth = self.head.truth(sample.target)
-            is_panorama = truth.ndim == 2
-            predict = self.predict_panorama if is_panorama else self.predict_crops
-            lengths = None if is_panorama else sample.ray_lengths
-            prediction = self.head.comparable(predict(sample, truth), truth, lengths)
+            if truth.ndim == 2:
+                area = SphereArea.of_numbers(sample.area.cpu().numpy())
+                where = sample.rotation.cpu().numpy(), area
+                predicted = self.predict_panorama(sample.images, tuple(truth.shape), *where, truth)
+                prediction = self.head.comparable(predicted, truth)
+            else:
+                predicted = self.predict_crops(sample, truth)
+                prediction = self.head.comparable(predicted, truth, sample.ray_lengths)
             self.metric.update(prediction, truth)
             predictions.append(prediction)
         return torch.stack(predictions)
@@ -163,25 +167,31 @@ class PixelTask(Task):
         return torch.cat(predictions)
 
     def predict_panorama(
-        self, sample: EvaluationSample[Tensor], truth: Tensor | None = None
+        self,
+        images: Float[Tensor, "images channels height width"],
+        shape: Any,
+        rotation: NDArray[np.float64] | None = None,
+        area: SphereArea | None = None,
+        truth: Tensor | None = None,
     ) -> Tensor:
-        """Predict every pixel of a panorama ``(H, W)``, see `Head`.
+        """Predict every pixel of a panorama, see `Head`.
 
         Args:
-            sample: Images of all view sets of the representation, in this order; area, rotation.
+            images: Images of all view sets of the representation, in this order.
+            shape: ``(H, W)`` of the panorama.
+            rotation: Rotation of the representation ``(3, 3)``.
+            area: Area of a partial panorama; None for the whole sphere.
             truth: Result of `Head.truth`, to add to the validation loss, except in a test.
         """
-        area = SphereArea.of_numbers(sample.area.cpu().numpy())
-        sets = self.view_sets(sample.images, sample.rotation.cpu().numpy(), area)
-        shape: Any = tuple(sample.target.shape)
-        how: dict[str, Any] = {"averaged": len(sets) > 1, "device": sample.images.device}
+        sets = self.view_sets(images, rotation, area)
+        how: dict[str, Any] = {"averaged": len(sets) > 1, "device": images.device}
         mosaic = self.head.mosaic(shape, self.representation.blend, area=area, **how)
         for views, outputs in scored_views(self, sets, self.eval_view_batch_size):
             mosaic.add(outputs, views)
             if truth is not None and not self.is_tested:
                 lengths = torch.from_numpy(views.ray_lengths()).to(outputs.device)
                 self._add_loss(outputs, labels_of_views(truth, views), lengths)
-        return mosaic.pixels().to(sample.images.device)
+        return mosaic.pixels().to(images.device)
 
     def _add_loss(self, outputs: Tensor, truth: Tensor, lengths: Tensor) -> None:
         """Add the loss of views, without auxiliary outputs, to the validation loss."""

@@ -25,11 +25,11 @@ from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
 from tangent_train.cli.trainer import build_trainer
-from tangent_train.rendering import TangentRepresentation
 from tangent_train.heads.pictures import prediction_panel
-from tangent_train.tasks import SegmentationTask
+from tangent_train.rendering import TangentRepresentation
 from tests.decoded import decoded
 from tests.running import composed_settings
+from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import Shapes, shape_task
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
@@ -69,7 +69,7 @@ def trained(
     data = Stanford2D3DS(stanford_root, TANGENT, batch_size=2, **split)
     torch.manual_seed(0)
     sgd = partial(torch.optim.SGD, lr=0.1)
-    task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
+    task = segmentation_task(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
@@ -231,7 +231,7 @@ def test_the_same_images_are_shown_after_every_validation(
         normalization: Any = data.normalization
         inputs = render_inputs(panorama, TANGENT.view_sets()[0], data.inputs)
         images = normalize(inputs, normalization, data.inputs)
-        labels = task.predict_labels(images, (32, 64)).numpy()
+        labels = predict_labels(task, images, (32, 64)).numpy()
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
         np.testing.assert_array_equal(shown[tag][-1], expected)
 
@@ -265,7 +265,7 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
         with torch.no_grad():
             scores = task.network(normalize(inputs, normalization, data.inputs)).double()
         labels = views.render(panorama.labels, "nearest").astype(np.int64)
-        weights = np.insert(task.class_weights.double().numpy(), 0, 0)[labels]
+        weights = np.insert(task.head.class_weights.double().numpy(), 0, 0)[labels]
         chosen = scores.log_softmax(1).gather(1, torch.tensor(labels).clamp(min=1)[:, None] - 1)
         total -= float((chosen[:, 0].numpy() * weights).sum())
         norm += float(weights.sum())
@@ -276,7 +276,7 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     task: Any = shape_task()
     _fit(tmp_path, Shapes(), task, "logger=csv", "validation_images=0")
     scalars = _of_csv(tmp_path)
-    of_classes = [scalars[f"val_accuracy/{name}"] for name in task.class_names]
+    of_classes = [scalars[f"val_accuracy/{name}"] for name in task.head.class_names]
     assert [step for step, _ in of_classes[0]] == VALIDATIONS
     mean = np.mean([values[-1][1] for values in of_classes])
     assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)

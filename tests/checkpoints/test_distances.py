@@ -131,7 +131,7 @@ def write_depth_checkpoint(path: Path, **changes: Any) -> Path:
 
 @pytest.mark.parametrize("kind", [None, "relative_disparity"])
 def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path: Path) -> None:
-    """The checkpoint of a run contains no kind: it is that of `DepthTask`."""
+    """The checkpoint of a run contains no kind: it is that of `PixelTask`."""
     changes = {} if kind is None else {"depth_kind": kind}
     path = write_depth_checkpoint(tmp_path / "net.ckpt", **changes)
     trained, described = load_network(path), describe_network(path)

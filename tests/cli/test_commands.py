@@ -33,7 +33,7 @@ from tangent_train.cli.trials import find_fault
 from tangent_train.console import print_text
 from tangent_train.results.evaluation_result import load_result
 from tangent_train.results.tables import Table
-from tangent_train.tasks.segmentation import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.cli.tiny_runs import SETTINGS, SMALL_ROOMS, Run, results
 from tests.running import run_python
 
@@ -117,7 +117,7 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
     rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     weights: list[dict[str, torch.Tensor]] = []
-    step = SegmentationTask.training_step
+    step = PixelTask.training_step
 
     def kept(task: SegmentationTask, *arguments: Any) -> torch.Tensor:
         weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
@@ -394,7 +394,7 @@ def test_impossible_settings_are_refused_before_any_data_is_made(
         ("train", "levl=5", "Key 'levl' is not in struct"),
         ("evaluate", "levels=9", "Is representation.levels meant?"),
         ("train", "area=[0,1,2,3]", "Is data.area meant?"),
-        ("train", "task.alignment=none", "It is a setting of task=depth"),
+        ("train", "task.head.alignment=none", "It is a setting of task=depth"),
         ("train", "representation.margin=1", "It is a setting of representation=cubemap"),
         ("transfer", "photos.data.rot=x", "Is photos.data.root meant?"),
         ("train", "experiment=rooms/demmo", "Is rooms/demo or rooms/depth or "),

@@ -15,12 +15,13 @@ from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import SphereArea
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks.segmentation import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.inference.trained import (
     CUBE,
@@ -32,6 +33,7 @@ from tests.inference.trained import (
     trained_network,
 )
 from tests.models.sphere_networks import awake, small_context
+from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import quiet_trainer
 
 SGD = functools.partial(torch.optim.SGD, lr=1.0)
@@ -70,10 +72,10 @@ def write_both(root: Path, angles: tuple[float, ...] = AREA) -> tuple[Path, Path
     return root / "whole", root / "part"
 
 
-def _task(kind: str, network: nn.Module | None = None) -> SegmentationTask:
+def _task(kind: str, network: nn.Module | None = None) -> PixelTask:
     made = build_from_config(KINDS[kind], "representation")
     inner = network or color_network(kernel=1)
-    return SegmentationTask(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
+    return segmentation_task(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
 
 
 def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanoramas:
@@ -93,7 +95,8 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
         metric = task.build_metric()
         for plain in data.test_dataloader():
             batch: Any = data.on_after_batch_transfer(plain, 0)
-            predicted = task.predict_labels(
+            predicted = predict_labels(
+                task,
                 batch.images[0],
                 tuple(batch.target[0].shape),
                 batch.rotation[0].numpy(),
@@ -140,7 +143,8 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     zenith = None if up is None else np.array(up) / np.linalg.norm(up)
     data.source("test")._kept = [panorama._replace(up=zenith)] * 2
     batch: Any = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
-    expected = task.predict_labels(
+    expected = predict_labels(
+        task,
         batch.images[0],
         tuple(batch.target[0].shape),
         batch.rotation[0].numpy(),
@@ -152,7 +156,7 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         views = PanoramaViews(trained, None, None, views.blend, 2)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)
-    labels = Predictor(trained, views).predict(image).labels()
+    labels = Predictor(trained, head_of(trained), views).predict(image).labels()
     cut = data.canvas.cut
     assert len(np.unique(cut(labels.numpy()))) > 1
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
@@ -212,7 +216,7 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
         assert batch.images.shape[:2] == (2, len(data.representation.view_sets()[0]))
         images, labels = task.training_pairs(batch)
         losses.append(
-            float(task.loss_sum((images,), labels).detach()) / float(task.loss_norm(labels))
+            float(task.loss_sum((images,), labels).detach()) / float(task.head.loss_norm(labels))
         )
         weights = data.class_weights("log")
     assert capsys.readouterr().out == "", (

@@ -16,6 +16,7 @@ from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.export import export_network
 from tangent_train.inference.images import InputImage
@@ -130,7 +131,9 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     merged = LabelMap("pairs", None, {f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network, label in ((trained, 18), (map_classes(trained, merged).trained, 18)):
         views = PanoramaViews(network)
-        mosaic = Predictor(network, views, min_confidence=0.5).predict(InputImage(rgb))
+        mosaic = Predictor(network, head_of(network), views, min_confidence=0.5).predict(
+            InputImage(rgb)
+        )
         assert set(np.unique(network.labels(mosaic.labels()))) == {label}
 
 

@@ -10,9 +10,9 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from tangent_train.config.setting_rules import flat_settings
+from tangent_train.heads import ClassesHead
 from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.published import facts
-from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")
 BANDS = ((45.0, 90.0), (-90.0, 45.0))
@@ -54,7 +54,7 @@ def made_record(
         OmegaConf.update(config, name.replace("__", "."), value)
     flat = dict(flat_settings(OmegaConf.to_container(config)))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
-    columns, mean = SegmentationTask.columns, sum(present) / len(present)
+    columns, mean = ClassesHead.columns, sum(present) / len(present)
     of_class = [heading.of_class for heading in columns.values()]
     return EvaluationResult(
         "panoramas",

@@ -13,13 +13,13 @@ from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
+from tangent_train.heads import DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
 from tangent_train.results.comparisons import runs_report, transfer_report
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
 from tangent_train.results.published import Comparison, facts, publications, published_lines
 from tangent_train.results.report import Report
 from tangent_train.results.rows import Row
-from tangent_train.tasks import ClassificationTask, DepthTask
 from tests.decoded import decoded
 from tests.results.made_records import PROTOCOL, made_record, without_solid_angle
 
@@ -215,7 +215,7 @@ def test_reports_of_shapes_name_their_rotations() -> None:
         "representation.base_level": 0,
     }
     means = {"accuracy": 0.8, "class_accuracy": 0.7}
-    columns = ClassificationTask.columns
+    columns = ImageClassHead.columns
     record = EvaluationResult("shapes", 120, columns, means, classes, settings=settings)
     aligned = replace(record, protocol=facts("paper_modelnet40"))
     rotated = replace(record, protocol={**aligned.protocol, "test_rotation": "so3"})
@@ -253,8 +253,8 @@ def test_published_depth_has_its_units_and_the_smallest_error_is_named(
     uncached = publications.__wrapped__
     monkeypatch.setattr("tangent_train.results.published.publications", uncached)
     protocol = facts("stanford2d3ds_depth")
-    means = dict.fromkeys(DepthTask.columns, 0.25)
-    record = EvaluationResult("panoramas", 2, DepthTask.columns, means, protocol=protocol)
+    means = dict.fromkeys(DistanceHead.columns, 0.25)
+    record = EvaluationResult("panoramas", 2, DistanceHead.columns, means, protocol=protocol)
     aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
     (table,) = Comparison.of([aligned]).tables(aligned)
     assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
@@ -268,7 +268,7 @@ def test_published_depth_has_its_units_and_the_smallest_error_is_named(
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
-    columns = DepthTask.columns
+    columns = DistanceHead.columns
     means = dict.fromkeys(columns, 0.25)
     protocol = {"data": "Stanford2D3DS", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}

@@ -14,7 +14,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
 from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
 from tangent_train.cli.run import build, inputs_and_classes
 from tangent_train.config.build import SettingsFile, build_from_config
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
 
@@ -54,7 +54,7 @@ def small_trained(
     )
 
 
-def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
+def save_checkpoint(path: Path, *overrides: str) -> PixelTask:
     """Write the checkpoint of a run, without entries of Lightning.
 
     Args:
@@ -73,5 +73,5 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
     with_statistics(task.network)
     content = {"config": settings, "predicts": task.predicts, **inputs_and_classes(data)}
     torch.save(content | {"state_dict": task.state_dict()}, path)
-    trained: SegmentationTask = task.eval()
+    trained: PixelTask = task.eval()
     return trained

@@ -112,7 +112,7 @@ def test_a_search_without_a_validation_split_is_refused(
 def test_a_search_for_the_worse_score_is_refused_before_the_first_run(
     rooms: str, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    package = ROOT / "tests" / "tasks" / "toy_regression"
+    package = ROOT / "tests" / "heads" / "toy_share"
     monkeypatch.syspath_prepend(package.parent)
     toy = (f"--config-dir={package / 'configs'}", "task=share", "representation.base_level=0")
     settings = (*SMALL_ROOMS, rooms, "network.widths=[4,8]", "trainer.max_epochs=1")
