@@ -12,7 +12,6 @@ from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import UNet
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.geometry import SphereArea
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -23,36 +22,35 @@ WHOLE, PART = "whole panorama", "35° above and below the horizon"
 
 
 def area(quick: bool) -> Iterator[Table]:
-    """Yield a table of the time of a small UNet, for tangent and equirectangular images."""
+    """Yield a table of the time of a small UNet for tangent images."""
     level = 5 if quick else 8
     torch.manual_seed(0)
     network = UNet(3, 13, (16, 24, 32, 48)).eval()
     rows = 2 ** (level + 1)
     rgb = np.random.default_rng(0).integers(0, 256, (rows, 2 * rows, 3), np.uint8)
-    canvas = PanoramaArea.on_canvas(SphereArea(-180, 180, -35.15625, 35.15625), rows)
+    canvas = PanoramaArea.on_canvas((-180, 180, -35.15625, 35.15625), rows)
     images = {
         WHOLE: InputImage(rgb),
         PART: InputImage(canvas.place(canvas.cut(rgb)), area=canvas),
     }
-    for name in ("tangent", "equirect"):
-        settings = {
-            "_target_": f"tangent_train.rendering.{name.capitalize()}Representation",
+    trained = LoadedNetwork(
+        network,
+        ("unknown", *map(str, range(13))),
+        ("rgb",),
+        RGB_NORMALIZATION,
+        level,
+        {
+            "_target_": "tangent_train.rendering.TangentRepresentation",
+            "base_level": 0,
             "level": level,
-        } | ({"base_level": 0} if name == "tangent" else {})
-        trained = LoadedNetwork(
-            network,
-            ("unknown", *map(str, range(13))),
-            ("rgb",),
-            RGB_NORMALIZATION,
-            level,
-            settings,
-            (rows, 2 * rows) if name == "equirect" else (2**level, 2**level),
-        )
-        predictor = Predictor(trained, head_of(trained), PanoramaViews(trained))
-        alternatives = [
-            Alternative(of, partial(predictor.predict, image), of == PART)
-            for of, image in images.items()
-        ]
-        table = Table(f"area: {name}", measure(alternatives, 2 if quick else 5))
-        table.goals = [Goal("time of the part", table.ratio(PART), 0.6)]
-        yield table
+        },
+        (2**level, 2**level),
+    )
+    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained))
+    alternatives = [
+        Alternative(of, partial(predictor.predict, image), of == PART)
+        for of, image in images.items()
+    ]
+    table = Table("area: tangent", measure(alternatives, 2 if quick else 5))
+    table.goals = [Goal("time of the part", table.ratio(PART), 0.6)]
+    yield table

@@ -52,7 +52,8 @@ from datamodules.core.transforms import (
     placed,
 )
 from tangent_train.errors import SettingError
-from tangent_train.geometry import SphereArea, shift_range
+from tangent_train.geometry import shift_range
+from tangent_train.geometry.equirect import check_area
 from tangent_train.io.gpano import Fill, PanoramaArea, check_area_size
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.png import check_panorama_size
@@ -214,7 +215,7 @@ class PanoramaDataModule(ImageDataModule):
     Args:
         batch_size: Panoramas per training step and process. Evaluation takes one at a time.
         area: The part of the sphere that all files show: west, east, south and north in degrees,
-            see `SphereArea`; None for the whole sphere.
+            see `check_area`; None for the whole sphere.
         fill: Colors of the panorama outside the area, in views that leave it.
         mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
             their labels are unknown. See `Masks`.
@@ -226,7 +227,6 @@ class PanoramaDataModule(ImageDataModule):
 
     Attributes:
         erp_height: Rows of the panoramas read.
-        sphere_area: `area` as a geometric object.
         canvas: The area, in pixels of these panoramas.
 
     Raises:
@@ -258,9 +258,8 @@ class PanoramaDataModule(ImageDataModule):
         fine = 0 < self.max_tilt_deg <= _HALF_TURN_DEG
         self.require("max_tilt_deg", fine, "more than 0, at most 180")
         self.require("fill", self.fill in get_args(Fill), ", ".join(get_args(Fill)))
-        self.sphere_area = SphereArea.of(self.area, "data.area")
-        self.canvas = PanoramaArea.on_canvas(self.sphere_area, self.erp_height)
-        self.representation = self.representation.limited_to(self.canvas.sphere)
+        self.canvas = PanoramaArea.on_canvas(self.area, self.erp_height, "data.area")
+        self.representation.view_sets(self.canvas.valid)  # refuses views that miss a pixel
         self._masks = Masks(self.mask, "data.mask")
         if not self._masks.of_each:
             self._masks.read("", self.canvas)
@@ -291,7 +290,7 @@ class PanoramaDataModule(ImageDataModule):
         if self.canvas.is_whole:
             check_panorama_size(path, size, self.erp_height, _PARTIAL)
         else:
-            check_area_size(path, size, self.sphere_area, self.canvas)
+            check_area_size(path, size, check_area(self.area), self.canvas)
 
     def transforms(self, split: Split) -> Sequence[Transform[Panorama, Any]]:
         """See `LabeledData`: placing, mask, rotation, then alignment with gravity."""
@@ -311,9 +310,7 @@ class PanoramaDataModule(ImageDataModule):
             judge = self._judge if split == "test" else None
             reading: Any = self.index().read
             read = reading.reader.rgb
-            transforms.append(
-                EstimatedUp(self.max_tilt_deg, read, rotated, judge, self.sphere_area)
-            )
+            transforms.append(EstimatedUp(self.max_tilt_deg, read, rotated, judge, self.area))
         return transforms
 
     def recorded(self, labels: Labels) -> Labels:

@@ -13,7 +13,7 @@ from torch.utils.data import Dataset
 from datamodules.core.panoramas import ImageFiles, ImageReader, Labels, steps_to_meters
 from datamodules.core.reading import SplitReader
 from datamodules.core.transforms import RotatedPanoramas
-from tangent_train.geometry import PanoramaPose, SphereArea
+from tangent_train.geometry import PanoramaPose
 
 
 class LabeledImage(NamedTuple):
@@ -29,8 +29,7 @@ class LabeledImage(NamedTuple):
         pose: Pose; None if unknown. In a photo's axes, x is the optical axis, y
             points to the right and z up in the image.
         camera_matrix: ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama.
-        area: Area of a partial panorama, whose arrays show the whole sphere, see `Panorama`; None
-            for other images.
+        valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
 
     The arrays may be shared or read-only: do not write to them.
     """
@@ -41,7 +40,7 @@ class LabeledImage(NamedTuple):
     distance_m: NDArray[np.float32] | None
     pose: PanoramaPose | None
     camera_matrix: NDArray[np.float64] | None = None
-    area: SphereArea | None = None
+    valid: NDArray[np.bool_] | None = None
 
 
 @dataclass(frozen=True)
@@ -74,5 +73,5 @@ class LabeledImages(Dataset[LabeledImage]):
         distance_m = None if depth is None else steps_to_meters(depth)
         matrix = getattr(image, "camera_matrix", None)
         return LabeledImage(
-            files.name, image.rgb, image.labels, distance_m, pose, matrix, image.area
+            files.name, image.rgb, image.labels, distance_m, pose, matrix, image.valid
         )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.labeled_data import print_on_rank_zero
 from tangent_train.errors import DataError, SettingError
-from tangent_train.geometry import PanoramaPose, SphereArea
+from tangent_train.geometry import PanoramaPose
 from tangent_train.io.gpano import read_area
 from tangent_train.io.image_files import image_paths, short_names
 from tangent_train.io.pixel_files import read_rgb
@@ -30,7 +30,7 @@ class PairedPanorama(NamedTuple):
         file: Image file.
         distance_m: ``(H, W)`` float32 meters from the center, NaN where missing; or None.
         pose: Camera pose; or None.
-        area: Area of a partial panorama, which `rgb` shows on the whole sphere; or None.
+        valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
     """
 
     name: str
@@ -38,7 +38,7 @@ class PairedPanorama(NamedTuple):
     file: Path
     distance_m: NDArray[np.float32] | None = None
     pose: PanoramaPose | None = None
-    area: SphereArea | None = None
+    valid: NDArray[np.bool_] | None = None
 
 
 class PanoramaPair(NamedTuple):
@@ -203,4 +203,4 @@ class ImagePairs(PanoramaPairs):
         rgb = read_rgb(path)
         area = read_area(path, (rgb.shape[0], rgb.shape[1]))
         whole = area.filled(area.place(rgb), "edge")
-        return PairedPanorama(self._names[files], whole, path, area=area.sphere)
+        return PairedPanorama(self._names[files], whole, path, valid=area.valid)

@@ -22,7 +22,7 @@ from datamodules.core.labels import DISTANCE, ClassSet
 from datamodules.core.problems import Problems
 from datamodules.core.store import Declared, Layout
 from tangent_train.errors import DataError, width_height
-from tangent_train.geometry import PanoramaPose, SphereArea, ray_lengths
+from tangent_train.geometry import PanoramaPose, ray_lengths
 from tangent_train.io.pixel_files import read_rgb
 from tangent_train.io.png import check_png
 from tangent_train.orientation.gravity import upright_rotation
@@ -168,8 +168,8 @@ class Panorama(NamedTuple):
         labels: ``(H, W)`` uint8 classes, 0 where unknown; or distances like `depth`, which is then
             None, see `PanoramaDistances`.
         up: ``(3,)`` direction of the zenith, a unit vector; None if it is z (upright).
-        area: The part of the sphere that was recorded; None for all of it. Outside, labels and
-            depth are 0, and colors are filled.
+        valid: ``(H, W)`` bool, the recorded pixels; None if all are. Elsewhere, labels and depth
+            are 0, and colors are filled.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -178,14 +178,13 @@ class Panorama(NamedTuple):
     depth: NDArray[np.uint16] | None
     labels: Labels
     up: NDArray[np.float64] | None = None
-    area: SphereArea | None = None
+    valid: NDArray[np.bool_] | None = None
 
     def sampler(self, representation: Representation) -> Sampler:
-        """Return the sampler of its views: those of the area, aligned with gravity."""
-        limited = representation.limited_to(self.area)
+        """Return the sampler of its views, aligned with gravity."""
         if self.up is None:
-            return limited
-        return limited.with_rotation(upright_rotation(self.up))
+            return representation
+        return representation.with_rotation(upright_rotation(self.up))
 
     def target(self, representation: Representation) -> Labels:
         """Return the labels that predictions on the panorama are compared with: all of them."""
@@ -292,7 +291,7 @@ class Photo(NamedTuple):
         labels: Classes or distances, as in panoramas.
         camera_matrix: ``(3, 3)`` K for integer pixel centers, without skew.
         up: None; the up direction of a photo is unknown.
-        area: None; a photo has no area of the sphere.
+        valid: None; all pixels of a photo are valid.
 
     The arrays may be shared or read-only: not to be written to.
     """
@@ -302,7 +301,7 @@ class Photo(NamedTuple):
     labels: Labels
     camera_matrix: NDArray[np.float64]
     up: None = None
-    area: None = None
+    valid: None = None
 
     def sampler(self, representation: PerspectiveRepresentation) -> PhotoSampler:
         """Return the sampler of its crops, which depend on its camera."""

@@ -18,7 +18,7 @@ from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.loading import Seed, sample_key, sample_rng
 from datamodules.core.panoramas import STEPS_PER_M
 from datamodules.core.reading import SplitReader
-from tangent_train.geometry import SphereArea, equirect_elevations
+from tangent_train.geometry import equirect_elevations
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.representations.views import Views
 
@@ -26,8 +26,6 @@ Inputs = Sequence[Tensor]
 """Rendered RGB, optionally depth and elevation, see `TrainingSample`."""
 
 _Images = TypeVar("_Images", Inputs, Tensor)
-
-_WHOLE = SphereArea.of(None)
 
 
 class TrainingSample(NamedTuple, Generic[_Images]):
@@ -60,8 +58,7 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
             of a photo.
         rotation: ``(3, 3)`` float64 rotation of the representation that aligns it with gravity.
         ray_lengths: As in `TrainingSample`, of each view set of a panorama or each crop of a photo.
-        area: ``(13,)`` float64, the area of a partial panorama, see `SphereArea.numbers`; that of
-            the whole sphere for other images.
+        valid: ``(H, W)`` bool, valid pixels of a partial panorama; ``(0, 0)`` for other images.
         index: Index in its split.
     """
 
@@ -69,8 +66,13 @@ class EvaluationSample(NamedTuple, Generic[_Images]):
     target: Tensor
     rotation: Tensor
     ray_lengths: Tensor
-    area: Tensor
+    valid: Tensor
     index: int  # type: ignore[assignment]  # hides tuple.index
+
+
+def valid_mask(valid: Tensor) -> NDArray[np.bool_] | None:
+    """Return the mask of `EvaluationSample.valid`; None if all pixels are valid."""
+    return valid.cpu().numpy() if valid.numel() else None
 
 
 @dataclass(frozen=True)
@@ -98,7 +100,7 @@ class TrainingImages(Dataset[TrainingSample[Inputs]]):
         epoch, index = sample_key(key, len(self))
         image = self.source.read(index)
         rng = sample_rng(self.seed, epoch, index)
-        views = image.sampler(self.representation).sample(rng)
+        views = image.sampler(self.representation).sample(rng, image.valid)
         rgb, *others = render_inputs(image, views, self.inputs)
         if self.color_jitter:
             rgb = jitter_colors(rgb, self.color_jitter, rng)
@@ -127,14 +129,14 @@ class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
     def __getitem__(self, key: int | tuple[int, int]) -> EvaluationSample[Inputs]:
         _, index = sample_key(key, len(self))
         image = self.source.read(index)
-        view_sets = image.sampler(self.representation).view_sets()
+        view_sets = image.sampler(self.representation).view_sets(image.valid)
         of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
         images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
         rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
         target = torch.tensor(_for_torch(image.target(self.representation)))
-        area = torch.from_numpy((image.area or _WHOLE).numbers)
+        valid = torch.tensor(np.empty((0, 0), np.bool_) if image.valid is None else image.valid)
         lengths = _ray_lengths(view_sets, image)
-        return EvaluationSample(images, target, torch.from_numpy(rotation), lengths, area, index)
+        return EvaluationSample(images, target, torch.from_numpy(rotation), lengths, valid, index)
 
 
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:

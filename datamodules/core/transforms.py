@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Literal
 
@@ -12,12 +12,9 @@ from numpy.typing import NDArray
 
 from datamodules.core.loading import sample_rng
 from datamodules.core.panoramas import ImageFiles, Panorama, resize_area
-from tangent_train.geometry import (
-    SphereArea,
-    random_rotation,
-    rotation_about,
-)
-from tangent_train.io.gpano import Fill, PanoramaArea, black_outside, read_up
+from tangent_train.geometry import random_rotation, rotation_about
+from tangent_train.geometry.equirect import check_area
+from tangent_train.io.gpano import Fill, PanoramaArea, area_of_angles, black_outside, read_up
 from tangent_train.io.masks import Masks
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
@@ -25,9 +22,6 @@ from tangent_train.rendering import rotate_equirect
 
 PanoramaJudge = Callable[[Panorama, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
-
-
-_WHOLE = SphereArea.of(None)
 
 
 def placed(
@@ -48,7 +42,7 @@ def placed(
         canvas.filled(canvas.place(rgb), fill),
         None if depth is None else canvas.place(depth),
         canvas.place(labels),
-        area=canvas.sphere,
+        valid=canvas.valid,
     )
 
 
@@ -94,7 +88,7 @@ class EstimatedUp:
         rotated: Rotation of the panoramas, if any.
         judge: Function that returns log-likelihoods of up directions, see `estimate_up`; it is not
             passed to other processes.
-        area: The part of the sphere that the files show.
+        area: The part of the sphere that the files show, see `check_area`; None for all of it.
     """
 
     def __init__(
@@ -103,7 +97,7 @@ class EstimatedUp:
         rgb: Callable[[ImageFiles], NDArray[np.uint8]],
         rotated: RotatedPanoramas | None = None,
         judge: PanoramaJudge | None = None,
-        area: SphereArea = _WHOLE,
+        area: Sequence[float] | None = None,
     ) -> None:
         self._max_tilt_deg = max_tilt_deg
         self._rgb = rgb
@@ -117,9 +111,7 @@ class EstimatedUp:
         if panorama.up is not None:
             return panorama
         if index not in self._ups:
-            rgb = panorama.rgb
-            if panorama.area is not None:  # estimates ignore what is black
-                rgb = black_outside(rgb, panorama.area)
+            rgb = black_outside(panorama.rgb, panorama.valid)  # estimates ignore what is black
             judge = self._judge and partial(self._judge, panorama._replace(rgb=rgb))
             rgb = rgb if len(rgb) >= MOST_ROWS else self._larger(index, files)
             self._ups[index] = estimate_up(rgb, self._max_tilt_deg, judge)
@@ -127,8 +119,8 @@ class EstimatedUp:
 
     def _larger(self, index: int, files: ImageFiles) -> NDArray[np.uint8]:
         rgb = self._rgb(files)
-        rows = round(rgb.shape[1] / self._area.width_deg * 180)
-        canvas = PanoramaArea.on_canvas(self._area, min(rows, MOST_ROWS))
+        placed = area_of_angles((rgb.shape[0], rgb.shape[1]), check_area(self._area))
+        canvas = PanoramaArea.on_canvas(self._area, min(placed.full_shape[0], MOST_ROWS))
         rgb = canvas.place(resize_area(rgb, canvas.image_shape))
         if self._rotated is None:
             return rgb
@@ -169,7 +161,7 @@ class RotatedPanoramas:
     def __call__(self, panorama: Panorama, index: int, files: Any = None) -> Panorama:
         """Return the rotated panorama: RGB bilinear, depth and labels nearest."""
         del files
-        rgb, depth, labels, before, area = panorama
+        rgb, depth, labels, before, valid = panorama
         rotation = self.rotation(index)
         up = rotation[:, 2] if before is None else rotation @ before
         return Panorama(
@@ -177,5 +169,9 @@ class RotatedPanoramas:
             None if depth is None else rotate_equirect(depth, rotation, "nearest"),
             rotate_equirect(labels, rotation, "nearest"),
             up if self._known else None,
-            None if area is None else area.rotated(rotation),
+            None if valid is None else _rotated_mask(valid, rotation),
         )
+
+
+def _rotated_mask(valid: NDArray[np.bool_], rotation: NDArray[np.float64]) -> NDArray[np.bool_]:
+    return rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0

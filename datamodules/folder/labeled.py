@@ -21,14 +21,13 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.index import Split
 from datamodules.core.inputs import Input
 from datamodules.core.labeled_data import print_on_rank_zero
-from datamodules.core.panoramas import ImageFiles, ImageReader
+from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras
 from datamodules.folder.classes import NO_CLASSES, UNKNOWN_NAME, read_classes
 from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
 from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError
-from tangent_train.io.gpano import tagged_area
 from tangent_train.io.image_files import image_paths
 
 _TRIED = 4
@@ -142,20 +141,6 @@ class FolderPanoramas(LabeledFolder, PanoramaDataModule):
         DataError: ``classes.json`` is missing or cannot be used.
         SettingError: A setting is invalid.
     """
-
-    def check_image(self, files: ImageFiles, reader: ImageReader, problems: Problems) -> None:
-        """See `ImageDataModule`; also compares the GPano tags with `area`."""
-        super().check_image(files, reader, problems)
-        with problems.noted(files.name, files.rgb):
-            size = reader.size("rgb", files.rgb)
-            tagged = None if size is None else tagged_area(files.rgb, size)
-            if tagged is not None and not tagged.sphere.is_near(self.sphere_area):
-                raise DataError(
-                    files.rgb,
-                    found=f"GPano tags of the area {[round(a, 2) for a in tagged.sphere.angles]}",
-                    expected=f"that of data.area={self.area or 'null'}, as for all images",
-                    remedy="Correct data.area, or use a data set for each area.",
-                )
 
 
 @dataclass(kw_only=True, eq=False, repr=False)

@@ -7,11 +7,13 @@ from collections.abc import Mapping
 from contextlib import redirect_stdout
 from typing import Any
 
+import numpy as np
+
 from datamodules.core.class_weights import label_doubts
 from tangent_train.cli.run import open_data
-from tangent_train.config.build import build_from_config
 from tangent_train.console import print_text
 from tangent_train.errors import counted
+from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table, percent
 
 
@@ -51,11 +53,13 @@ def check(settings: Mapping[str, Any]) -> None:
         for warning in warnings:
             print_text(f"Warning: {warning}", error=not terminal)
     if getattr(data, "area", None) is not None:
-        representation = build_from_config(settings["representation"], "representation")
-        views = [sum(map(len, r.view_sets())) for r in (data.representation, representation)]
+        valid = data.canvas.valid
+        views = [sum(map(len, data.representation.view_sets(v))) for v in (valid, None)]
         rows, columns = data.representation.image_size
+        angles = equirect_solid_angles(data.canvas.full_shape)
+        share = 1.0 if valid is None else np.average(valid.mean(axis=1), weights=angles)
         print_text(
-            f"Area {list(data.area)}: {percent(data.sphere_area.share)} % of the sphere; "
+            f"Area {list(data.area)}: {percent(share)} % of the sphere; "
             f"{views[0]} of {views[1]} views, {columns} × {rows} pixels each.",
             error=not terminal,
         )

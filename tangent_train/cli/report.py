@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tangent_train.console import print_text
-from tangent_train.errors import DataError
 from tangent_train.imports import elsewhere
 
 
@@ -21,20 +20,17 @@ def report(arguments: Sequence[str]) -> None:
         DataError: Runs are missing or cannot be read.
     """
     options = _parser().parse_args(arguments)
-    for folder in options.folders:
-        if not folder.is_dir():
-            raise DataError(folder, found="no such folder", expected="a run, or a folder of runs")
     # Slow imports, not needed to refuse a command line.
     with elsewhere():
-        from tangent_train.results.comparisons import runs_report
         from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
+        from tangent_train.results.report import runs_report
 
-    records = [load_result(folder) for folder in find_runs(options.folders)]
+    results = [load_result(folder) for folder in find_runs(options.folders)]
     notes = [f"{run}: not finished, ignored." for run in unfinished_runs(options.folders)]
-    runs = runs_report(records, notes)
+    runs = runs_report(results, notes)
     runs.write(options.output, "report")
-    runs.tables()[0].print()
-    for note in runs.all_notes():
+    runs.means().print()
+    for note in runs.notes:
         print_text(f"- {note}")
     print_text(f"Files: {options.output}/report.*")
 

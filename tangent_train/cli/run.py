@@ -50,7 +50,7 @@ from tangent_train.results.evaluation import (
 )
 from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
 from tangent_train.results.html import write_report
-from tangent_train.results.published import Comparison
+from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.schedules import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
@@ -203,11 +203,13 @@ class Run:
             protocol={**self.data.facts, **self.task.head.facts},
             checkpoint=name,
             label_map=self.settings.get("label_map"),
+            folds=getattr(self.data, "folds", ()),
             settings=dict(flat_settings(self.settings)),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(record)
-        summary, published = summary_lines(record), Comparison.of([record])
-        write_results(record, self.folder, [*notes, *published.notes], published.tables(record))
+        summary, (rows, sources) = summary_lines(record), published_rows([record])
+        published = [published_table(rows, record)] if rows else []
+        write_results(record, self.folder, [*notes, *sources], published)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",

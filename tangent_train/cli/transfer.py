@@ -158,7 +158,7 @@ def _report(
 ) -> None:
     """Write and print the tables and the chart."""
     with elsewhere():  # imports matplotlib
-        from tangent_train.results.comparisons import levels_report, transfer_report
+        from tangent_train.results.report import levels_report, transfer_report
     from tangent_train.results.evaluation_result import load_result
 
     records: dict[Any, list[Any]] = defaultdict(list)
@@ -175,6 +175,6 @@ def _report(
         name, report = "transfer", transfer_report(records, cells)
     report.write(folder, name)
     report.tables()[0].print()
-    for note in report.all_notes():
+    for note in report.notes:
         print_text(f"- {note}")
     print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")

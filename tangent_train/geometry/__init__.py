@@ -14,7 +14,6 @@ Convention, stated here once and used everywhere:
 * Angles are in radians unless a name ends in ``deg``.
 """
 
-from tangent_train.geometry.area import SphereArea
 from tangent_train.geometry.camera import (
     camera_matrix_from_fov,
     is_camera_matrix,
@@ -56,7 +55,6 @@ __all__ = [
     "PanoramaPose",
     "PinholeGrid",
     "RingGrid",
-    "SphereArea",
     "TangentGrid",
     "camera_matrix_from_fov",
     "checked_rotation",

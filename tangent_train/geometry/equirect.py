@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -156,3 +157,38 @@ def equirect_solid_angles(shape: tuple[int, int]) -> NDArray[np.float64]:
     height, width = shape
     edges = np.sin(np.pi / 2 - np.arange(height + 1) / height * np.pi)
     return 2 * np.pi / width * (edges[:-1] - edges[1:])
+
+
+def check_area(angles: Sequence[float] | None, setting: str = "area") -> tuple[float, ...]:
+    """Return west, east, south and north of a part of the sphere.
+
+    Args:
+        angles: Edges in degrees: longitudes −180 to 180, with ``west > east`` for an area across
+            ±180° and -180, 180 for all around; latitudes −90 to 90. None for the whole sphere.
+        setting: Name of the setting, for messages.
+
+    Raises:
+        SettingError: The angles are not those of an area.
+    """
+    if angles is None:
+        return -180, 180, -90, 90
+    west, east, south, north = angles if len(angles) == 4 else (0, 0, 0, 0)
+    if not (-180 <= west <= 180 and -180 <= east <= 180 and -90 <= south < north <= 90) or (
+        (east - west) % 360 == 0 and (west, east) != (-180, 180)
+    ):
+        raise SettingError(
+            setting,
+            found=list(angles),
+            expected="[west,east,south,north] in degrees, −180 to 180 and −90 to 90, south below "
+            "north, east other than west; [-180,180,…] is all around",
+        )
+    return west, east, south, north
+
+
+def area_mask(angles: Sequence[float], shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return a mask ``(H, W)`` of the pixels whose center lies in an area, see `check_area`."""
+    west, east, south, north = angles
+    latitudes = np.degrees(equirect_latitudes(shape[0]))
+    longitudes = np.degrees(equirect_longitudes(shape[1]))
+    width = east - west if east > west else east - west + 360
+    return np.outer((south <= latitudes) & (latitudes <= north), (longitudes - west) % 360 <= width)

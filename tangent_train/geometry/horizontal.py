@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry.area import SphereArea
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 
@@ -46,9 +45,9 @@ class RingGrid(PinholeGrid):
             edges. Pixels are square: if `size` has another ratio, one field of view is larger.
         size: Rows and columns of the images.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
-        area: Area that the images must cover; None for the sphere.
+        valid: ``(H, W)`` pixels of a panorama that the images must cover; None for the sphere.
         by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
-        is_complete: False for images that cover the area together with those of other grids.
+        is_complete: False for images that cover them together with those of other grids.
 
     Raises:
         SettingError: A ring, a field of view or the size is invalid; two views have the same
@@ -70,7 +69,7 @@ class RingGrid(PinholeGrid):
         fov_deg: tuple[float, float],
         size: tuple[int, int],
         rotation: ArrayLike | None = None,
-        area: SphereArea | None = None,
+        valid: NDArray[np.bool_] | None = None,
         *,
         by_owners: bool = True,
         is_complete: bool = True,
@@ -90,8 +89,8 @@ class RingGrid(PinholeGrid):
             )
         resting = PinholeGrid(axes, (rows, columns), pitch)
         if is_complete:
-            check_coverage([resting], area, by_owners=by_owners)
-        overlapping = not is_complete or overlaps(resting, area)
+            check_coverage([resting], valid, by_owners=by_owners)
+        overlapping = not is_complete or overlaps(resting, valid)
         super().__init__(axes, resting.size, pitch, rotation, is_overlapping=overlapping)
         vars(self).update(rings=checked)
 

@@ -13,12 +13,7 @@ from torch import Tensor
 
 from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.geometry import (
-    SphereArea,
-    equirect_to_lonlat,
-    lonlat_to_xyz,
-    ray_lengths,
-)
+from tangent_train.geometry import ray_lengths
 from tangent_train.heads.alignment import (
     AlignmentReport,
     align_views,
@@ -45,7 +40,8 @@ class AlignedMosaic:
         kind: Kind of the network's output.
         blend: Blend of the views.
         align: See `alignment.align_views`.
-        area: Area of a partial panorama: views are compared inside it. None for the whole sphere.
+        valid: ``(H, W)`` valid pixels of a partial panorama, at which views are compared; None if
+            all are valid.
         camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
 
     Attributes:
@@ -61,16 +57,15 @@ class AlignedMosaic:
         blend: Blend,
         align: Align | None = None,
         *,
-        area: SphereArea | None = None,
+        valid: NDArray[np.bool_] | None = None,
         camera_matrix: NDArray[np.float64] | None = None,
     ) -> None:
         self._shape, self._kind, self._align = shape, kind, align
         self._blend: Blend = blend
         self._camera = camera_matrix
         points = sphere_points(shape) if camera_matrix is None else lattice(shape)
-        if area is not None:
-            lonlat_rad = equirect_to_lonlat(points[:, ::-1], shape)
-            points = points[area.contains(lonlat_to_xyz(lonlat_rad))]
+        if valid is not None:
+            points = points[valid[points[:, 0], points[:, 1]]]
         self._points = points
         self._parts: list[tuple[Views, Tensor, Tensor]] = []
 

@@ -207,7 +207,7 @@ class Head(nn.Module, ABC):
         *,
         averaged: bool = False,
         device: Any = "cpu",
-        area: Any = None,
+        valid: NDArray[np.bool_] | None = None,
         camera_matrix: NDArray[np.float64] | None = None,
     ) -> HeadMosaic:
         """Return an empty panorama or photo.
@@ -217,7 +217,7 @@ class Head(nn.Module, ABC):
             blend: Blend of the views.
             averaged: True if several sets of views are averaged, or more than the pixels is needed.
             device: Device of the outputs.
-            area: Area of a partial panorama; None for the whole sphere.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
             camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
         """
         raise NotImplementedError

@@ -196,7 +196,7 @@ class ClassesHead(Head):
         *,
         averaged: bool = False,
         device: Any = "cpu",
-        area: Any = None,
+        valid: NDArray[np.bool_] | None = None,
         camera_matrix: NDArray[np.float64] | None = None,
     ) -> LabelMosaic:
         """Return a mosaic of probabilities, which reuses the memory of an earlier one."""

@@ -275,12 +275,12 @@ class DistanceHead(Head):
         *,
         averaged: bool = False,
         device: Any = "cpu",
-        area: Any = None,
+        valid: NDArray[np.bool_] | None = None,
         camera_matrix: NDArray[np.float64] | None = None,
     ) -> AlignedMosaic:
         """Return a mosaic that keeps all views until they are aligned."""
         given = shape, self.depth_kind, blend, self.align
-        self._aligned = AlignedMosaic(*given, area=area, camera_matrix=camera_matrix)
+        self._aligned = AlignedMosaic(*given, valid=valid, camera_matrix=camera_matrix)
         return self._aligned
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:

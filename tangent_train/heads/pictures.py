@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.io.gpano import PanoramaArea, black_outside
+from tangent_train.io.gpano import black_outside
 from tangent_train.io.palette import class_colors, distance_colors
 from tangent_train.metrics.segmentation import UNKNOWN
 
@@ -159,8 +158,8 @@ def shown_arrays(
         prediction: Predicted labels of the same shape.
         representation: Representation that defines the crops.
         most_rows: Largest number of rows, to which larger images are downsampled; None for all.
-        cut: True to cut a partial panorama to its area, unless it is rotated. Else it is black and
-            unknown outside.
+        cut: True to cut a partial panorama to the box around its valid pixels. Elsewhere, it is
+            black and unknown.
 
     Returns:
         RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w.
@@ -171,14 +170,23 @@ def shown_arrays(
         (crops,) = image.sampler(representation).view_sets()
         shown = crops.render(image.rgb, "bilinear")
         rgb, truth, labels = map(np.hstack, (shown, truth, labels))
-    elif image.area is not None:
-        limit: Callable[[Any], Any] = partial(black_outside, area=image.area)
-        if cut and image.area.rotation is None:
-            limit = PanoramaArea.on_canvas(image.area, len(rgb)).cut
-        rgb, truth, labels = map(limit, (rgb, truth, labels))
+    elif image.valid is not None:
+        rgb, truth, labels = (black_outside(a, image.valid) for a in (rgb, truth, labels))
+        if cut:
+            box = _box(image.valid)
+            rgb, truth, labels = (array[box] for array in (rgb, truth, labels))
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
     part = slice(step // 2, None, step)
     return rgb[part, part], truth[part, part], labels[part, part]
+
+
+def _box(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return rows ``(h, 1)`` and columns ``(w,)`` of a box, which may continue across ±180°."""
+    (rows,), (columns,) = (np.nonzero(valid.any(axis=axis)) for axis in (1, 0))
+    gaps = np.diff(columns, append=columns[0] + valid.shape[1])
+    first = columns[(gaps.argmax() + 1) % len(columns)]
+    across = (first + np.arange(valid.shape[1] - gaps.max() + 1)) % valid.shape[1]
+    return np.arange(rows[0], rows[-1] + 1)[:, None], across
 
 
 def _titled(image: _Image, title: str) -> _Image:

@@ -273,7 +273,7 @@ class Predictor:
             self._view_sets.blend,
             averaged=averaged or len(sets) > 1,
             device=self.device,
-            area=None if image.area is None else image.area.sphere,
+            valid=image.valid,
             camera_matrix=image.camera_matrix,
         )
         count = sum(len(views) for views, _, _ in sets)

@@ -63,6 +63,11 @@ class InputImage:
         """Rows and columns."""
         return self.rgb.shape[0], self.rgb.shape[1]
 
+    @property
+    def valid(self) -> NDArray[np.bool_] | None:
+        """``(H, W)`` valid pixels of a partial panorama; None if all are valid."""
+        return None if self.area is None else self.area.valid
+
     def cut(self, pixels: NDArray[Any]) -> NDArray[Any]:
         """Cut pixels ``(H, W[, C])`` to the area of a partial panorama."""
         return pixels if self.area is None else self.area.cut(pixels)

@@ -15,8 +15,9 @@ from datamodules.core.panoramas import distance_from_z_depth, resize_area, resiz
 from tangent_train.config.build import SettingsFile, build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
-from tangent_train.geometry import PinholeGrid, SphereArea, TangentGrid
+from tangent_train.geometry import PinholeGrid, TangentGrid
 from tangent_train.inference.images import InputImage
+from tangent_train.io.gpano import PanoramaArea
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import (
     EquirectRepresentation,
@@ -39,8 +40,8 @@ Levels = int | Sequence[int] | None
 """A level s, which sets the angular resolution, or several to average over; None as trained."""
 
 ViewChoice = str | Mapping[str, Any] | None
-"""Views of panoramas: an option of the configs of representations, such as ``horizontal``; or its name
-as ``option``, with changed settings of the representation. None as trained."""
+"""Views of panoramas: an option of the configs of representations, such as ``horizontal``; or its
+name as ``option``, with changed settings of the representation. None as trained."""
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
 _PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
@@ -61,6 +62,10 @@ _OVERLAP = 0.25
 
 _OVERSAMPLED = 2
 """Photos are resized to at most 2 pixels per pixel of a crop before their borders are mirrored."""
+
+
+_MASK_ROWS = 360
+"""Rows of the mask of the area that panoramas show."""
 
 
 class SourceViews(NamedTuple):
@@ -122,7 +127,7 @@ class PanoramaViews:
         self.image_size = self.representation.image_size
         self.distortion_aware = getattr(self.representation, "distortion_aware", False)
         self.blend = self.representation.blend
-        self._trained, self._fill = trained, fill or trained.fill
+        self._fill = fill or trained.fill
 
     def description(self, area: Sequence[float] | None = None) -> str:
         """Return number and size of the views; of pinhole images also their angle and resolution.
@@ -130,11 +135,10 @@ class PanoramaViews:
         Signals on an icosphere are described by their number of values.
 
         Args:
-            area: Area that the panoramas show, see `SphereArea.of`.
+            area: Area that the panoramas show, see `check_area`; None for the whole sphere.
         """
-        limited = self.representation.limited_to(SphereArea.of(area))
-        rows, columns = limited.image_size
-        sets = limited.view_sets()
+        rows, columns = self.image_size
+        sets = self.representation.view_sets(PanoramaArea.on_canvas(area, _MASK_ROWS).valid)
         count = sum(map(len, sets))
         if rows == 1:  # signals on an icosphere
             return f"{counted(count, 'signals')} of {columns} values"
@@ -152,20 +156,17 @@ class PanoramaViews:
         return f"{text} at base level {base_level} ({'; '.join(parts)})"
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Return the sets of views of one panorama, of its area if it is partial."""
+        """Return the sets of views of the valid pixels of one panorama."""
         representation: Representation = self.representation
-        rotation, area = None, image.area
-        if area is not None:
-            limited = representation.limited_to(area.sphere)
-            if _fits(self._trained, limited.image_size):
-                representation = limited
-            image = replace(image, rgb=area.filled(image.rgb, self._fill))
+        rotation = None
+        if image.area is not None:
+            image = replace(image, rgb=image.area.filled(image.rgb, self._fill))
         if image.up is not None:
             rotation = upright_rotation(image.up)
             representation = representation.with_rotation(rotation)
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
-        return [SourceViews(image, shape, representation.view_sets(), rotation)]
+        return [SourceViews(image, shape, representation.view_sets(image.valid), rotation)]
 
 
 def _described(grid: PinholeGrid) -> str:

@@ -11,7 +11,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Literal, Self, TypeVar
 
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import SphereArea, equirect_directions
+from tangent_train.geometry.equirect import check_area
 from tangent_train.io.xmp import read_properties
 from tangent_train.orientation.gravity import up_from_pose
 from tangent_train.rendering.resampling import resize
@@ -69,37 +69,35 @@ class PanoramaArea:
     image_shape: tuple[int, int]
 
     @classmethod
-    def on_canvas(cls, area: SphereArea, rows: int) -> Self:
-        """Return the pixels that show an area, in a panorama of some rows; `rotation` is ignored.
+    def on_canvas(cls, angles: Sequence[float] | None, rows: int, setting: str = "area") -> Self:
+        """Return the pixels of an area, in a panorama of some rows.
 
         Args:
-            area: The area; its size and position are rounded to pixels.
+            angles: See `check_area`; size and position are rounded to pixels.
             rows: Rows H of the whole panorama.
+            setting: Name of the setting, for messages.
+
+        Raises:
+            SettingError: The angles are not those of an area.
         """
-        height = max(1, round((area.north - area.south) / 180 * rows))
-        width = max(1, round(area.width_deg / 180 * rows))
-        top = min(round((90 - area.north) / 180 * rows), rows - height)
-        left = round((area.west + 180) / 180 * rows) % (2 * rows)
+        west, east, south, north = check_area(angles, setting)
+        height = max(1, round((north - south) / 180 * rows))
+        width = max(1, round(_width_deg(west, east) / 180 * rows))
+        top = min(round((90 - north) / 180 * rows), rows - height)
+        left = round((west + 180) / 180 * rows) % (2 * rows)
         bounds = (top, top + height), (left, left + width)
         return cls((rows, 2 * rows), *bounds, (height, width))
-
-    @property
-    def sphere(self) -> SphereArea:
-        """The area in degrees."""
-        height, width = self.full_shape
-        if self.columns[1] - self.columns[0] == width:
-            west = -180.0
-            east = 180.0
-        else:
-            west, east = (360 * (column % width) / width - 180 for column in self.columns)
-        north, south = (90 - 180 * row / height for row in self.rows)
-        return SphereArea(west, east, south, north)
 
     @property
     def is_whole(self) -> bool:
         """True if the image is the whole panorama."""
         height, width = self.full_shape
         return self.rows == (0, height) and self.columns == (0, width)
+
+    @property
+    def valid(self) -> NDArray[np.bool_] | None:
+        """``(H, W)`` True for the pixels of the image, read-only; None for the whole panorama."""
+        return None if self.is_whole else _valid(self)
 
     def place(self, image: NDArray[_Pixel]) -> NDArray[_Pixel]:
         """Place the image ``(h, w[, C])`` on a panorama ``(H, W[, C])`` that is 0 elsewhere."""
@@ -220,8 +218,8 @@ def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaAr
         SettingError: The angles are invalid, or the image would not have square pixels.
         DataError: The whole panorama would be too large.
     """
-    area = SphereArea.of(angles)
-    width, height = area.width_deg, area.north - area.south
+    west, east, south, north = check_area(angles)
+    width, height = _width_deg(west, east), north - south
     pixels_deg = width / size[1], height / size[0]
     if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
         fit = pixels_deg[0] * size[0]
@@ -232,30 +230,27 @@ def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaAr
             expected=f"angles that make them square: {fit:.2f}° high"
             + f", e.g. {-fit / 2:.2f} to {fit / 2:.2f}" * (fit <= 180),
         )
-    across, down = ((area.west + 180) / 360, width / 360), ((90 - area.north) / 180, height / 180)
+    across, down = ((west + 180) / 360, width / 360), ((90 - north) / 180, height / 180)
     return _area(f"area={list(angles)}", size, across, down)
 
 
-def black_outside(image: NDArray[_Pixel], area: SphereArea) -> NDArray[_Pixel]:
-    """Return a panorama ``(H, W[, C])`` that is 0 outside an area, which may be rotated."""
-    if area.rotation is None:
-        canvas = PanoramaArea.on_canvas(area, len(image))
-        return canvas.place(canvas.cut(image))
-    inside = area.contains(equirect_directions((image.shape[0], image.shape[1])))
-    return np.where(
-        inside.reshape(inside.shape + (1,) * (image.ndim - 2)), image, image.dtype.type(0)
-    )
+def black_outside(image: NDArray[_Pixel], valid: NDArray[np.bool_] | None) -> NDArray[_Pixel]:
+    """Return a panorama ``(H, W[, C])`` that is 0 at invalid pixels."""
+    if valid is None:
+        return image
+    mask = valid.reshape(valid.shape + (1,) * (image.ndim - 2))
+    return np.where(mask, image, image.dtype.type(0))
 
 
 def check_area_size(
-    path: Path, size: tuple[int, int], area: SphereArea, canvas: PanoramaArea
+    path: Path, size: tuple[int, int], angles: Sequence[float], canvas: PanoramaArea
 ) -> None:
     """Check that an image fits the area of its data set, and has enough pixels.
 
     Args:
         path: The image.
         size: Rows and columns of the image.
-        area: The area.
+        angles: The area, see `check_area`.
         canvas: The area, in pixels of the panoramas that a run reads.
 
     Raises:
@@ -263,13 +258,14 @@ def check_area_size(
         SettingError: It has fewer pixels.
     """
     height, width = canvas.image_shape
-    ratio = (area.north - area.south) / area.width_deg
+    west, east, south, north = angles
+    ratio = (north - south) / _width_deg(west, east)
     if not math.isclose(size[0], size[1] * ratio, rel_tol=_TOLERANCE):
         raise DataError(
             path,
             found=width_height(size),
             expected=f"{width_height((round(size[1] * ratio), size[1]))}, for square pixels in "
-            f"data.area={list(area.angles)}",
+            f"data.area={list(angles)}",
             remedy="Correct data.area; all images of a data set show the same area.",
         )
     if size[0] < height - 1 or size[1] < width - 1:
@@ -322,6 +318,17 @@ def read_up(path: Path) -> NDArray[np.float64] | None:
     pitch = _number(path, "PosePitchDegrees", tags.get("PosePitchDegrees", "0"), 90)
     roll = _number(path, "PoseRollDegrees", tags.get("PoseRollDegrees", "0"), 180)
     return None if pitch == roll == 0 else up_from_pose(pitch, roll)
+
+
+@lru_cache(maxsize=4)
+def _valid(area: PanoramaArea) -> NDArray[np.bool_]:
+    valid = area.place(np.ones(area.image_shape, np.bool_))
+    valid.setflags(write=False)
+    return valid
+
+
+def _width_deg(west: float, east: float) -> float:
+    return east - west if east > west else east - west + 360
 
 
 def _number(path: Path, name: str, text: str, most: float) -> float:

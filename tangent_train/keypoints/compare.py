@@ -14,12 +14,12 @@ from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
     PanoramaPose,
-    SphereArea,
     TangentGrid,
     equirect_shape,
     nearest_level,
     random_rotation,
 )
+from tangent_train.geometry.valid_views import is_valid
 from tangent_train.keypoints import (
     SphericalKeypoints,
     TwoView,
@@ -151,7 +151,7 @@ class Comparer:
         # Keypoints of a panorama of the previous pair are used again.
         self._cache = {
             (side.name, level): self._cache.get((side.name, level))
-            or self._detect(image, level, side.area)
+            or self._detect(image, level, side.valid)
             for side, image in zip(sides, images, strict=True)
         }
         left, right = (self._cache[side.name, level] for side in sides)
@@ -161,8 +161,10 @@ class Comparer:
                 np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
             )
             image = rotate_equirect(images[1], rotation)
-            area = pair.right.area and pair.right.area.rotated(rotation)
-            conditions[ROTATED] = rotation, image, self._detect(image, level, area)
+            valid = pair.right.valid
+            if valid is not None:
+                valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
+            conditions[ROTATED] = rotation, image, self._detect(image, level, valid)
         views = _depth_views(pair)
         overlap = None if views is None else _defined(fov_overlap(*views))
         known = {
@@ -193,9 +195,9 @@ class Comparer:
         return level
 
     def _detect(
-        self, rgb: NDArray[np.uint8], level: int, area: SphereArea | None
+        self, rgb: NDArray[np.uint8], level: int, valid: NDArray[np.bool_] | None
     ) -> dict[str, SphericalKeypoints]:
-        """Return the keypoints of an area by representation, in the order of `representations`."""
+        """Return the keypoints at valid pixels, in the order of `representations`."""
         found = {"ERP": detect_on_equirect(rgb)}
         grids: dict[str, TangentGrid | CubeGrid] = {}
         if self.controls:
@@ -205,9 +207,9 @@ class Comparer:
         found |= {
             name: detect_on_tangent_images(rgb, grid, self.margin) for name, grid in grids.items()
         }
-        if area is None:
+        if valid is None:
             return found
-        return {name: k.select(area.contains(k.directions_xyz)) for name, k in found.items()}
+        return {name: k.select(is_valid(valid, k.directions_xyz)) for name, k in found.items()}
 
     def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
         matches = match(left.descriptors, right.descriptors, self.ratio, mutual=self.mutual)

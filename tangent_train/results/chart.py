@@ -11,7 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from tangent_train.results.rows import Row, Statistic
+from tangent_train.results.evaluation_result import EvaluationResult
+from tangent_train.results.rows import RunRow, Statistic
 
 _COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Colors of Okabe and Ito, which people with color blindness can distinguish."""
@@ -20,7 +21,7 @@ _LONGEST_LABEL = 60
 _ERROR_BARS = "bars: standard deviation over folds, else over seeds, else 95 % interval over images"
 
 
-def report_png(title: str, rows: Sequence[Row]) -> bytes:
+def report_png(title: str, rows: Sequence[RunRow], like: EvaluationResult) -> bytes:
     """Draw bars of the means and of each class, and lines over the latitude.
 
     Error bars are the standard deviation over folds, else over seeds, else the 95 % interval over
@@ -29,25 +30,25 @@ def report_png(title: str, rows: Sequence[Row]) -> bytes:
     Args:
         title: Title of the chart.
         rows: Rows with the same scores and classes.
+        like: Evaluation with these scores and classes.
 
     Returns:
         Content of a PNG file.
     """
-    record = rows[0].records[0]
     panels: list[_Panel] = []
-    headings = record.main_columns
-    for unit in dict.fromkeys(heading.unit for heading in headings.values()):
-        shown = {n: h.text for n, h in headings.items() if h.unit == unit}
+    columns = like.main_columns
+    for unit in dict.fromkeys(column.unit for column in columns.values()):
+        shown = {n: c.text for n, c in columns.items() if c.unit == unit}
         means = [[row.score(name) for name in shown] for row in rows]
         panels.append(_Panel("" if panels else title, list(shown.values()), means, unit))
-    if score := record.main_of_class:
-        heading, names = record.columns[record.class_means[score]], record.class_names
+    if score := like.main_of_class:
+        column, names = like.columns[like.class_means[score]], like.class_names
         classes = [[row.score(score, name) for name in names] for row in rows]
-        panels.append(_Panel(f"{heading.class_text} of each class", names, classes, heading.unit))
-    return _png(rows, *panels)
+        panels.append(_Panel(f"{column.class_text} of each class", names, classes, column.unit))
+    return _png(rows, panels, like)
 
 
-def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str, unit: str) -> bytes:
+def grid_png(title: str, grid: Mapping[str, Mapping[str, RunRow]], score: str, unit: str) -> bytes:
     """Draw bars of one score of every view, grouped by condition.
 
     Args:
@@ -61,8 +62,7 @@ def grid_png(title: str, grid: Mapping[str, Mapping[str, Row]], score: str, unit
     """
     scores = [[row.score(score) for row in by_condition.values()] for by_condition in grid.values()]
     conditions = list(next(iter(grid.values())))
-    panel = _Panel(title, conditions, scores, unit)
-    return _png([Row(view, ()) for view in grid], panel)
+    return _png([RunRow(view, ()) for view in grid], [_Panel(title, conditions, scores, unit)])
 
 
 class _Panel(NamedTuple):
@@ -74,10 +74,12 @@ class _Panel(NamedTuple):
     unit: str
 
 
-def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
+def _png(
+    rows: Sequence[RunRow], panels: Sequence[_Panel], like: EvaluationResult | None = None
+) -> bytes:
     """Draw panels of bars, and lines over the latitude for rows with latitude bands."""
-    banded = any(row.bands for row in rows)
-    count = len(panels) + banded
+    has_bands = any(row.bands for row in rows)
+    count = len(panels) + has_bands
     width = max(10.0, 0.12 * len(panels[-1].ticks) * len(rows))
     figure = Figure((width, 3.6 * count + 0.2 * len(rows)), dpi=120, layout="constrained")
     plots = figure.subplots(count, 1, squeeze=False)[:, 0]
@@ -85,11 +87,10 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
         axes.set_title(panel.title, loc="left")
         _bars(axes, rows, panel)
     plots[0].set_title(f"{panels[0].title}\n{_ERROR_BARS}", loc="left")
-    if banded:
-        record = next(row for row in rows if row.bands).records[0]
-        heading = record.columns[record.main]
-        plots[-1].set_title(f"{heading.text} by latitude", loc="left")
-        _band_lines(plots[-1], rows, record.main, heading.unit)
+    if has_bands and like is not None:
+        column = like.columns[like.main]
+        plots[-1].set_title(f"{column.text} by latitude", loc="left")
+        _band_lines(plots[-1], rows, like.main, column.unit)
     handles, labels = plots[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper left", frameon=False, ncols=2)
     for text in figure.findobj(Text):
@@ -99,7 +100,7 @@ def _png(rows: Sequence[Row], *panels: _Panel) -> bytes:
     return file.getvalue()
 
 
-def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
+def _bars(axes: Axes, rows: Sequence[RunRow], panel: _Panel) -> None:
     width, ticks = 0.8 / len(rows), panel.ticks
     for k, (row, number, scores) in enumerate(zip(rows, _numbers(rows), panel.scores, strict=True)):
         is_repeated = number >= len(_COLORS)  # its color
@@ -109,7 +110,7 @@ def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
             0.92 * width,
             yerr=np.transpose([_in_unit(_error_bar(score), panel.unit) for score in scores]),
             color=_COLORS[number % len(_COLORS)],
-            hatch="//" if row.published else "xx" if is_repeated else "",
+            hatch="//" if row.is_published else "xx" if is_repeated else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
         )
@@ -117,7 +118,7 @@ def _bars(axes: Axes, rows: Sequence[Row], panel: _Panel) -> None:
     _score_axis(axes, panel.unit)
 
 
-def _band_lines(axes: Axes, rows: Sequence[Row], score: str, unit: str) -> None:
+def _band_lines(axes: Axes, rows: Sequence[RunRow], score: str, unit: str) -> None:
     for row, number in zip(rows, _numbers(rows), strict=True):
         bands = sorted(row.bands)
         centers = [(south + north) / 2 for south, north in bands]
@@ -129,7 +130,7 @@ def _band_lines(axes: Axes, rows: Sequence[Row], score: str, unit: str) -> None:
     axes.set_xlim(-90, 90)
 
 
-def _numbers(rows: Sequence[Row]) -> list[int]:
+def _numbers(rows: Sequence[RunRow]) -> list[int]:
     """Return a number of each row for its color; a row and its row of the paper share a number."""
     names = list(dict.fromkeys(row.label.removesuffix(" (paper)") for row in rows))
     return [names.index(row.label.removesuffix(" (paper)")) for row in rows]

@@ -1,4 +1,4 @@
-"""Write the tables and files of one evaluation, and build parts of its record."""
+"""Write the tables and files of one evaluation, and build its parts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _OTHER_COLUMNS = {
     "taken_for": "most often taken for",
     "taken_for_share": "%",
 }
-"""Headings of the columns per class that are not scores."""
+"""Titles of the columns per class that are not scores."""
 
 
 def evaluation_result(head: Head, result: Any, noun: str, images: int) -> EvaluationResult:
@@ -92,89 +92,91 @@ def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, An
     ]
 
 
-def headline(record: EvaluationResult) -> str:
+def headline(result: EvaluationResult) -> str:
     """Return the scores over all images in one line."""
     means = [
-        f"{h.text} {score_text(value, h.unit, record.intervals.get(name))}\u00a0{h.unit}".strip()
-        for name, h in record.main_columns.items()
-        if (value := record.scores.get(name)) is not None
+        f"{h.text} {score_text(value, h.unit, result.intervals.get(name))}\u00a0{h.unit}".strip()
+        for name, h in result.main_columns.items()
+        if (value := result.scores.get(name)) is not None
     ]
-    absent = record.absent
-    some = f", {len(record.classes) - len(absent)} of {len(record.classes)} classes"
-    legend = " (in brackets: 95\u00a0% intervals)" if record.intervals else ""
-    over = counted(record.images, record.noun) + (some if absent else "")
+    absent = result.absent
+    some = f", {len(result.classes) - len(absent)} of {len(result.classes)} classes"
+    legend = " (in brackets: 95\u00a0% intervals)" if result.intervals else ""
+    over = counted(result.images, result.noun) + (some if absent else "")
     return f"{', '.join(means)} over {over}".strip() + legend
 
 
-def summary_lines(record: EvaluationResult) -> list[str]:
+def summary_lines(result: EvaluationResult) -> list[str]:
     """Return the headline and, below it, the facts of the protocol, if there are any."""
-    facts = (f"{name.replace('_', ' ')}: {fact}" for name, fact in record.protocol.items())
-    return list(filter(None, (headline(record), "; ".join(facts))))
+    facts = (f"{name.replace('_', ' ')}: {fact}" for name, fact in result.protocol.items())
+    return list(filter(None, (headline(result), "; ".join(facts))))
 
 
-def result_tables(record: EvaluationResult) -> list[Table]:
+def result_tables(result: EvaluationResult) -> list[Table]:
     """Return a table of scores per class, or over all images, by latitude, and by group.
 
     A class is omitted if it occurs in neither labels nor predictions and its score is undefined.
 
     Args:
-        record: EvaluationResult of the evaluation.
+        result: The evaluation.
     """
-    headings = record.columns
-    tables = [_per_class(record) if record.classes else _over_all(record)]
-    bands = [["{}° … {}°".format(*band["latitude_deg"])] for band in record.latitude_bands]
-    groups = [[group["group"], str(group["images"])] for group in record.groups]
+    tables = [_per_class(result) if result.classes else _over_all(result)]
+    bands = [["{}° … {}°".format(*band["latitude_deg"])] for band in result.latitude_bands]
+    groups = [[group["group"], str(group["images"])] for group in result.groups]
     for title, firsts, entries, header in (
-        ("By latitude", bands, record.latitude_bands, ["latitude"]),
-        ("By group", groups, record.groups, ["group", "images"]),
+        ("By latitude", bands, result.latitude_bands, ["latitude"]),
+        ("By group", groups, result.groups, ["group", "images"]),
     ):
-        names = [name for name in (entries[0] if entries else ()) if name in headings]
-        rows = [
-            [*first, *(score_text(entry[name], headings[name].unit) for name in names)]
-            for first, entry in zip(firsts, entries, strict=True)
-        ]
-        columns = [*header, *(headings[name].title for name in names)]
-        tables += [Table(title, columns, rows)] if rows else []
+        if entries:
+            columns = {n: result.columns[n] for n in entries[0] if n in result.columns}
+            rows = [
+                [*first, *(score_text(entry[name], c.unit) for name, c in columns.items())]
+                for first, entry in zip(firsts, entries, strict=True)
+            ]
+            titles = (column.title for column in columns.values())
+            tables.append(Table(title, [*header, *titles], rows))
     return tables
 
 
-def _mean(record: EvaluationResult, name: str) -> str:
-    unit = record.columns[name].unit
-    return score_text(record.scores[name], unit, record.intervals.get(name))
+def _mean(result: EvaluationResult, name: str) -> str:
+    unit = result.columns[name].unit
+    return score_text(result.scores[name], unit, result.intervals.get(name))
 
 
-def _over_all(record: EvaluationResult) -> Table:
+def _over_all(result: EvaluationResult) -> Table:
     rows = [
-        [heading.title, _mean(record, name)]
-        for name, heading in record.columns.items()
-        if record.latitude_bands or not name.endswith(SOLID_ANGLE)
+        [column.title, _mean(result, name)]
+        for name, column in result.columns.items()
+        if result.latitude_bands or not name.endswith(SOLID_ANGLE)
     ]
-    return Table("Scores", ("score", f"over all {record.noun}"), rows)
+    return Table("Scores", ("score", f"over all {result.noun}"), rows)
 
 
-def _per_class(record: EvaluationResult) -> Table:
-    mean_of, headings = record.class_means, dict(_OTHER_COLUMNS)
-    headings |= {name: record.columns[mean].class_title for name, mean in mean_of.items()}
-    units = {name: record.columns[mean].unit for name, mean in mean_of.items()}
+def _per_class(result: EvaluationResult) -> Table:
+    mean_of = result.class_means
+    titles = _OTHER_COLUMNS | {
+        name: result.columns[mean].class_title for name, mean in mean_of.items()
+    }
+    units = {name: result.columns[mean].unit for name, mean in mean_of.items()}
     columns = [
         name
-        for name in record.classes[0]
-        if name != "class" and (record.latitude_bands or not name.endswith(SOLID_ANGLE))
+        for name in result.classes[0]
+        if name != "class" and (result.latitude_bands or not name.endswith(SOLID_ANGLE))
     ]
-    predicted = np.sum(record.confusion, axis=0)[-len(record.classes) :]
+    predicted = np.sum(result.confusion, axis=0)[-len(result.classes) :]
     rows = [
         [entry["class"], *(_cell(entry[name], units.get(name, "%")) for name in columns)]
-        for entry, count in zip(record.classes, predicted, strict=True)
-        if count or entry[record.main_of_class] is not None
+        for entry, count in zip(result.classes, predicted, strict=True)
+        if count or entry[result.main_of_class] is not None
     ]
-    means = (_mean(record, mean_of[name]) if name in mean_of else "" for name in columns)
+    means = (_mean(result, mean_of[name]) if name in mean_of else "" for name in columns)
     texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
-    note = f"Means without classes that do not occur in the labels: {', '.join(record.absent)}."
+    note = f"Means without classes that do not occur in the labels: {', '.join(result.absent)}."
     return Table(
         "Per class",
-        ["class", *(headings[name] for name in columns)],
+        ["class", *(titles[name] for name in columns)],
         [*rows, ["mean", *means]],
-        note if record.absent else "",
+        note if result.absent else "",
         text_columns=texts,
     )
 
@@ -183,21 +185,21 @@ def _cell(value: Any, unit: str) -> str:
     return score_text(value, unit) if value is None or isinstance(value, float) else str(value)
 
 
-def confusion_table(record: EvaluationResult) -> Table:
+def confusion_table(result: EvaluationResult) -> Table:
     """Return the confusion matrix as a heat map, in percent of the true class."""
-    first = len(record.confusion) - len(record.classes)  # without the unknown class
-    counts = np.asarray(record.confusion, np.float64)[first:]
+    first = len(result.confusion) - len(result.classes)  # without the unknown class
+    counts = np.asarray(result.confusion, np.float64)[first:]
     shares = counts[:, first:] / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     rows = [
         (name, *(f"{100 * share:.0f}" if share >= 0.005 else "" for share in row))
-        for name, row in zip(record.class_names, shares, strict=True)
+        for name, row in zip(result.class_names, shares, strict=True)
     ]
     note = "Rows: truth; columns: prediction; % of the row."
-    return Table("Confusion", ("", *record.class_names), rows, note, shades=shares.tolist())
+    return Table("Confusion", ("", *result.class_names), rows, note, shades=shares.tolist())
 
 
 def write_results(
-    record: EvaluationResult,
+    result: EvaluationResult,
     folder: Path,
     notes: Sequence[str] = (),
     published: Sequence[Table] = (),
@@ -205,15 +207,15 @@ def write_results(
     """Write ``results.json``, ``.csv`` and ``.md``, each atomically.
 
     Args:
-        record: EvaluationResult of the evaluation.
+        result: The evaluation.
         folder: Output folder.
         notes: Paragraphs in ``results.md`` below the headline.
         published: Tables of published scores in ``results.md``.
     """
-    write_text(folder / RESULTS_FILE, record.json())
-    network = {"checkpoint": record.checkpoint, "label_map": record.label_map}
-    lines = [{**entry, **network} for entry in record.classes or [record.scores]]
+    write_text(folder / RESULTS_FILE, result.json())
+    network = {"checkpoint": result.checkpoint, "label_map": result.label_map}
+    lines = [{**entry, **network} for entry in result.classes or [result.scores]]
     write_text(folder / "results.csv", csv_text(list(lines[0]), lines))
-    tables = "\n".join(table.markdown() for table in (*result_tables(record), *published))
-    text = "\n\n".join(["# Results", *summary_lines(record), *notes, tables])
+    tables = "\n".join(table.markdown() for table in (*result_tables(result), *published))
+    text = "\n\n".join(["# Results", *summary_lines(result), *notes, tables])
     write_text(folder / "results.md", text)

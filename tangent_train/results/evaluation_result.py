@@ -105,37 +105,6 @@ class EvaluationResult:
         """Seed of the run."""
         return self.settings.get("seed")
 
-    @property
-    def bands(self) -> tuple[Band, ...]:
-        """Latitude bands."""
-        return tuple(tuple(entry["latitude_deg"]) for entry in self.latitude_bands)
-
-    @property
-    def data(self) -> str:
-        """Name of the data set, with rotation and gravity alignment of the test images."""
-        name = str(self.settings.get("data._target_")).rpartition(".")[2]
-        rotation = self.settings.get("data.test_rotation")
-        if rotation is None or self.settings.get("data.inputs") is None:  # shapes
-            return name
-        upright = self.settings.get("data.upright")
-        aligned = "" if upright is None else f", upright: {upright}"
-        return f"{name}, test rotated: {rotation}{aligned}"
-
-    def score(self, name: str, part: str | Band | None = None) -> float | None:
-        """Return a score over all images, of a class, or of a latitude band.
-
-        Args:
-            name: Name of the score.
-            part: Name of a class, or a band; None for all images.
-
-        Returns:
-            Score; None if it is undefined, or the part does not exist.
-        """
-        parts: dict[Any, Mapping[str, Any]] = {None: self.scores}
-        parts |= zip(self.class_names, self.classes, strict=True)
-        parts |= zip(self.bands, self.latitude_bands, strict=True)
-        return parts.get(part, {}).get(name)
-
     def json(self) -> str:
         """Return the content of ``results.json``."""
         content = _adapter().dump_json(self, indent=1, exclude={"settings", "folder"})

@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import yaml  # type: ignore[import-untyped]
 
 from tangent_train.results.evaluation_result import EvaluationResult
-from tangent_train.results.rows import Row
+from tangent_train.results.rows import RunRow, Score
 from tangent_train.results.tables import Table, score_text
 
 _NOT_FACTS = ("about", "experiment")
@@ -64,28 +64,35 @@ class Publication(NamedTuple):
         """Folds with a score; empty for means over all folds."""
         return tuple(dict.fromkeys(line["fold"] for line in self.lines if line["fold"]))
 
-    def differences(self, record: EvaluationResult) -> tuple[str, ...]:
+    def differences(self, result: EvaluationResult) -> tuple[str, ...]:
         """Return the facts that differ from those of an evaluation, with both values."""
-        published, found = facts(self.protocol), dict(record.protocol)
+        published, found = facts(self.protocol), dict(result.protocol)
         found.pop("views_aligned", None)  # of the method
         if self.level:
-            published["level"], found["level"] = self.level, str(record.settings.get("level"))
-        if self.folds and record.fold is not None and str(record.fold) not in self.folds:
-            published["fold"], found["fold"] = ", ".join(self.folds), str(record.fold)
+            published["level"], found["level"] = self.level, str(result.settings.get("level"))
+        if self.folds and result.fold is not None and str(result.fold) not in self.folds:
+            published["fold"], found["fold"] = ", ".join(self.folds), str(result.fold)
         pairs = {n: (published.get(n, "–"), found.get(n, "–")) for n in {**published, **found}}
         return tuple(f"{n}: published {p}, this run {r}" for n, (p, r) in pairs.items() if p != r)
 
-    def row(self, like: EvaluationResult, shown: Sequence[str] = ()) -> Row:
-        """Return a row with the headings and classes of an evaluation.
+    def row(self, like: EvaluationResult, shown: Sequence[str] = ()) -> RunRow:
+        """Return a row with the scores and classes of an evaluation.
 
         Args:
             like: Evaluation.
             shown: Facts of the protocol that are columns of the tables.
         """
-        folds: dict[str, dict[str, Mapping[str, str]]] = defaultdict(dict)
+        of_class = {mean: name for name, mean in like.class_means.items()}
+        scores = []
         for line in self.lines:
-            folds[line["fold"]][line["score"]] = line
-        records = tuple(_record(like, fold, by_score) for fold, by_score in folds.items())
+            fold, mean = int(line["fold"]) if line["fold"] else None, line["score"]
+            parts = [(None, mean, line["mean"])] if mean in like.columns else []
+            if mean in of_class:
+                parts += [(name, of_class[mean], line.get(name)) for name in like.class_names]
+            for part, name, text in parts:
+                if text:
+                    whole = 100 if like.columns[mean].unit == "%" else 1
+                    scores.append(Score(fold, None, name, part, round(float(text) / whole, 6)))
         protocol = facts(self.protocol)
         columns = {
             "data": protocol["data"],
@@ -95,72 +102,71 @@ class Publication(NamedTuple):
             "folds": ", ".join(self.folds) or "–",
             **{name: protocol.get(name, "–") for name in shown},
         }
-        return Row(f"{self.name} (paper)", records, columns, published=True)
+        return RunRow(f"{self.name} (paper)", scores, columns)
 
 
-class Comparison(NamedTuple):
-    """Published scores for some evaluations.
+def published_rows(
+    results: Sequence[EvaluationResult], *, transfer: bool = False, shown: Sequence[str] = ()
+) -> tuple[list[RunRow], list[str]]:
+    """Compare evaluations with the published scores on their data sets.
 
-    Attributes:
-        rows: Scores of the same protocol.
-        notes: Sources of these, and the differences of the nearest other protocols.
+    Args:
+        results: Evaluations with the same scores.
+        transfer: True for scores of networks that were trained on other data.
+        shown: Facts of the protocols that are columns of the tables.
+
+    Returns:
+        Rows of the published scores of the same protocol, and notes on their sources and on the
+        differences of the nearest other protocols.
+    """
+    groups: dict[tuple[str, ...], list[Publication]] = defaultdict(list)
+    for publication in publications():
+        stage, data = publication.stage, facts(publication.protocol)["data"]
+        names = {line["score"] for line in publication.lines}
+        on_data = [r for r in results if r.protocol.get("data") == data and names & {*r.scores}]
+        if on_data and (stage or publication.trained_on if transfer else not stage):
+            groups[min(map(publication.differences, on_data), key=len)].append(publication)
+    same = groups.pop((), [])
+    sources = ", ".join(dict.fromkeys(publication.source for publication in same))
+    notes = [f"Published scores of the same protocol: {sources}."] if same else []
+    nearest = sorted(groups, key=len)[:_MOST_NAMED]
+    notes += [_difference(groups[some], some, results[0]) for some in nearest]
+    return [publication.row(results[0], shown) for publication in same], notes
+
+
+def published_table(rows: Sequence[RunRow], like: EvaluationResult) -> Table:
+    """Return a table of published scores for one evaluation.
+
+    Args:
+        rows: Rows of published scores.
+        like: Evaluation with the scores and the fold.
     """
 
-    rows: list[Row]
-    notes: list[str]
+    def mean(row: RunRow, name: str) -> float | None:
+        return row.score(name, fold=like.fold if like.fold in row.folds else None).mean
 
-    @staticmethod
-    def of(
-        records: Sequence[EvaluationResult], *, transfer: bool = False, shown: Sequence[str] = ()
-    ) -> Comparison:
-        """Compare evaluations with the published scores on their data sets.
-
-        Args:
-            records: Evaluations with the same scores.
-            transfer: True for scores of networks that were trained on other data.
-            shown: Facts of the protocols that are columns of the tables.
-        """
-        groups: dict[tuple[str, ...], list[Publication]] = defaultdict(list)
-        for publication in publications():
-            stage, data = publication.stage, facts(publication.protocol)["data"]
-            names = {line["score"] for line in publication.lines}
-            on_data = [r for r in records if r.protocol.get("data") == data and names & {*r.scores}]
-            if on_data and (stage or publication.trained_on if transfer else not stage):
-                groups[min(map(publication.differences, on_data), key=len)].append(publication)
-        same = groups.pop((), [])
-        sources = ", ".join(dict.fromkeys(publication.source for publication in same))
-        notes = [f"Published scores of the same protocol: {sources}."] if same else []
-        nearest = sorted(groups, key=len)[:_MOST_NAMED]
-        notes += [_difference(groups[some], some, records[0]) for some in nearest]
-        return Comparison([publication.row(records[0], shown) for publication in same], notes)
-
-    def tables(self, like: EvaluationResult) -> list[Table]:
-        """Return a table of the rows for one evaluation, or nothing without rows.
-
-        Args:
-            like: Evaluation with the headings and the fold.
-        """
-        rows = [row.of_fold(like.fold) if like.fold in row.folds else row for row in self.rows]
-        names = [n for n in like.columns if any(r.score(n).mean is not None for r in rows)]
-        cells = [
-            (
-                row.label,
-                row.facts["input"],
-                *(score_text(row.score(name).mean, like.columns[name].unit) for name in names),
-            )
-            for row in rows
-        ]
-        header = ("", "input", *(like.columns[name].title for name in names))
-        table = Table("Published, same protocol", header, cells, text_columns=(0, 1))
-        return [table] if rows else []
+    columns = {
+        name: column
+        for name, column in like.columns.items()
+        if any(mean(row, name) is not None for row in rows)
+    }
+    cells = [
+        (
+            *(row.label, row.facts["input"]),
+            *(score_text(mean(row, name), column.unit) for name, column in columns.items()),
+        )
+        for row in rows
+    ]
+    header = ("", "input", *(column.title for column in columns.values()))
+    return Table("Published, same protocol", header, cells, text_columns=(0, 1))
 
 
 def _difference(
-    group: Sequence[Publication], differences: Sequence[str], record: EvaluationResult
+    group: Sequence[Publication], differences: Sequence[str], result: EvaluationResult
 ) -> str:
     """Return a sentence on published scores with the same differences from an evaluation."""
-    sign = -1 if record.columns[record.main].better == "lower" else 1
-    named = [(publication.scores(record.main), publication) for publication in group]
+    sign = -1 if result.columns[result.main].better == "lower" else 1
+    named = [(publication.scores(result.main), publication) for publication in group]
     scores, best = max(named, key=lambda pair: fmean([sign * s for s in pair[0]] or [-math.inf]))
     text = ", ".join(f"{score:g}" for score in scores)
     more = f" and {len(group) - 1} more" if len(group) > 1 else ""
@@ -196,20 +202,3 @@ def published_lines() -> Iterator[dict[str, str]]:
 
 def _read(name: str) -> str:
     return files("tangent_train.results").joinpath(name).read_text(encoding="utf-8")
-
-
-def _record(
-    like: EvaluationResult, fold: str, by_score: Mapping[str, Mapping[str, str]]
-) -> EvaluationResult:
-    def value(score: str, column: str) -> float | None:
-        text = by_score.get(score, {}).get(column)
-        whole = 100 if like.columns[score].unit == "%" else 1
-        return round(float(text) / whole, 6) if text else None
-
-    classes = [
-        {"class": c, **{name: value(mean, c) for name, mean in like.class_means.items()}}
-        for c in like.class_names
-    ]
-    means = {name: value(name, "mean") for name in like.scores}
-    settings = {"data.fold": int(fold) if fold else None}
-    return EvaluationResult("", 0, like.columns, means, classes, settings=settings)

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from datamodules.stanford2d3ds.files import FOLDS
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.results.chart import grid_png, report_png
-from tangent_train.results.evaluation_result import Band, EvaluationResult
-from tangent_train.results.rows import Row
+from tangent_train.results.evaluation_result import EvaluationResult
+from tangent_train.results.published import published_rows
+from tangent_train.results.rows import Part, RunRow, check_alike, group_results
 from tangent_train.results.tables import Table, score_text
 
 Cell = tuple[str, str]
@@ -25,6 +25,15 @@ _LEGEND = (
     "in brackets that over seeds within a fold."
 )
 _LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its images."
+_CHANGE_OF_STAGES = (
+    "Change: from photos after the same fine-tuning, over the folds and seeds that both have."
+)
+_REPRESENTATIONS = {
+    "Cubemap": "cube map",
+    "Equirect": "ERP",
+    "Perspective": "photos",
+    "Tangent": "tangent images",
+}
 
 
 @dataclass(frozen=True)
@@ -41,15 +50,20 @@ class Report:
     """
 
     title: str
-    rows: Sequence[Row]
+    rows: Sequence[RunRow]
     notes: Sequence[str] = ()
     compared: str = ""
     cells: Mapping[str, Cell] = field(default_factory=dict)
 
     @property
-    def grid(self) -> dict[str, dict[str, Row]]:
+    def first(self) -> EvaluationResult:
+        """First evaluation; all have the same scores and classes."""
+        return next(result for row in self.rows for result in row.results)
+
+    @property
+    def grid(self) -> dict[str, dict[str, RunRow]]:
         """Rows by view and condition, all conditions in each view; empty with one condition."""
-        grid: dict[str, dict[str, Row]] = defaultdict(dict)
+        grid: dict[str, dict[str, RunRow]] = defaultdict(dict)
         for row in self.rows:
             if row.label in self.cells:
                 view, condition = self.cells[row.label]
@@ -57,13 +71,8 @@ class Report:
         conditions = dict.fromkeys(c for rows in grid.values() for c in rows)
         if len(conditions) < 2:
             return {}
-        empty = Row("", ())
+        empty = RunRow("", ())
         return {view: {c: rows.get(c, empty) for c in conditions} for view, rows in grid.items()}
-
-    @property
-    def first(self) -> EvaluationResult:
-        """First record; all records have the same scores and classes."""
-        return self.rows[0].records[0]
 
     @property
     def cell_score(self) -> str:
@@ -71,38 +80,47 @@ class Report:
         by_angle = self.first.main + SOLID_ANGLE
         return by_angle if by_angle in self.first.columns else self.first.main
 
-    def tables(self) -> list[Table]:
-        """Return the tables of views in conditions, of means, of classes and of latitude bands."""
-        banded = [row for row in self.rows if row.bands]
-        tables = [*self._views(), self._overall(), *self._per_class()]
-        if banded:
-            bands, name = banded[0].bands, self.first.main
-            heading = self.first.columns[name]
-            rows = [
-                (row.label, *(score_text(row.score(name, b).mean, heading.unit) for b in bands))
-                for row in banded
-            ]
-            header = ("", *(f"{south:g}° … {north:g}°" for south, north in bands))
-            tables.append(Table(f"{heading.title} by latitude", header, rows))
-        return tables
-
-    def _views(self) -> Iterator[Table]:
-        grid = self.grid
-        if not grid:
-            return
-        conditions, name = next(iter(grid.values())), self.cell_score
-        rows = [
-            (view, *(self._cell(row, name, 0) for row in by_condition.values()))
-            for view, by_condition in grid.items()
-        ]
-        title = f"{self.title}: {self.first.columns[name].title}"
-        yield Table(title, ("", *conditions), rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
-
     @property
     def _legend(self) -> str:
-        return "Percent. " * all(h.unit == "%" for h in self.first.columns.values()) + _LEGEND
+        in_percent = all(column.unit == "%" for column in self.first.columns.values())
+        return "Percent. " * in_percent + _LEGEND
 
-    def _overall(self) -> Table:
+    def tables(self) -> list[Table]:
+        """Return the tables of views in conditions, of means, of classes and of latitude bands."""
+        first, tables = self.first, [self.means()]
+        if self.grid:
+            tables.insert(0, self._views())
+        for name, mean in first.class_means.items():
+            if not name.endswith(SOLID_ANGLE):
+                title = first.columns[mean].class_title
+                parts: dict[str, Part] = {c: c for c in first.class_names}
+                tables.append(self._parts(title[:1].upper() + title[1:], name, parts))
+        bands = next((row.bands for row in self.rows if row.bands), [])
+        title = f"{first.columns[first.main].title} by latitude"
+        titles = [f"{south:g}° … {north:g}°" for south, north in bands]
+        tables.append(self._parts(title, first.main, dict(zip(titles, bands, strict=True))))
+        return [table for table in tables if table.rows]
+
+    def _views(self) -> Table:
+        rows = [
+            (view, *(self._cell(row, self.cell_score) for row in by_condition.values()))
+            for view, by_condition in self.grid.items()
+        ]
+        title = f"{self.title}: {self.first.columns[self.cell_score].title}"
+        header = ("", *next(iter(self.grid.values())))
+        return Table(title, header, rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
+
+    def _parts(self, title: str, name: str, parts: Mapping[str, Part]) -> Table:
+        """Return the table of a score of classes or latitude bands, given by title."""
+        rows = [
+            (row.label, *(self._cell(row, name, part) for part in parts.values()))
+            for row in self.rows
+            if any(row.score(name, part).folds for part in parts.values())
+        ]
+        return Table(title, ("", *parts), rows)
+
+    def means(self) -> Table:
+        """Return the table of the scores over all images."""
         scores = self.first.main_columns
         names = dict.fromkeys(name for row in self.rows for name in row.facts)
         facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
@@ -110,55 +128,26 @@ class Report:
         columns = [("", [row.label for row in self.rows])]
         columns += [(name, cells) for name, cells in facts.items() if len(set(cells)) > 1]
         texts = range(len(columns))
-        for name, heading in scores.items():
-            cells = [self._cell(row, name, len(row.folds)) for row in self.rows]
-            columns.append((heading.title, cells))
+        for name, column in scores.items():
+            columns.append((column.title, [self._cell(row, name) for row in self.rows]))
             if self.compared and not name.endswith(SOLID_ANGLE):
-                columns.append(("change", [_change(row.kept(name).mean) for row in self.rows]))
+                columns.append(("change", [_change(row.ratio(name)) for row in self.rows]))
         header, cells_of = zip(*columns, strict=True)
         common = f"{'; '.join(alike)}." if alike else ""
-        shown = any(row.score(name).interval for row in self.rows for name in scores)
-        intervals = _LEGEND_OF_INTERVALS if shown else ""
+        has_intervals = any(row.score(name).interval for row in self.rows for name in scores)
+        intervals = _LEGEND_OF_INTERVALS if has_intervals else ""
         note = " ".join(filter(None, (common, self._legend, intervals, self.compared)))
         return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
 
-    def _per_class(self) -> Iterator[Table]:
-        classes = self.first.class_names
-        for name, mean in self.first.class_means.items():
-            rows = [
-                (row.label, *(self._cell(row, name, len(row.folds), c) for c in classes))
-                for row in self.rows
-                if not name.endswith(SOLID_ANGLE)
-                and any(row.score(name, c).mean is not None for c in classes)
-            ]
-            if rows:
-                title = self.first.columns[mean].class_title
-                yield Table(f"{title[:1].upper()}{title[1:]}", ("", *classes), rows)
-
-    def _cell(self, row: Row, name: str, folds: int, part: str | None = None) -> str:
+    def _cell(self, row: RunRow, name: str, part: Part = None) -> str:
         """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""
         score = row.score(name, part)
-        if score.mean is None:
-            return "–"
-        mean = name if part is None else self.first.class_means[name]
-        text = partial(score_text, unit=self.first.columns[mean].unit)
+        column = self.first.columns[self.first.class_means.get(name, name)]
+        text = partial(score_text, unit=column.unit)
         over_folds = "" if score.over_folds is None else f" ± {text(score.over_folds)}"
         over_seeds = "" if score.over_seeds is None else f" (± {text(score.over_seeds)})"
-        count = f" of {score.folds}" if score.folds < folds else ""
+        count = f" of {score.folds}" if 0 < score.folds < len(row.folds) else ""
         return text(score.mean, interval=score.interval) + over_folds + over_seeds + count
-
-    def all_notes(self) -> list[str]:
-        """Return the notes, with those on missing folds."""
-        incomplete: dict[str, list[str]] = defaultdict(list)
-        for row in self.rows:
-            missing = [str(fold) for fold in FOLDS if fold not in row.folds]
-            if missing and row.folds != (None,) and not row.published:
-                incomplete[" and ".join(missing)].append(row.label)
-        notes = [
-            f"{', '.join(labels)}: fold {folds} missing; not a mean of {len(FOLDS)} folds."
-            for folds, labels in incomplete.items()
-        ]
-        return [*notes, *self.notes]
 
     def write(self, folder: Path, name: str) -> None:
         """Write the report as ``.md``, ``.csv`` and ``.png``, each atomically.
@@ -168,68 +157,207 @@ class Report:
             name: Name of the files.
         """
         write_text(folder / f"{name}.md", self._markdown())
-        figures = list(self.figures())
-        columns = list(dict.fromkeys(key for figure in figures for key in figure))
-        write_text(folder / f"{name}.csv", csv_text(columns, figures))
+        lines = list(self.csv_lines())
+        titles = list(dict.fromkeys(title for line in lines for title in line))
+        write_text(folder / f"{name}.csv", csv_text(titles, lines))
         if self.grid:
-            heading = self.first.columns[self.cell_score]
-            title = f"{self.title}: {heading.text}"
-            png = grid_png(title, self.grid, self.cell_score, heading.unit)
+            column = self.first.columns[self.cell_score]
+            title = f"{self.title}: {column.text}"
+            png = grid_png(title, self.grid, self.cell_score, column.unit)
         else:
-            png = report_png(self.title, self.rows)
+            png = report_png(self.title, self.rows, self.first)
         write_bytes(folder / f"{name}.png", png)
 
-    def figures(self) -> Iterator[dict[str, Any]]:
-        """Yield the lines of the CSV file.
-
-        There is a line for each row, fold ("mean" over all folds), class or band, and score.
-        """
-        first = self.first
+    def csv_lines(self) -> Iterator[dict[str, Any]]:
+        """Yield a line for each row, fold ("mean" over all folds), class or band, and score."""
         for row in self.rows:
-            scopes = [(fold, row.of_fold(fold)) for fold in row.folds if fold is not None]
-            for fold, part in [*scopes, ("mean", row)]:
-                facts = {"row": row.label, **row.facts, "fold": fold}
-                entries: list[tuple[str, str | Band | None, str]]
-                entries = [("mean", None, name) for name in first.columns]
-                entries += [(c, c, name) for c in first.class_names for name in first.class_means]
-                entries += [
-                    ("mean", band, name)
-                    for band in row.bands
-                    for name in first.columns
-                    if name in row.records[0].latitude_bands[0]
-                ]
-                for class_name, section, name in entries:
-                    south, north = section if isinstance(section, tuple) else (None, None)
+            parts = dict.fromkeys((score.part, score.name) for score in row.scores)
+            for fold in (*(fold for fold in row.folds if fold is not None), None):
+                for part, name in parts:
+                    south, north = part if isinstance(part, tuple) else (None, None)
+                    score = row.score(name, part, fold)._asdict()
+                    low, high = score.pop("interval") or (None, None)
                     yield {
-                        **facts,
-                        "class": class_name,
+                        "row": row.label,
+                        **row.facts,
+                        "fold": "mean" if fold is None else fold,
+                        "class": part if isinstance(part, str) else "mean",
                         "south": south,
                         "north": north,
                         "score": name,
-                        **part.score(name, section)._asdict(),
-                        "kept": part.kept(name, section).mean,
+                        **score,
+                        "low": low,
+                        "high": high,
+                        "ratio": row.ratio(name, part, fold),
                     }
 
     def _markdown(self) -> str:
         first, *others = (table.markdown() for table in self.tables())
-        notes = "".join(f"- {note}\n" for note in self.all_notes())
+        notes = "".join(f"- {note}\n" for note in self.notes)
         runs = [
             (row.label, str(r.fold or "–"), str(r.seed), str(r.folder))
             for row in self.rows
-            if not row.published
-            for r in row.records
+            for r in row.results
         ]
         table = Table("Runs", ("", "fold", "seed", "run"), runs, text_columns=(0, 3))
         return "\n".join([f"# {first[3:]}", notes, *others, table.markdown()])
 
 
-def _change(kept: float | None) -> str:
+def _change(ratio: float | None) -> str:
     """Return the ratio to another score as a relative change in percent.
 
     >>> _change(0.955), _change(1.026), _change(0.9999)
     ('−4.5 %', '+2.6 %', '+0.0 %')
     """
-    if kept is None:
+    if ratio is None:
         return "–"
-    rounded = round(100 * (kept - 1), 1) + 0.0  # no −0.0
+    rounded = round(100 * (ratio - 1), 1) + 0.0  # no −0.0
     return f"{rounded:+.1f} %".replace("-", "−")
+
+
+def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) -> Report:
+    """Report the mean and spread of each group of finished runs, with published scores.
+
+    Args:
+        results: Results of the runs.
+        notes: Notes to add.
+
+    Raises:
+        DataError: The runs have different scores or classes.
+    """
+    check_alike(results)
+    shown = [
+        name
+        for name in dict.fromkeys(name for result in results for name in result.protocol)
+        if name not in ("data", "classes")
+        and len({result.protocol.get(name) for result in results}) > 1
+    ]
+    rows = [
+        RunRow.of(label, group, _facts(group, shown))
+        for label, group in group_results(results).items()
+    ]
+    published, sources = published_rows(results, shown=shown)
+    merged = sorted(
+        [*published, *rows], key=lambda row: (row.facts["data"], row.facts["s"].zfill(2))
+    )
+    return Report("Report", merged, [*_missing_folds(rows), *_repeated(rows), *notes, *sources])
+
+
+def transfer_report(
+    stages: Mapping[str, Sequence[EvaluationResult]], cells: Mapping[str, Cell] | None = None
+) -> Report:
+    """Report a transfer from photos to panoramas, with published scores.
+
+    Args:
+        stages: Evaluations by the names of their stages. S, S-erp and S-FT-10, tested on panoramas,
+            are compared with P and P-FT-10, tested on photos, after the same fine-tuning.
+        cells: View and condition of stages that evaluate the same network.
+    """
+    results = [result for group in stages.values() for result in group]
+    check_alike(results)
+    shown = ["test_rotation"]
+    rows = [RunRow.of(name, group, _facts(group, shown)) for name, group in stages.items()]
+    notes = _missing_folds(rows)
+    published, sources = published_rows(results, transfer=True, shown=shown)
+    by_name = {row.label: row for row in (*rows, *published)}
+    rows = [replace(row, partner=by_name.get(_photos_of(name))) for name, row in by_name.items()]
+    compared = _CHANGE_OF_STAGES if any(row.partner for row in rows) else ""
+    title = "Transfer from photos to panoramas"
+    return Report(title, rows, [*notes, *sources], compared, cells or {})
+
+
+def _photos_of(stage: str) -> str:
+    """Return the stage on photos with the same fine-tuning; "" for a stage on photos.
+
+    >>> _photos_of("S-FT-10 (paper)"), _photos_of("S-erp"), _photos_of("P")
+    ('P-FT-10 (paper)', 'P', '')
+    """
+    name, mark, paper = stage.partition(" (paper)")
+    if name[0] != "S":
+        return ""
+    photos = f"P{name[1:]}" if "-FT-" in name else "P"
+    return photos + mark + paper
+
+
+def levels_report(levels: Mapping[int, Sequence[EvaluationResult]], trained_level: float) -> Report:
+    """Report one network at several levels of the panoramas.
+
+    This is the paper's third transfer experiment: photos are normalized to the angular resolution
+    of one level; scores decrease with the difference from the resolution of the panoramas.
+
+    Args:
+        levels: Evaluations by level.
+        trained_level: Level with the angular resolution of the photos in training; a fraction if it
+            is between two levels.
+    """
+    check_alike([result for results in levels.values() for result in results])
+    rows = {
+        level: RunRow.of(f"level {level}", levels[level], _facts(levels[level]))
+        for level in sorted(levels)
+    }
+    nearest = min(rows, key=lambda level: abs(level - trained_level))
+    compared = [
+        row if level == nearest else replace(row, partner=rows[nearest])
+        for level, row in rows.items()
+    ]
+    note = f"Photos in training: the angular resolution of level {trained_level:g}."
+    change = f"Change: from level {nearest}, over the folds and seeds that both have."
+    notes = [*_missing_folds(compared), note]
+    return Report("One network at several levels", compared, notes, change)
+
+
+def _missing_folds(rows: Sequence[RunRow]) -> list[str]:
+    """Return notes on rows without a run of each fold of their data set."""
+    notes: dict[str, list[str]] = defaultdict(list)
+    for row in rows:
+        folds = row.results[0].folds
+        missing = [str(fold) for fold in folds if fold not in row.folds]
+        if missing:
+            text = f"fold {' and '.join(missing)} missing; not a mean of {len(folds)} folds."
+            notes[text].append(row.label)
+    return [f"{', '.join(labels)}: {text}" for text, labels in notes.items()]
+
+
+def _repeated(rows: Sequence[RunRow]) -> list[str]:
+    """Return notes on rows with several runs of the same fold and seed."""
+    return [
+        f"{row.label}: {len(row.results) - count} runs have the fold and seed of another one."
+        for row in rows
+        if (count := len({(r.fold, r.seed) for r in row.results})) < len(row.results)
+    ]
+
+
+def _facts(results: Sequence[EvaluationResult], shown: Sequence[str] = ()) -> dict[str, str]:
+    """Return data, inputs and views of a row, by column."""
+    result, settings = results[0], results[0].settings
+    folds = sorted({str(r.fold) for r in results if r.fold is not None})
+    label_map = {} if result.label_map is None else {"label map": result.label_map}
+    return {
+        "data": str(settings.get("data._target_")).rpartition(".")[2],
+        "s": str(settings.get("level") or "–"),
+        "input": _inputs(settings.get("data.inputs")),
+        "b": _base_level(settings),
+        **{name: result.protocol.get(name, "–") for name in shown},
+        **label_map,
+        "folds": ", ".join(folds) or "–",
+        "runs": str(len(results)),
+    }
+
+
+def _inputs(names: Sequence[str] | None) -> str:
+    """Return RGB or RGB-D, as in the paper, and further inputs; a dash for shapes."""
+    if names is None:
+        return "–"
+    further = [name for name in names if name not in ("rgb", "depth")]
+    return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
+
+
+def _base_level(settings: Mapping[str, Any]) -> str:
+    """Return the base level b of tangent images, or a short name of another representation."""
+    base = settings.get("representation.base_level")
+    if base is not None:
+        return str(base)
+    target = str(settings.get("representation._target_")).rpartition(".")[2]
+    name = target.removesuffix("Representation")
+    aware = ", distortion-aware" * bool(settings.get("representation.distortion_aware"))
+    return _REPRESENTATIONS.get(name, name) + aware

@@ -8,126 +8,157 @@ the folds (difference between folds), and over seeds, pooled over folds with sev
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
 from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
-from tangent_train.config.setting_rules import may_differ
 from tangent_train.errors import DataError
 from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.metrics.segmentation import Interval
 from tangent_train.results.evaluation_result import RESULTS_FILE, Band, EvaluationResult
 
+Part = str | Band | None
+"""Name of a class, or a latitude band; None for all images."""
+
+_IGNORED = (
+    *("choices", "checkpoint", "checkpoint_every_n_steps", "logger", "panels", "resume", "trust"),
+    *("validation_images", "seed", "data.fold", "data.seed", "data.root", "data.label_table"),
+    *("data.cache", "data.in_memory", "data.num_workers", "data.store"),
+    *("task.channels_last", "task.compile", "task.eval_view_batch_size"),
+    *("trainer.accelerator", "trainer.enable_model_summary", "trainer.enable_progress_bar"),
+    *("trainer.log_every_n_steps", "trainer.num_sanity_val_steps", "trainer.strategy"),
+)
+"""Settings, or sections, in which the runs of a row may differ: fold, seed, paths, speed."""
+
+_SHOWN_SETTINGS = 3
+
+
+class Score(NamedTuple):
+    """A score of one run, a share of 1 or in the unit of its column."""
+
+    fold: int | None
+    seed: int | None
+    name: str
+    part: Part
+    value: float
+
 
 class Statistic(NamedTuple):
-    """A score over folds and seeds, a share of 1.
+    """A score over folds and seeds.
 
     Attributes:
         mean: Mean over the means of folds; None if no run has the score.
         over_folds: Standard deviation of the means of folds; None with one fold.
         over_seeds: Pooled standard deviation within folds; None with one seed per fold.
         folds: Number of folds with the score: a class may be absent from a fold.
-        low: Lower end of the 95 % bootstrap interval over the images of a single run; None with
-            several runs.
-        high: Upper end of that interval.
+        interval: 95 % bootstrap interval over the images of a single run; None with several runs.
     """
 
     mean: float | None
     over_folds: float | None
     over_seeds: float | None
     folds: int
-    low: float | None = None
-    high: float | None = None
-
-    @property
-    def interval(self) -> Interval | None:
-        """The 95 % interval; None with several runs."""
-        return None if self.low is None or self.high is None else (self.low, self.high)
+    interval: Interval | None = None
 
 
 @dataclass(frozen=True)
-class Row:
-    """Evaluations that differ only in fold and seed.
+class RunRow:
+    """Scores of evaluations that differ only in fold and seed.
 
     Attributes:
         label: Name of the row.
-        records: Records of the evaluations.
-        facts: Further columns of the tables, by heading.
+        scores: Scores of all evaluations.
+        facts: Further columns of the tables, by title.
+        results: Evaluations; empty for published scores.
         partner: Row that the scores are compared with.
-        published: True if the scores are from a paper.
     """
 
     label: str
-    records: tuple[EvaluationResult, ...]
+    scores: Sequence[Score]
     facts: Mapping[str, str] = field(default_factory=dict)
-    partner: Row | None = None
-    published: bool = False
+    results: Sequence[EvaluationResult] = ()
+    partner: RunRow | None = None
+
+    @classmethod
+    def of(
+        cls, label: str, results: Iterable[EvaluationResult], facts: Mapping[str, str]
+    ) -> RunRow:
+        """Return the row of some evaluations, sorted by fold and seed."""
+        ordered = sorted(results, key=lambda r: (r.fold or 0, r.seed or 0, str(r.folder)))
+        return cls(label, [score for r in ordered for score in _scores(r)], facts, ordered)
+
+    @property
+    def is_published(self) -> bool:
+        """True for published scores, whose labels end in "(paper)"."""
+        return self.label.endswith("(paper)")
 
     @property
     def folds(self) -> tuple[int | None, ...]:
-        """Folds of the records; a single None for data without folds."""
-        folds = dict.fromkeys(record.fold for record in self.records)
+        """Folds of the scores; a single None for data without folds."""
+        folds = dict.fromkeys(score.fold for score in self.scores)
         return tuple(fold for fold in folds if fold is not None) or (None,)
 
     @property
-    def bands(self) -> tuple[Band, ...]:
-        """Latitude bands of the records."""
-        return tuple(dict.fromkeys(band for record in self.records for band in record.bands))
+    def bands(self) -> list[Band]:
+        """Latitude bands of the scores."""
+        parts = dict.fromkeys(score.part for score in self.scores)
+        return [part for part in parts if isinstance(part, tuple)]
 
-    def of_fold(self, fold: int | None) -> Row:
-        """Return the row with the records of one fold, also in the partner."""
-        records = tuple(record for record in self.records if record.fold == fold)
-        partner = None if self.partner is None else self.partner.of_fold(fold)
-        return replace(self, records=records, partner=partner)
+    @cached_property
+    def _grouped(self) -> Mapping[tuple[str, Part], list[Score]]:
+        groups: dict[tuple[str, Part], list[Score]] = defaultdict(list)
+        for score in self.scores:
+            groups[score.name, score.part].append(score)
+        return groups
 
-    def score(self, name: str, part: str | Band | None = None) -> Statistic:
+    def _select(self, name: str, part: Part, fold: int | None) -> list[Score]:
+        found = self._grouped.get((name, part), [])
+        return [score for score in found if fold in (None, score.fold)]
+
+    def score(self, name: str, part: Part = None, fold: int | None = None) -> Statistic:
         """Return the mean over folds of the mean over seeds, with spreads, or one run's interval.
 
         Args:
             name: Name of the score.
-            part: Name of a class, or a band; None for all images.
+            part: Part of the images.
+            fold: A single fold; None for all.
         """
-        statistic = average((fold, value) for (fold, _), value in self._values(name, part))
-        if part is not None or len(self.records) != 1:
-            return statistic
-        low, high = self.records[0].intervals.get(name, (None, None))
-        return statistic._replace(low=low, high=high)
+        statistic = average((s.fold, s.value) for s in self._select(name, part, fold))
+        if part is None and len(self.results) == 1:
+            return statistic._replace(interval=self.results[0].intervals.get(name))
+        return statistic
 
-    def kept(self, name: str, part: str | Band | None = None) -> Statistic:
-        """Return the ratio of a score to that of the partner, over folds and seeds of both.
+    def ratio(self, name: str, part: Part = None, fold: int | None = None) -> float | None:
+        """Return the ratio of the mean to that of the partner, over folds and seeds of both.
 
-        The mean is the ratio of the two means; the spreads are those of the single ratios. Pixels
-        of photos cover nearly equal solid angles, so that scores of panoramas by solid angle are
-        compared with scores of photos by pixels.
+        Pixels of photos cover nearly equal solid angles, so that scores of panoramas by solid angle
+        are compared with scores of photos by pixels.
 
         Args:
             name: Name of the score.
-            part: Name of a class, or a band; None for all images.
+            part: Part of the images.
+            fold: A single fold; None for all.
 
         Returns:
-            Ratio; its mean is None without a partner, or if the partner's score is undefined or 0.
+            Ratio; None without a partner, or if the partner's score is undefined or 0.
         """
         if self.partner is None:
-            return average([])
+            return None
         by_pixels = name.removesuffix(SOLID_ANGLE)
-        bases = dict(self.partner._values(name, part) or self.partner._values(by_pixels, part))
-        pairs = [(k[0], value, bases[k]) for k, value in self._values(name, part) if k in bases]
-        base_mean = average((fold, base) for fold, _, base in pairs).mean
-        if not base_mean:
-            return average([])
-        ratios = average((fold, value / base) for fold, value, base in pairs if base)
+        partner = self.partner._select(name, part, fold)
+        partner = partner or self.partner._select(by_pixels, part, fold)
+        bases = {(s.fold, s.seed): s.value for s in partner}
+        pairs = [
+            (s.fold, s.value, bases[s.fold, s.seed])
+            for s in self._select(name, part, fold)
+            if (s.fold, s.seed) in bases
+        ]
         mean = average((fold, value) for fold, value, _ in pairs).mean
-        return ratios._replace(mean=None if mean is None else mean / base_mean)
-
-    def _values(
-        self, name: str, part: str | Band | None
-    ) -> list[tuple[tuple[int | None, int | None], float]]:
-        """Return the defined scores of the records, with fold and seed."""
-        scores = (((r.fold, r.seed), r.score(name, part)) for r in self.records)
-        return [(key, value) for key, value in scores if value is not None]
+        base = average((fold, value) for fold, _, value in pairs).mean
+        return mean / base if mean is not None and base else None
 
 
 def average(values: Iterable[tuple[int | None, float]]) -> Statistic:
@@ -154,94 +185,94 @@ def average(values: Iterable[tuple[int | None, float]]) -> Statistic:
     )
 
 
-def check_alike(records: Sequence[EvaluationResult]) -> None:
+def _scores(result: EvaluationResult) -> Iterator[Score]:
+    """Yield the defined scores of an evaluation."""
+    parts: list[tuple[Part, Mapping[str, Any]]] = [(None, result.scores)]
+    parts += [(entry["class"], entry) for entry in result.classes]
+    parts += [(tuple(entry["latitude_deg"]), entry) for entry in result.latitude_bands]  # type: ignore[misc]
+    for part, entry in parts:
+        for name in dict.fromkeys((*result.columns, *result.class_means)):
+            if (value := entry.get(name)) is not None:
+                yield Score(result.fold, result.seed, name, part, value)
+
+
+def check_alike(results: Sequence[EvaluationResult]) -> None:
     """Check that evaluations have the same scores and the same classes.
 
     Raises:
         DataError: Scores or classes differ.
     """
-    first = records[0]
-    for record in records:
-        if (record.columns, record.class_names) != (first.columns, first.class_names):
+    contents = [(*result.columns, *result.class_names) for result in results]
+    for result, names in zip(results, contents, strict=True):
+        if names != contents[0]:
             raise DataError(
-                record.folder / RESULTS_FILE,
-                found=_contents(record),
-                expected=f"{_contents(first)}, the contents of {first.folder / RESULTS_FILE}",
+                result.folder / RESULTS_FILE,
+                found=f"scores and classes {', '.join(names)}",
+                expected=f"{', '.join(contents[0])}, as in {results[0].folder / RESULTS_FILE}",
                 remedy="Report them separately.",
             )
 
 
-def _contents(record: EvaluationResult) -> str:
-    classes = f", classes {', '.join(record.class_names)}" * bool(record.classes)
-    return f"scores {', '.join(record.columns)}{classes}"
-
-
-def group_runs(records: Sequence[EvaluationResult]) -> list[Row]:
+def group_results(results: Sequence[EvaluationResult]) -> dict[str, list[EvaluationResult]]:
     """Group evaluations that differ only in fold and seed.
 
     Args:
-        records: Records of finished runs, with their settings.
+        results: Results of finished runs, with their settings.
 
     Returns:
-        Rows in the order of their first runs. Their labels are the names of the runs, and the
-        settings by which they differ from rows of the same name.
-
-    Raises:
-        DataError: The runs have different scores or classes.
+        Groups in the order of their first runs, by label: the name of the runs, and the settings by
+        which they differ from groups of the same name.
     """
-    check_alike(records)
-    members: dict[str, list[EvaluationResult]] = defaultdict(list)
-    for record in records:
-        members[json.dumps(_identity(record), sort_keys=True, default=str)].append(record)
-    labels = _labels([group[0] for group in members.values()])
-    return [
-        Row(label, tuple(sorted(group, key=lambda r: (r.fold or 0, r.seed or 0, str(r.folder)))))
-        for label, group in zip(labels, members.values(), strict=True)
-    ]
+    groups: list[tuple[dict[str, Any], list[EvaluationResult]]] = []
+    for result in results:
+        identity = _identity(result)
+        members = next((members for other, members in groups if other == identity), None)
+        if members is None:
+            groups.append((identity, [result]))
+        else:
+            members.append(result)
+    for identity, members in groups:
+        identity.setdefault("name", members[0].folder.name)
+    identities = [identity for identity, _ in groups]
+    labels = [_label(one, identities, _SHOWN_SETTINGS) for one in identities]
+    if len(set(labels)) < len(labels):
+        labels = [_label(one, identities, None) for one in identities]
+    return {label: members for label, (_, members) in zip(labels, groups, strict=True)}
 
 
-def _identity(record: EvaluationResult) -> dict[str, Any]:
+def _identity(result: EvaluationResult) -> dict[str, Any]:
     """Return the settings that are equal in all runs of a row."""
+    ignored = tuple(f"{name}." for name in _IGNORED)
     # A network without settings is identified by its file.
-    network = {"checkpoint": record.checkpoint} if "network" in record.settings else {}
+    network = {"checkpoint": result.checkpoint} if "network" in result.settings else {}
     return network | {
         # Each fold is fine-tuned from a different checkpoint.
         name: True if name == "init_from" else value
-        for name, value in record.settings.items()
-        if value is not None and not may_differ(name, "report")
+        for name, value in result.settings.items()
+        if value is not None and not f"{name}.".startswith(ignored)
     }
 
 
-def _labels(firsts: Sequence[EvaluationResult], shown: int | None = 3) -> list[str]:
-    """Return names with the settings that differ: the first few, or all if they are needed."""
-    labels = []
-    for record in firsts:
-        settings = _identity(record)
-        others = [o for o in map(_identity, firsts) if o.get("name") == settings.get("name")]
-        differing = [
-            _short_setting(name, settings.get(name))
-            for name in sorted({key for other in others for key in other})
-            if any(_differs(name, other, settings) for other in others)
-        ]
-        text = ", ".join(differing[:shown]) + ", …" * (len(differing) > (shown or len(differing)))
-        name = str(settings.get("name") or record.folder.name)
-        labels.append(name + (f" ({text})" if text else ""))
-    is_clear = shown is None or len(set(labels)) == len(labels)
-    return labels if is_clear else _labels(firsts, None)
+def _label(
+    identity: Mapping[str, Any], identities: Sequence[Mapping[str, Any]], shown: int | None
+) -> str:
+    """Return the name of runs with the settings that differ: the first few, or all with None."""
+    others = [other for other in identities if other["name"] == identity["name"]]
+    names = sorted({name for other in others for name in other})
+    names = [n for n in names if any(_is_different(n, identity, other) for other in others)]
+    texts = [_setting_text(name, identity.get(name)) for name in names]
+    text = ", ".join(texts[:shown]) + ", …" * (shown is not None and len(texts) > shown)
+    return str(identity["name"]) + f" ({text})" * bool(text)
 
 
-def _differs(setting: str, first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
+def _is_different(name: str, first: Mapping[str, Any], second: Mapping[str, Any]) -> bool:
     """Return True if a setting differs, but not the class of its section."""
-    classes = [
-        name
-        for name in first.keys() | second.keys()
-        if name.endswith("._target_") and setting.startswith(name.removesuffix("_target_"))
-    ]
-    is_same_class = all(first.get(name) == second.get(name) for name in classes if name != setting)
-    return is_same_class and first.get(setting) != second.get(setting)
+    target = f"{name.rpartition('.')[0]}._target_"
+    is_comparable = name == target or first.get(target) == second.get(target)
+    return is_comparable and first.get(name) != second.get(name)
 
 
-def _short_setting(setting: str, value: Any) -> str:
+def _setting_text(name: str, value: Any) -> str:
     """Return a setting as text; a class without its module."""
-    section = setting.removesuffix("._target_")
-    return f"{section}={value if section == setting else str(value).rpartition('.')[2]}"
+    section = name.removesuffix("._target_")
+    return f"{section}={value if section == name else str(value).rpartition('.')[2]}"

@@ -11,9 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import SphereArea
 from tangent_train.heads import Head
 from tangent_train.inference.engine import scored_views, sees_rays, upright_rays, view_scores
 from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
@@ -145,8 +144,7 @@ class PixelTask(Task):
             sample: EvaluationSample[Tensor] = EvaluationSample(*fields)
             truth = self.head.truth(sample.target)
             if truth.ndim == 2:
-                area = SphereArea.of_numbers(sample.area.cpu().numpy())
-                where = sample.rotation.cpu().numpy(), area
+                where = sample.rotation.cpu().numpy(), valid_mask(sample.valid)
                 predicted = self.predict_panorama(sample.images, tuple(truth.shape), *where, truth)
                 prediction = self.head.comparable(predicted, truth)
             else:
@@ -171,7 +169,7 @@ class PixelTask(Task):
         images: Float[Tensor, "images channels height width"],
         shape: Any,
         rotation: NDArray[np.float64] | None = None,
-        area: SphereArea | None = None,
+        valid: NDArray[np.bool_] | None = None,
         truth: Tensor | None = None,
     ) -> Tensor:
         """Predict every pixel of a panorama, see `Head`.
@@ -180,12 +178,12 @@ class PixelTask(Task):
             images: Images of all view sets of the representation, in this order.
             shape: ``(H, W)`` of the panorama.
             rotation: Rotation of the representation ``(3, 3)``.
-            area: Area of a partial panorama; None for the whole sphere.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
             truth: Result of `Head.truth`, to add to the validation loss, except in a test.
         """
-        sets = self.view_sets(images, rotation, area)
+        sets = self.view_sets(images, rotation, valid)
         how: dict[str, Any] = {"averaged": len(sets) > 1, "device": images.device}
-        mosaic = self.head.mosaic(shape, self.representation.blend, area=area, **how)
+        mosaic = self.head.mosaic(shape, self.representation.blend, valid=valid, **how)
         for views, outputs in scored_views(self, sets, self.eval_view_batch_size):
             mosaic.add(outputs, views)
             if truth is not None and not self.is_tested:
@@ -199,18 +197,19 @@ class PixelTask(Task):
             self.add_validation_loss(outputs, self.head.targets(truth, lengths))
 
     def view_sets(
-        self, images: Tensor, rotation: NDArray[np.float64] | None, area: SphereArea | None
+        self, images: Tensor, rotation: NDArray[np.float64] | None, valid: NDArray[np.bool_] | None
     ) -> list[ViewSet]:
         """Return the sets of views of a panorama, with their images.
 
         Args:
             images: Images of all view sets of the representation, in this order.
             rotation: Rotation of the representation ``(3, 3)``.
-            area: Area of a partial panorama; None for the whole sphere.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
         """
-        limited = self.representation.limited_to(area)
-        rotated = limited if rotation is None else limited.with_rotation(rotation)
-        sets = rotated.view_sets()
+        rotated = self.representation
+        if rotation is not None:
+            rotated = rotated.with_rotation(rotation)
+        sets = rotated.view_sets(valid)
         readers = (part.__getitem__ for part in torch.split(images, [len(views) for views in sets]))
         seen = upright_rays(sets, rotation, images.device) if self.sees_rays else [None] * len(sets)
         return list(zip(sets, readers, seen, strict=True))

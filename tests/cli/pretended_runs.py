@@ -17,7 +17,7 @@ from tangent_train.cli.command_settings import check_settings
 from tangent_train.cli.transfer import transfer
 from tangent_train.files import config_folder
 from tests.cli.tiny_runs import SMALL_ROOMS
-from tests.results.made_records import made_record
+from tests.results.example_results import example_result
 
 SETTINGS = (
     "experiment=rooms/transfer",
@@ -69,7 +69,7 @@ class PretendedRuns:
         if folder.name == self.failing:
             return 7
         score = 1.0 if folder.name == "S-FT-1" else 0.5
-        record = made_record([score, score], ("wall", "floor"))
+        record = example_result([score, score], ("wall", "floor"))
         (folder / "results.json").write_text(record.json())
         return 0
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.cli.tiny_runs import Run
-from tests.results.made_records import made_record, write_run
+from tests.results.example_results import example_result, write_run
 
 FILES = {"report.md", "report.csv", "report.png"}
 
@@ -16,9 +16,9 @@ FILES = {"report.md", "report.csv", "report.png"}
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
     """Two folds, no sofa in the second."""
-    write_run(tmp_path / "runs" / "1", made_record([0.6, 0.5, 1.0], bands=(0.6, 0.2), data__fold=1))
+    write_run(tmp_path / "runs" / "1", example_result([0.6, 0.5, 1.0], bands=(0.6, 0.2), data__fold=1))
     write_run(
-        tmp_path / "runs" / "2", made_record([0.8, 0.5, None], bands=(0.6, 0.2), data__fold=2)
+        tmp_path / "runs" / "2", example_result([0.8, 0.5, None], bands=(0.6, 0.2), data__fold=2)
     )
     return tmp_path / "runs"
 
@@ -38,7 +38,7 @@ def test_the_files_hold_the_runs(
     assert float(wall["mean"]) == pytest.approx(0.7)
     text = (tmp_path / "report" / "report.md").read_text()
     assert "| mine | 70.0 ± 14.1 | 50.0 ± 0.0 | 100.0 of 1 |" in text
-    assert "| mine | 60.0 | 20.0 |" in text, "bands of latitude"
+    assert "| mine | 60.0 ± 0.0 | 20.0 ± 0.0 |" in text, "bands of latitude"
     assert f"| mine | 2 | 0 | {runs / '2'} |" in text
     printed = capsys.readouterr().out
     for words in ("mine: fold 3 missing", f"{runs / 'cut'}: not finished"):

@@ -14,11 +14,11 @@ from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
     RingGrid,
-    SphereArea,
     TangentGrid,
     rotation_about,
 )
 from tangent_train.geometry.coverage import check_coverage, overlaps
+from tangent_train.geometry.equirect import area_mask
 from tangent_train.rendering.tables import find_owned_spans, owners
 from tests.geometry.directions import angle_deg, random_directions
 
@@ -156,14 +156,18 @@ def test_a_direction_may_be_shown_by_another_view_than_its_owner() -> None:
         grid_of(rings, fov, size, by_owners=True)
 
 
+def _mask(*angles: float) -> NDArray[np.bool_]:
+    return area_mask(angles, (360, 720))
+
+
 def test_some_views_can_cover_a_part_of_the_sphere() -> None:
-    flat = grid_of(((0, 1),), area=SphereArea(-49, 49, -35, 35))
+    flat = grid_of(((0, 1),), valid=_mask(-49, 49, -35, 35))
     assert (flat.num_images, flat.is_overlapping) == (1, True)
     with pytest.raises(SettingError, match="expected views that cover the area"):
-        grid_of(((0, 1),), area=SphereArea(-49, 49, -39, 39))
+        grid_of(((0, 1),), valid=_mask(-49, 49, -39, 39))
     front = grid_of(STANDARD).subset([0, 8, 13])
-    check_coverage([front], SphereArea(-20, 20, -80, 80), by_owners=True)
-    assert overlaps(front, SphereArea(-20, 20, -80, 80))
+    check_coverage([front], _mask(-20, 20, -80, 80), by_owners=True)
+    assert overlaps(front, _mask(-20, 20, -80, 80))
     np.testing.assert_array_equal(front.directions(), grid_of(STANDARD).directions([0, 8, 13]))
     assert front != grid_of(STANDARD).subset([0, 8, 12])
     assert front.with_rotation(ROTATION) == grid_of(STANDARD, rotation=ROTATION).subset([0, 8, 13])

@@ -13,8 +13,10 @@ from torch import nn
 
 from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
+from datamodules.core.samples import valid_mask
 from tangent_train.config.build import build_from_config
-from tangent_train.geometry import SphereArea
+from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.valid_views import is_valid
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -57,7 +59,7 @@ KINDS = {
 
 def write_both(root: Path, angles: tuple[float, ...] = AREA) -> tuple[Path, Path]:
     """Whole panoramas whose labels are unknown outside an area, and the same cut to it."""
-    canvas = PanoramaArea.on_canvas(SphereArea.of(angles), ROWS)
+    canvas = PanoramaArea.on_canvas(angles, ROWS)
     for folder in (root / "whole", root / "part"):
         write_classes(folder, [None, "dark", "green", "bright"])
         (folder / "test.txt").write_text("0\n1\n")
@@ -92,7 +94,7 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
     for root in write_both(tmp_path):
         task = _task(kind)
         data = _data(root, task, test_rotation=rotation)
-        metric = task.build_metric()
+        metric = task.head.build_metric()
         for plain in data.test_dataloader():
             batch: Any = data.on_after_batch_transfer(plain, 0)
             predicted = predict_labels(
@@ -100,24 +102,20 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
                 batch.images[0],
                 tuple(batch.target[0].shape),
                 batch.rotation[0].numpy(),
-                area=SphereArea.of_numbers(batch.area[0].numpy()),
+                valid=valid_mask(batch.valid[0]),
             )
             metric.update(predicted, batch.target[0])
             labels.append(predicted.where(batch.target[0] > 0, 0))
             views.append(batch.images.numel())
         counts.append(metric.compute())
-    whole, part = counts
     for name in ("pixels", "bands", "solid_angle"):  # true classes, which the fill does not change
         expected, found = (getattr(count, name).sum(axis=-1) for count in counts)
         np.testing.assert_allclose(found, expected, rtol=1e-12)
-    assert whole.pixels.sum() > 0
+    assert counts[0].pixels.sum() > 0
     before, after = torch.stack(labels[:2]), torch.stack(labels[2:])
     assert (before == after)[before > 0].double().mean() > 0.98
-    is_less = rotation is None and kind not in ("cube map", "icosphere")
+    is_less = rotation is None and kind in ("tangent", "nearest", "horizontal")
     assert sum(views[2:]) <= sum(views[:2]) - is_less
-    if kind == "equirectangular" and rotation is None:  # nothing is interpolated
-        assert torch.equal(before, after)
-        np.testing.assert_array_equal(part.of_images, whole.of_images)
 
 
 def test_the_validation_loss_is_that_of_the_labels_in_the_area(tmp_path: Path) -> None:
@@ -148,7 +146,7 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         batch.images[0],
         tuple(batch.target[0].shape),
         batch.rotation[0].numpy(),
-        area=SphereArea.of_numbers(batch.area[0].numpy()),
+        valid=valid_mask(batch.valid[0]),
     )
     trained = trained_network(KINDS[of], module=network, fill="reflect")
     views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"))
@@ -162,17 +160,6 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
 
 
-def test_a_network_of_one_size_gets_the_whole_image() -> None:
-    area = PanoramaArea.on_canvas(SphereArea.of(AREA), ROWS)
-    image = InputImage(area.place(area.cut(sphere(ROWS))), area=area)
-    sizes = []
-    for fixed in (None, (ROWS, 2 * ROWS)):
-        trained = trained_network(ERP | {"level": 5}, fixed_size=fixed)
-        ((_, _, (views,), _),) = PanoramaViews(trained)(image)
-        sizes.append(views.render(image.rgb, "bilinear").shape[1:3])
-    assert sizes == [(64, 96), (64, 128)]
-
-
 def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -> None:
     """Pixel for pixel: colors and labels of all views that see nothing else."""
     small = TangentRepresentation(1, 5)
@@ -182,19 +169,16 @@ def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -
         task.representation = small
         data = _data(root, task)
         image = data.source("test").read(0)
-        (views,) = image.sampler(small).view_sets()
+        (views,) = image.sampler(small).view_sets(image.valid)
         rendered.append(
             [views.render(image.rgb, "bilinear"), views.render(image.labels, "nearest")]
         )
         kept = views.grid
     assert len(rendered[1][0]) < 80
-    canvas = PanoramaArea.on_canvas(SphereArea.of(AREA), ROWS)
-    (top, bottom), (left, right), pixel = canvas.rows, canvas.columns, 180 / ROWS
-    inner = SphereArea(
-        (left + 1) * pixel - 180, (right - 1) % (2 * ROWS) * pixel - 180,
-        90 - (bottom - 1) * pixel, 90 - (top + 1) * pixel,
-    )  # fmt: skip
-    inside = inner.contains(kept.directions()).all(axis=(1, 2))
+    west, east, south, north = AREA
+    inner = area_mask((west + 5, east - 5, south + 5, north - 5), (512, 1024))
+    inside = is_valid(inner, kept.directions().reshape(-1, 3)).reshape(len(rendered[1][0]), -1)
+    inside = inside.all(axis=1)
     assert 5 < inside.sum() < inside.size
     whole = TangentRepresentation(1, 5).grid
     faces = (whole.centers_xyz @ kept.centers_xyz.T).argmax(axis=0)
@@ -213,7 +197,8 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
         data = _data(write_both(tmp_path)[1], task, fill=fill, batch_size=2)
         batch: Any = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
         assert batch.images.shape[:2] == batch.labels.shape[:2]
-        assert batch.images.shape[:2] == (2, len(data.representation.view_sets()[0]))
+        needed = data.representation.view_sets(data.canvas.valid)[0]
+        assert batch.images.shape[:2] == (2, len(needed))
         images, labels = task.training_pairs(batch)
         losses.append(
             float(task.loss_sum((images,), labels).detach()) / float(task.head.loss_norm(labels))

@@ -21,13 +21,13 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
-    SphereArea,
     TangentGrid,
     camera_matrix_from_fov,
     equirect_directions,
     equirect_solid_angles,
     rotation_about,
 )
+from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads import head_of
 from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.inference.applying import apply
@@ -118,14 +118,13 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
     for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, 17 * depth.where(up.abs() < 0.6, depth / 4)))  # farther at the poles
-    for shape, area in (
+    for shape, valid in (
         (SHAPE, None),
-        (SHAPE, SphereArea(-60, 100, -20, 70)),
+        (SHAPE, area_mask((-60, 100, -20, 70), SHAPE)),
         ((32, 64), None),  # fewer pixels than directions
     ):
-        found = _combined(outputs, shape, "relative_disparity", "nearest", "none", area=area)
-        directions = equirect_directions(shape)
-        inside = area.contains(directions) if area else np.ones(shape, bool)
+        found = _combined(outputs, shape, "relative_disparity", "nearest", "none", valid=valid)
+        inside = np.ones(shape, bool) if valid is None else valid
         values: Any = found[inside]
         weight = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)[inside]
         assert weight[values < 1].sum() / weight.sum() == pytest.approx(0.5, abs=0.015)

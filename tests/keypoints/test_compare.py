@@ -9,7 +9,8 @@ import pytest
 from PIL import Image
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair
-from tangent_train.geometry import SphereArea
+from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.valid_views import is_valid
 from tangent_train.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 from tests.keypoints.ball_room import ball_pair
@@ -88,13 +89,13 @@ def test_keypoints_of_partial_panoramas_lie_in_their_areas(
         files.append(str(tmp_path / f"{name}.webp"))
         Image.fromarray(side.rgb[40:160, 100:300]).save(files[-1], xmp=xmp, lossless=True)
     read = ImagePairs(files[0], files[1]).read(0)
-    area = SphereArea(-86.25, 101.25, -60, 52.5)
-    assert read.left.area is not None
-    assert read.left.area.angles == area.angles
+    valid = area_mask((-86.25, 101.25, -60, 52.5), (192, 384))
+    assert read.left.valid is not None
+    np.testing.assert_array_equal(read.left.valid, valid)
     comparison = Comparer((1,), seed=3).compare(read)
     for condition in (AS_GIVEN, ROTATED):
         for matched in comparison.found[condition].values():
             assert len(matched.left) > 20
-            assert area.contains(matched.left.directions_xyz).all()
-            is_inside = area.contains(matched.right.directions_xyz)
+            assert is_valid(valid, matched.left.directions_xyz).all()
+            is_inside = is_valid(valid, matched.right.directions_xyz)
             assert is_inside.all() == (condition == AS_GIVEN)

@@ -9,13 +9,13 @@ import pytest
 
 from tangent_train.errors import DataError
 from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
-from tests.results.made_records import made_record, write_run
+from tests.results.example_results import example_result, write_run
 
 SCORES = (0.1, 0.2, None)
 
 
 def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
-    result = made_record(SCORES, bands=(0.5, 0.25))
+    result = example_result(SCORES, bands=(0.5, 0.25))
     result = replace(result, intervals={"miou": (0.125, 0.5), "macc_solid_angle": (0.0, 1.0)})
     result = replace(result, folds=(4, 5))
     read = load_result(write_run(tmp_path / "a", result))
@@ -27,7 +27,7 @@ def test_a_result_is_read_as_it_was_written(tmp_path: Path) -> None:
 
 def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     for name in ("b", "a"):
-        write_run(tmp_path / name, made_record(SCORES))
+        write_run(tmp_path / name, example_result(SCORES))
     (tmp_path / "cut" / "checkpoints").mkdir(parents=True)
     found = find_runs([tmp_path / "b", tmp_path])
     assert [path.name for path in found] == ["b", "a"]
@@ -38,7 +38,7 @@ def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("content", [None, "[]", '{"noun": "pairs"}', "[" * 100_000])
 def test_broken_results_are_named(content: str | None, tmp_path: Path) -> None:
-    path = write_run(tmp_path / "a", made_record(SCORES)) / "results.json"
+    path = write_run(tmp_path / "a", example_result(SCORES)) / "results.json"
     path.unlink()
     if content is not None:
         path.write_text(content)

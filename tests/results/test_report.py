@@ -15,13 +15,18 @@ from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
 from tangent_train.heads import DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
-from tangent_train.results.comparisons import runs_report, transfer_report
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
-from tangent_train.results.published import Comparison, facts, publications, published_lines
-from tangent_train.results.report import Report
-from tangent_train.results.rows import Row
+from tangent_train.results.published import (
+    facts,
+    publications,
+    published_lines,
+    published_rows,
+    published_table,
+)
+from tangent_train.results.report import Report, levels_report, runs_report, transfer_report
+from tangent_train.results.rows import RunRow
 from tests.decoded import decoded
-from tests.results.made_records import PROTOCOL, made_record, without_solid_angle
+from tests.results.example_results import PROTOCOL, example_result, without_solid_angle
 
 REAL = CLASSES
 
@@ -36,37 +41,48 @@ def _cells(report: Report, table: int = 0) -> dict[str, dict[str, str]]:
     return {row[0]: dict(zip(found.header[1:], row[1:], strict=True)) for row in found.rows}
 
 
-def _paper(**settings: Any) -> dict[str, Row]:
+def _paper(**settings: Any) -> dict[str, RunRow]:
     """The paper's transfer by stage, as it stands beside one of that level."""
-    record = made_record([0.5] * 13, REAL, **{"level": 8, "protocol": PROTOCOL, **settings})
+    record = example_result([0.5] * 13, REAL, **{"level": 8, "protocol": PROTOCOL, **settings})
     photos = replace(record, protocol=facts("paper_photos"))
     rows = transfer_report({"P": [photos], "S": [record]}).rows
-    return {row.label.removesuffix(" (paper)"): row for row in rows if row.published}
+    return {row.label.removesuffix(" (paper)"): row for row in rows if row.is_published}
 
 
-def test_the_tables_show_means_spreads_and_what_is_missing() -> None:
+def test_the_tables_show_means_spreads_and_missing_folds() -> None:
     report = _runs_report(
-        made_record([0.1, 0.5, 0.5], data__fold=1),
-        made_record([0.3, 0.5, None], data__fold=3),
-        made_record([0.3, 0.5, None], data__fold=3, seed=1),
-        made_record([0.3, 0.5, None], data__fold=3, seed=1),
+        example_result([0.1, 0.5, 0.5], data__fold=1),
+        example_result([0.3, 0.5, None], data__fold=3),
+        example_result([0.3, 0.5, None], data__fold=3, seed=1),
+        example_result([0.3, 0.5, None], data__fold=3, seed=1),
     )
     cells = _cells(report)["mine"]
     assert cells["mIoU %"] == "38.3 ± 2.4 (± 0.0)"
-    note = report.tables()[0].note
+    note = report.means().note
     assert note.startswith("data Stanford2D3DS; s 7; input RGB-D; b 0; folds 1, 3; runs 4. Percent")
     classes = {"wall": "20.0 ± 14.1 (± 0.0)", "floor": "50.0 ± 0.0 (± 0.0)", "sofa": "50.0 of 1"}
     assert [_cells(report, k)["mine"] for k in (1, 2)] == [classes] * 2
-    assert report.all_notes() == [
+    assert report.notes == [
         "mine: fold 2 missing; not a mean of 3 folds.",
-        "mine: fold 3, seed 1 more than once, also in /runs/3_1.",
+        "mine: 1 runs have the fold and seed of another one.",
         "a note",
     ]
 
 
+def test_folds_are_those_of_the_data_set() -> None:
+    """Own data with folds 4 and 5, and data without folds."""
+    results = [example_result([0.5] * 3, folds=(4, 5), data__fold=fold) for fold in (4, 5)]
+    assert runs_report(results).notes == []
+    assert runs_report(results[:1]).notes == ["mine: fold 5 missing; not a mean of 2 folds."]
+    assert transfer_report({"S": results[1:]}).notes == [
+        "S: fold 4 missing; not a mean of 2 folds."
+    ]
+    assert runs_report([example_result([0.5] * 3, folds=(), data__fold=None)]).notes == []
+
+
 def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     def run(found: dict[str, tuple[float, float]], **settings: Any) -> EvaluationResult:
-        return replace(made_record([0.1, 0.5, 0.5], **settings), intervals=found)
+        return replace(example_result([0.1, 0.5, 0.5], **settings), intervals=found)
 
     intervals = {"miou": (0.25, 0.31)}  # a mean of few images may lie outside
     several = [run(intervals, data__fold=fold) for fold in (1, 2)]
@@ -76,8 +92,8 @@ def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     assert cells["single"]["mAcc %"] == "36.7"
     assert cells["mine"]["mIoU %"] == "36.7 ± 0.0"
     explained = "95 % bootstrap interval over its images"
-    assert explained in report.tables()[0].note
-    assert explained not in _runs_report(*several).tables()[0].note
+    assert explained in report.means().note
+    assert explained not in _runs_report(*several).means().note
 
 
 def test_the_views_of_a_row_are_named() -> None:
@@ -85,13 +101,13 @@ def test_the_views_of_a_row_are_named() -> None:
     records = []
     for aware in (False, True):
         section = {"_target_": target, "distortion_aware": aware, "base_level": None}
-        records.append(made_record([0.5] * 3, representation=section))
+        records.append(example_result([0.5] * 3, representation=section))
     shown = {cells["b"] for cells in _cells(_runs_report(*records)).values()}
     assert shown == {"ERP", "ERP, distortion-aware"}
 
 
 def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
-    report = _runs_report(made_record([0.5] * 13, REAL, protocol=PROTOCOL))
+    report = _runs_report(example_result([0.5] * 13, REAL, protocol=PROTOCOL))
     cells = _cells(report)
     assert set(cells) == {
         "tangent images (paper)", "Tateno et al. (paper)", "Lee et al. (paper)", "mine",
@@ -102,28 +118,25 @@ def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
     per_class = _cells(report, 1)["tangent images (paper)"]
     assert (per_class["beam"], per_class["board"]) == ("30.4", "57.2")
     source = "Published scores of the same protocol: https://arxiv.org/abs/1912.09390."
-    assert source in report.all_notes()
+    assert source in report.notes
 
 
 @pytest.mark.parametrize("name", sorted(PROTOCOL.keys() - {"data"} | {"another"}))
-def test_a_single_differing_fact_is_named_and_nothing_stands_beside(name: str) -> None:
-    record = made_record([0.5] * 13, REAL, protocol=PROTOCOL | {name: "changed"})
-    published = Comparison.of([record])
-    assert published.rows == []
-    assert published.tables(record) == []
-    first, *others = published.notes
-    was = PROTOCOL.get(name, "–")
+def test_scores_with_one_differing_fact_are_not_shown_and_the_fact_is_named(name: str) -> None:
+    result = example_result([0.5] * 13, REAL, protocol=PROTOCOL | {name: "changed"})
+    rows, (first, *others) = published_rows([result])
+    assert rows == []
     assert first == (
         "Not comparable: tangent images: 44.9 and 2 more (paper_512). "
-        f"{name}: published {was}, this run changed."
+        f"{name}: published {PROTOCOL.get(name, '–')}, this run changed."
     )
     assert 1 <= len(others) <= 2
 
 
-def test_published_scores_stand_with_their_own_differences() -> None:
-    """Scores of one protocol at levels 5 and 7 differ from a run at level 6 in other ways."""
-    record = made_record([0.5] * 13, REAL, protocol=PROTOCOL, level=6)
-    five, seven, _ = Comparison.of([record]).notes
+def test_published_scores_of_one_protocol_have_their_own_differences() -> None:
+    """Scores at levels 5 and 7 differ from a run at level 6."""
+    result = example_result([0.5] * 13, REAL, protocol=PROTOCOL, level=6)
+    _, (five, seven, _) = published_rows([result])
     assert five.startswith("Not comparable: Zhang et al.: 43.3 and 3 more (paper_512). level: ")
     assert seven.endswith(
         "tangent images: 44.9 and 2 more (paper_512). level: published 7, this run 6."
@@ -132,24 +145,24 @@ def test_published_scores_stand_with_their_own_differences() -> None:
 
 def test_a_fold_without_a_published_score_is_named() -> None:
     protocol = facts("stanford2d3ds_trans4pass")
-    record = made_record([0.5] * 13, REAL, protocol=protocol, data__fold=2)
-    (row,) = Comparison.of([record]).rows
+    result = example_result([0.5] * 13, REAL, protocol=protocol, data__fold=2)
+    (row,), _ = published_rows([result])
     assert row.label == "Trans4PASS+ (S) (paper)"
     assert row.score("miou").mean == pytest.approx(0.54)
-    (table,) = Comparison.of([record]).tables(record)
+    table = published_table([row], result)
     assert table.rows == [("Trans4PASS+ (S) (paper)", "RGB", "47.7")], "of the run's fold"
-    transfer = Comparison.of([record], transfer=True)
-    assert transfer.rows == []
-    assert "fold: published 1, this run 2." in transfer.notes[0]
-    transfer = Comparison.of([replace(record, settings={"data.fold": 1})], transfer=True)
-    assert {row.label for row in transfer.rows} >= {
+    rows, notes = published_rows([result], transfer=True)
+    assert rows == []
+    assert "fold: published 1, this run 2." in notes[0]
+    rows, _ = published_rows([replace(result, settings={"data.fold": 1})], transfer=True)
+    assert {row.label for row in rows} >= {
         "Trans4PASS+ (S), trained on photos of Stanford2D3DS (paper)"
     }
 
 
 def test_facts_in_which_runs_differ_are_columns_of_all_rows() -> None:
-    other = made_record([0.5] * 13, REAL, protocol=PROTOCOL | {"mask": "-60"}, data__mask=-60)
-    report = _runs_report(made_record([0.5] * 13, REAL, protocol=PROTOCOL), other)
+    other = example_result([0.5] * 13, REAL, protocol=PROTOCOL | {"mask": "-60"}, data__mask=-60)
+    report = _runs_report(example_result([0.5] * 13, REAL, protocol=PROTOCOL), other)
     assert {label: row["mask"] for label, row in _cells(report).items()} == {
         "mine (data.mask=None)": "none",
         "mine (data.mask=-60)": "-60",
@@ -167,7 +180,7 @@ def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> N
 
 
 def test_rows_are_in_the_order_of_their_levels() -> None:
-    records = [made_record([0.5] * 3, name=str(level), level=level) for level in (10, 9)]
+    records = [example_result([0.5] * 3, name=str(level), level=level) for level in (10, 9)]
     assert list(_cells(_runs_report(*records))) == ["9", "10"]
 
 
@@ -193,45 +206,49 @@ def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
 
 
 def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> None:
-    photos = without_solid_angle(made_record([0.4, 0.8, 0.6]))
-    sphere = made_record([0.3, 0.8, 0.4], bands=(0.1, 0.2))
-    tuned = made_record([0.8, 0.8, 0.8])
+    photos = without_solid_angle(example_result([0.4, 0.8, 0.6]))
+    sphere = example_result([0.3, 0.8, 0.4], bands=(0.1, 0.2))
+    tuned = example_result([0.8, 0.8, 0.8])
     stages = {"P": [photos], "S": [sphere], "S-erp": [tuned], "S-FT-10": [tuned]}
     report = transfer_report(stages)
-    table = report.tables()[0]
+    table = report.means()
     change = table.header.index("change", table.header.index("mIoU %"))
     assert [row[change] for row in table.rows] == ["–", "−16.7 %", "+33.3 %", "–"]
     assert [row.partner and row.partner.label for row in report.rows] == [None, "P", "P", None]
 
 
-def test_reports_of_shapes_name_their_rotations() -> None:
+def test_reports_of_shapes_have_the_published_scores_of_the_same_rotation() -> None:
     classes = [{"class": name, "images": 3, "accuracy": 0.5} for name in MODELNET40]
-    settings = {
-        "data._target_": "datamodules.ModelNet40",
-        "level": 5,
-        "name": "shapes",
-        "representation.random_rotation": "yaw",
-        "data.test_rotation": "so3",
-        "representation.base_level": 0,
-    }
-    means = {"accuracy": 0.8, "class_accuracy": 0.7}
+    settings = {"data._target_": "datamodules.ModelNet40", "level": 5, "name": "shapes"}
+    settings["representation.base_level"] = 0
+    scores = {"accuracy": 0.8, "class_accuracy": 0.7}
     columns = ImageClassHead.columns
-    record = EvaluationResult("shapes", 120, columns, means, classes, settings=settings)
-    aligned = replace(record, protocol=facts("paper_modelnet40"))
-    rotated = replace(record, protocol={**aligned.protocol, "test_rotation": "so3"})
-    assert Comparison.of([rotated]).rows == []
+    result = EvaluationResult("shapes", 120, columns, scores, classes, settings=settings)
+    aligned = replace(result, protocol=facts("paper_modelnet40"))
+    rotated = replace(result, protocol={**aligned.protocol, "test_rotation": "so3"})
+    assert published_rows([rotated])[0] == []
     cells = _cells(_runs_report(aligned))
-    assert cells["shapes"]["rotated in training / test"] == "z / SO3"
     assert cells["shapes"]["accuracy %"] == "80.0"
     assert cells["shapes"]["mean over classes %"] == "70.0"
     assert cells["tangent images (paper)"]["accuracy %"] == "89.1"
     assert len(cells) == 5
 
 
+def test_levels_are_compared_with_the_level_of_the_photos() -> None:
+    levels = {8: [example_result([0.4] * 3)], 7: [example_result([0.8] * 3)]}
+    table = levels_report(levels, 7.3).means()
+    change = table.header.index("change")
+    assert [(row[0], row[change]) for row in table.rows] == [
+        ("level 7", "–"),
+        ("level 8", "−50.0 %"),
+    ]
+
+
 def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     def blue_rows(share: float) -> int:
-        rows = [Row("$a$ " * 30, (made_record([share] * 3),))]
-        blue = (decoded(report_png("Report", rows)) == (0x00, 0x72, 0xB2)).all(-1)
+        result = example_result([share] * 3)
+        rows = [RunRow.of("$a$ " * 30, [result], {})]
+        blue = (decoded(report_png("Report", rows, result)) == (0x00, 0x72, 0xB2)).all(-1)
         return int(blue.any(1).sum())
 
     low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
@@ -256,13 +273,14 @@ def test_published_depth_has_its_units_and_the_smallest_error_is_named(
     means = dict.fromkeys(DistanceHead.columns, 0.25)
     record = EvaluationResult("panoramas", 2, DistanceHead.columns, means, protocol=protocol)
     aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
-    (table,) = Comparison.of([aligned]).tables(aligned)
+    rows, _ = published_rows([aligned])
+    table = published_table(rows, aligned)
     assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
     assert table.rows == [
         ("far (paper)", "–", "0.12", "88.0", "0.4"),
         ("near (paper)", "–", "0.1", "92.5", "0.36"),
     ]
-    (note,) = Comparison.of([replace(record, protocol=protocol | {"mask": "-60"})]).notes
+    _, (note,) = published_rows([replace(record, protocol=protocol | {"mask": "-60"})])
     assert note.startswith("Not comparable: near: 0.1 and 1 more (stanford2d3ds_depth). mask: ")
 
 
@@ -282,13 +300,13 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
         records.append(load_result(folder))
     assert records[0].columns == columns
     assert records[0].scores == means
-    assert Comparison.of(records) == ([], [])
+    assert published_rows(records) == ([], [])
     report = runs_report(records)
-    header, rows = report.tables()[0].header, report.tables()[0].rows
+    header, rows = report.means().header, report.means().rows
     assert header[-6:] == (
         *("AbsRel ↓", "δ1 %", "RMSE m ↓"),
         *("AbsRel by solid angle ↓", "δ1 by solid angle %", "RMSE by solid angle m ↓"),
     )
     assert [row[-6:-3] for row in rows] == [("0.25", "25.0", "0.25")] * 2
     assert {"none", "median in distance"} <= {cell for row in rows for cell in row}
-    assert {line["score"] for line in report.figures()} == {*columns}, "the CSV file has all"
+    assert {line["score"] for line in report.csv_lines()} == {*columns}, "the CSV file has all"

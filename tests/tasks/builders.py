@@ -9,11 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tangent_train.geometry import SphereArea
 from tangent_train.heads import ClassesHead, DistanceHead, Head
 from tangent_train.tasks import PixelTask
-
-WHOLE = torch.from_numpy(SphereArea.of(None).numbers)
 
 
 def build_head(head: type[Head], names: Sequence[str], settings: dict[str, Any]) -> Any:

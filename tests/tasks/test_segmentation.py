@@ -15,7 +15,6 @@ from torch.utils.data import DataLoader
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
 from tangent_train.errors import SettingError
-from tangent_train.geometry import SphereArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
 from tests.tasks.builders import segmentation_task
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([1.0, 3.0])
-WHOLE = torch.from_numpy(SphereArea.of(None).numbers)
+WHOLE = torch.empty(0, 0, dtype=torch.bool)
 ONE = torch.ones(1, 1, 1)
 TANGENT = TangentRepresentation(base_level=0, level=4)
 

@@ -7,10 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError, at_least
-from tangent_train.geometry import PinholeGrid, RingGrid, SphereArea, TangentGrid
+from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid
 from tangent_train.geometry.coverage import check_coverage
+from tangent_train.geometry.equirect import area_mask, check_area
 from tangent_train.geometry.horizontal import checked_rings, half_extents
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
@@ -19,6 +21,9 @@ from tangent_train.rendering.representations.views import (
     PinholeViews,
     RotationAugmentation,
 )
+
+_ROWS = 360
+"""Rows of the mask of the area that the views must cover."""
 
 
 class HorizontalRepresentation(PinholeRepresentation):
@@ -77,7 +82,9 @@ class HorizontalRepresentation(PinholeRepresentation):
         checked = checked_rings([ring for part in by_fov.values() for ring in part])
         self.symmetry_deg = 360 / max(ring.views for ring in checked)
         size = ring_size(level, _pair(fov), dim)
-        covered = None if area is None else SphereArea.of(area, "representation.area")
+        covered = None
+        if area is not None:
+            covered = area_mask(check_area(area, "representation.area"), (_ROWS, 2 * _ROWS))
         how = {"by_owners": blend == "nearest", "is_complete": len(by_fov) == 1}
         grids = [RingGrid(part, of, size, None, covered, **how) for of, part in by_fov.items()]
         if len(grids) > 1:
@@ -96,14 +103,17 @@ class HorizontalRepresentation(PinholeRepresentation):
             len(grids) > 1,
         )
 
-    def sample(self, rng: np.random.Generator) -> PinholeViews:
+    def sample(
+        self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None
+    ) -> PinholeViews:
         """See `PinholeRepresentation`; of one field of view, drawn by the number of its views."""
         if not self._is_joint:
-            return super().sample(rng)
-        needed = self._needed(self.grids, is_resting=True)
+            return super().sample(rng, valid)
+        needed = self._needed([grid.with_rotation(None) for grid in self.grids], valid)
         counts = np.array([len(faces) for faces in needed])
         drawn = rng.choice(len(counts), p=counts / counts.sum())
-        return self._sample(rng, self.grids[drawn], needed[drawn], counts[counts > 0].min())
+        least = counts[counts > 0].min()
+        return self._sample(rng, self.grids[drawn], needed[drawn], valid, least)
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:

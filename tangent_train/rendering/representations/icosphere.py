@@ -18,7 +18,6 @@ from torch import Tensor
 
 from tangent_train.geometry import (
     FLIP_Y,
-    SphereArea,
     equirect_directions,
     equirect_shape,
     icosphere,
@@ -209,8 +208,7 @@ def _at_vertices(values: Tensor, level: int) -> Tensor:
 class IcosphereRepresentation:
     """A signal on the vertices or faces of an icosphere, for networks on its mesh.
 
-    The view is always the whole sphere. Outside the area of a partial panorama, colors are those of
-    ``data.fill``, and labels are unknown.
+    The view is always the whole sphere.
 
     Args:
         level: Level s of the panorama and of the icosphere.
@@ -263,13 +261,11 @@ class IcosphereRepresentation:
         rotated._rotation = rotation
         return rotated
 
-    def limited_to(self, area: SphereArea | None) -> Self:
-        """Return the representation itself: a signal always covers the sphere."""
-        del area
-        return self
-
-    def sample(self, rng: np.random.Generator) -> IcosphereViews:
-        """Return the signal, optionally rotated and mirrored."""
+    def sample(
+        self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None
+    ) -> IcosphereViews:
+        """Return the signal, optionally rotated and mirrored; it always covers the sphere."""
+        del valid
         matrix = self._rotation
         if self.random_rotation == "so3":
             matrix = matrix @ random_rotation(rng)
@@ -279,8 +275,9 @@ class IcosphereRepresentation:
             matrix = matrix @ FLIP_Y
         return self._views(matrix)
 
-    def view_sets(self) -> list[IcosphereViews]:
+    def view_sets(self, valid: NDArray[np.bool_] | None = None) -> list[IcosphereViews]:
         """Return the signal in every rotation about the vertical."""
+        del valid
         return [self._views(self._rotation @ rotation) for rotation in self._rotations]
 
     def _views(self, matrix: NDArray[np.float64]) -> IcosphereViews:

@@ -187,15 +187,17 @@ class PhotoSampler:
     size: tuple[int, int]
     representation: PerspectiveRepresentation
 
-    def sample(self, rng: np.random.Generator) -> PhotoCrops:
-        """Return crops at random positions in the photo."""
+    def sample(self, rng: np.random.Generator, valid: None = None) -> PhotoCrops:
+        """Return crops at random positions in the photo; all its pixels are valid."""
+        del valid
         common = self.representation
         least, greatest = self._shifts()
         shifts = rng.uniform(least, greatest, (common.crops_per_photo, 2))
         return self._crops(shifts, mirrored=common.mirror and bool(rng.random() < 0.5))
 
-    def view_sets(self) -> list[PhotoCrops]:
+    def view_sets(self, valid: None = None) -> list[PhotoCrops]:
         """Return the fewest crops that cover the photo, evenly spaced."""
+        del valid
         return [self.cover()]
 
     def cover(self, overlap: float = 0.0) -> PhotoCrops:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Self, TypeVar
 
 import numpy as np
@@ -15,14 +14,13 @@ from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import (
     CubeGrid,
     PinholeGrid,
-    SphereArea,
     TangentGrid,
     equirect_shape,
     random_rotation,
     rotation_about,
 )
-from tangent_train.geometry.area_views import best_views, views_of_area
 from tangent_train.geometry.coverage import check_coverage
+from tangent_train.geometry.valid_views import best_views, needed_views
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
@@ -88,7 +86,6 @@ class PinholeRepresentation:
         self.faces_per_panorama = faces_per_panorama
         self.grids = grids
         self._rotations = vertical_rotations(rotations, self.symmetry_deg)
-        self._area: SphereArea | None = None
         self._is_partial, self._is_joint = is_partial, is_joint
 
     @property
@@ -104,32 +101,24 @@ class PinholeRepresentation:
         rotated.grids = [grid.with_rotation(rotation_or_none) for grid in self.grids]
         return rotated
 
-    def limited_to(self, area: SphereArea | None) -> Self:
-        """Return the same representation with only the images that an area needs.
+    def sample(
+        self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None
+    ) -> PinholeViews:
+        """Return all images or a random subset, optionally rotated as a whole and each mirrored.
 
-        Evaluation renders those of `views_of_area`. A training sample contains as many images as
-        the unrotated area needs, so that samples of one batch have equal numbers: those of
-        `views_of_area`, or under rotation those that see most.
-
-        Raises:
-            SettingError: The images of a partial representation do not cover the area.
+        Of a partial panorama, they are as many as its valid pixels need without rotation, so that
+        samples of one batch have equal numbers: those of `needed_views`, or under rotation those
+        that see most valid pixels.
         """
-        limited = copy.copy(self)
-        limited._area = None if area is None or area.is_whole else area
-        if self._is_partial:
-            limited.view_sets()
-        return limited
-
-    def sample(self, rng: np.random.Generator) -> PinholeViews:
-        """Return all images or a random subset, optionally rotated as a whole and each mirrored."""
-        (needed,) = self._needed([self.grid], is_resting=True)
-        return self._sample(rng, self.grid, needed)
+        (needed,) = self._needed([self.grid.with_rotation(None)], valid)
+        return self._sample(rng, self.grid, needed, valid)
 
     def _sample(
         self,
         rng: np.random.Generator,
         grid: PinholeGrid,
         needed: NDArray[np.int64],
+        valid: NDArray[np.bool_] | None,
         most: int | None = None,
     ) -> PinholeViews:
         """Return `sample` of one grid.
@@ -137,7 +126,8 @@ class PinholeRepresentation:
         Args:
             rng: Random generator.
             grid: The grid.
-            needed: Images that the area needs without rotation.
+            needed: Images that are needed without rotation.
+            valid: See `sample`.
             most: Maximum number of images; None for all that are needed.
         """
         if self.random_rotation != "none":
@@ -145,9 +135,10 @@ class PinholeRepresentation:
             angle = rng.uniform(0, 2 * math.pi)
             rotation = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
             grid = _rotated(grid, rotation)
-        faces = None if self._area is None else needed
-        if self._area is not None and not (grid.rotation is None is self._area.rotation):
-            faces = best_views(grid, self._area, len(needed))
+        faces = None
+        if valid is not None:
+            is_rotated = grid.rotation is not None
+            faces = best_views(grid, valid, len(needed)) if is_rotated else needed
         limits = [count for count in (self.faces_per_panorama, most) if count is not None]
         if limits:
             available = grid.num_images if faces is None else faces
@@ -155,35 +146,36 @@ class PinholeRepresentation:
         return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
 
     def _needed(
-        self, grids: Sequence[PinholeGrid], *, is_resting: bool = False
+        self, grids: Sequence[PinholeGrid], valid: NDArray[np.bool_] | None
     ) -> list[NDArray[np.int64]]:
-        """Return the images of grids, under one rotation, that the area needs.
+        """Return the images of grids under one rotation that the valid pixels need.
 
         Args:
             grids: Grids to average over, or grids of a joint representation.
-            is_resting: True to ignore the rotations of grids and area.
+            valid: See `sample`.
         """
-        area = self._area
-        if area is None:
+        if valid is None:
             return [grid.face_indices() for grid in grids]
-        if is_resting:
-            area, grids = replace(area, rotation=None), [g.with_rotation(None) for g in grids]
         if self._is_joint:
-            return views_of_area(grids, area)
+            return needed_views(grids, valid)
         blends = (blend_of(self.blend, is_overlapping=grid.is_overlapping) for grid in grids)
         return [
-            views_of_area([grid], area, by_owners=blend == "nearest")[0]
+            needed_views([grid], valid, by_owners=blend == "nearest")[0]
             for grid, blend in zip(grids, blends, strict=True)
         ]
 
-    def view_sets(self) -> list[PinholeViews]:
-        """Return all images of every level in every rotation."""
+    def view_sets(self, valid: NDArray[np.bool_] | None = None) -> list[PinholeViews]:
+        """Return the images of every level in every rotation: all, or those of `needed_views`.
+
+        Raises:
+            SettingError: The images of a partial representation do not cover the valid pixels.
+        """
         rotated = [[_rotated(grid, r) for grid in self.grids] for r in self._rotations]
         for grids in rotated if self._is_partial else ():
-            check_coverage(grids, self._area)
-        of_rotations = (zip(grids, self._needed(grids), strict=True) for grids in rotated)
+            check_coverage(grids, valid)
+        of_rotations = (zip(grids, self._needed(grids, valid), strict=True) for grids in rotated)
         pairs = [pair for of_grid in zip(*of_rotations, strict=True) for pair in of_grid]
-        if self._area is not None:
+        if valid is not None:
             pairs = [(grid.subset(faces), faces) for grid, faces in pairs if len(faces)]
         return [PinholeViews(grid) for grid, _ in pairs]
 

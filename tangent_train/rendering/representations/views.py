@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.geometry import PinholeGrid, SphereArea, ray_lengths
+from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
@@ -108,14 +108,17 @@ class Views:
 
 
 class Sampler(Protocol):
-    """Selects views of one panorama or photo."""
+    """Selects views of one panorama or photo.
 
-    def sample(self, rng: np.random.Generator) -> Views:
+    Views that see no valid pixel ``(H, W)`` of a panorama are left out; None if all are valid.
+    """
+
+    def sample(self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None) -> Views:
         """Return the views of one training sample: a random subset, augmented."""
         ...
 
-    def view_sets(self) -> Sequence[Views]:
-        """Return sets of views that each cover the whole image; their scores are averaged."""
+    def view_sets(self, valid: NDArray[np.bool_] | None = None) -> Sequence[Views]:
+        """Return sets of views that each cover the valid pixels; their scores are averaged."""
         ...
 
 
@@ -137,14 +140,6 @@ class Representation(Sampler, Protocol):
 
     def with_rotation(self, rotation: NDArray[np.float64]) -> Self:
         """Return the same representation in rotated directions R·d, for tilted panoramas."""
-        ...
-
-    def limited_to(self, area: SphereArea | None) -> Self:
-        """Return the same representation with only the views that an area needs.
-
-        Args:
-            area: Part of the sphere, in the frame of the panorama; None for all of it.
-        """
         ...
 
 

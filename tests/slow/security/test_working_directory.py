@@ -10,7 +10,7 @@ import pytest
 
 from tests.cli.tiny_runs import SETTINGS
 from tests.datamodules.data_files import write_png
-from tests.results.made_records import made_record, write_run
+from tests.results.example_results import example_result, write_run
 from tests.slow.security.hostile_folder import make_hostile, run_in_hostile
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="the loader of glibc")
@@ -54,7 +54,7 @@ def test_files_of_the_working_directory_configure_no_command(
 ) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
     write_png(tmp_path / "room.png", noise)
-    write_run(tmp_path / "run", made_record((0.5, 0.5, 0.5)))
+    write_run(tmp_path / "run", example_result((0.5, 0.5, 0.5)))
     done = run_in_hostile(make_hostile(tmp_path / "hostile"), command, *arguments)
     assert done.returncode == (command == "check"), done.stderr  # its rooms are not made yet
     found = [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")]

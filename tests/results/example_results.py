@@ -1,4 +1,4 @@
-"""Records with given scores, and runs on disk that hold them."""
+"""Evaluation results with given scores, and run folders that contain them."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from tangent_train.config.setting_rules import flat_settings
 from tangent_train.heads import ClassesHead
-from tangent_train.results.evaluation_result import EvaluationResult
+from tangent_train.results.evaluation_result import EvaluationResult, flat_settings
 from tangent_train.results.published import facts
 
 NAMES = ("wall", "floor", "sofa")
@@ -33,29 +32,31 @@ SETTINGS = {
 }
 
 
-def made_record(
+def example_result(
     scores: Sequence[float | None],
     names: Sequence[str] = NAMES,
     bands: Sequence[float] = (),
     protocol: Mapping[str, str] = {},
+    folds: Sequence[int] = (1, 2, 3),
     **settings: Any,
 ) -> EvaluationResult:
-    """Make a record with one value for all scores of a class, and the means of these.
+    """Return a result with one value for all scores of a class, and the means of these.
 
     Args:
         scores: Score of each class.
         names: Name of each class.
         bands: Score of each band.
         protocol: Facts of the protocol, e.g. `PROTOCOL`.
+        folds: Folds of the data set.
         settings: Changes of `SETTINGS`, two underscores for a point.
     """
     config = OmegaConf.create(SETTINGS)
     for name, value in settings.items():
         OmegaConf.update(config, name.replace("__", "."), value)
-    flat = dict(flat_settings(OmegaConf.to_container(config)))  # type: ignore[arg-type]
+    flat = flat_settings(OmegaConf.to_container(config))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
     columns, mean = ClassesHead.columns, sum(present) / len(present)
-    of_class = [heading.of_class for heading in columns.values()]
+    of_class = [column.of_class for column in columns.values()]
     return EvaluationResult(
         "panoramas",
         5,
@@ -70,23 +71,24 @@ def made_record(
             for band, value in zip(BANDS, bands, strict=False)
         ],
         protocol=protocol,
+        folds=folds,
         settings=flat,
         folder=Path(f"/runs/{flat['data.fold']}_{flat['seed']}"),
     )
 
 
-def write_run(folder: Path, record: EvaluationResult) -> Path:
-    """The run that a record is of: its results and settings."""
+def write_run(folder: Path, result: EvaluationResult) -> Path:
+    """Write the results and settings of a run."""
     folder.mkdir(parents=True)
-    (folder / "results.json").write_text(record.json())
+    (folder / "results.json").write_text(result.json())
     settings: Any = OmegaConf.create()
-    for name, value in record.settings.items():
+    for name, value in result.settings.items():
         OmegaConf.update(settings, name, value)
     OmegaConf.save(settings, folder / "config.yaml")
     return folder
 
 
-def without_solid_angle(record: EvaluationResult) -> EvaluationResult:
-    """As photos are scored."""
-    means = {k: None if k.endswith("_solid_angle") else v for k, v in record.scores.items()}
-    return replace(record, scores=means)
+def without_solid_angle(result: EvaluationResult) -> EvaluationResult:
+    """Return a result like that of photos."""
+    scores = {k: None if k.endswith("_solid_angle") else v for k, v in result.scores.items()}
+    return replace(result, scores=scores)
