@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
 import torch
 from torch import nn
-from torch.optim.lr_scheduler import ReduceLROnPlateau
 
 from tangent_train.errors import SettingError, counted
 
@@ -17,7 +16,7 @@ _RGB = 3
 
 
 def try_training(task: Any, data: Any, settings: Mapping[str, Any]) -> None:
-    """Try a training step of full size, the optimizer and the scheduler.
+    """Try a training step of full size.
 
     The data module tries the last step of an epoch once it has counted its samples.
 
@@ -32,34 +31,6 @@ def try_training(task: Any, data: Any, settings: Mapping[str, Any]) -> None:
     synchronized = bool(settings["trainer"].get("sync_batchnorm"))
     data.try_step = partial(_try_step, copy.deepcopy(task).to("meta"), data, synchronized)
     data.try_step(data.per_step)
-    _try_schedule(task, settings)
-
-
-def _try_schedule(task: Any, settings: Mapping[str, Any]) -> None:
-    """Build the optimizer and the scheduler, and take a step."""
-    group = {"params": [torch.zeros(1, 1, requires_grad=True)]}
-
-    def schedule() -> None:
-        built = task.optimization(lambda: {"epoch": 1000, "step": 1000})
-        if isinstance(built, dict):
-            built["optimizer"].step(lambda: 0.0)  # some optimizers need a closure
-            scheduler = built["lr_scheduler"]["scheduler"]
-            scheduler.step(*[0.0] * isinstance(scheduler, ReduceLROnPlateau))
-
-    trials: dict[str, Callable[[], object]] = {
-        "optimizer": lambda: task.make_optimizer([group]),
-        "scheduler": schedule,
-    }
-    for name, trial in trials.items():
-        try:
-            trial()
-        except SettingError:
-            raise
-        except Exception as error:
-            expected = f"settings that {settings[name]['_target_']} accepts"
-            raise SettingError(
-                name, found=f"{type(error).__name__}: {error}", expected=expected
-            ) from error
 
 
 def try_network(task: Any, channels: int) -> None:
@@ -73,7 +44,7 @@ def try_network(task: Any, channels: int) -> None:
         raise SettingError(
             "network",
             found=f"{type(task.network).__name__}, which does not take {shape} ({fault})",
-            expected=f"a network that maps {task.takes}",
+            expected=f"a network that maps {task.head.takes}",
             remedy="For a network for photos: data.inputs=[rgb]." if channels > _RGB else "",
         )
 

@@ -341,7 +341,7 @@ _SCHEDULER = "scheduler._target_=torch.optim.lr_scheduler"
         (["network=unet"], "image size for the UNet: found 48 × 48"),
         (["network.num_classes=5"], "scores of the network"),
         (["network.in_channels=3"], "network: found UNet, which does not take"),
-        (["task=classification"], "task: found ClassificationTask, which needs image_class"),
+        (["task=classification"], "task: found a head for image_class"),
         (["checkpoint_every_n_steps=0"], "checkpoint_every_n_steps: found 0"),
         (["validation_images=-1"], "validation_images: found -1"),
         (["panels=-1"], "panels: found -1"),

@@ -189,7 +189,7 @@ def test_a_label_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"network": "network.widths=[4]"}, r"network\.widths: found .*the network is in"),
         ({"inputs": "data.inputs=[rgb,depth]"}, "found inputs|normalization"),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected unknown or never"),
-        ({"data": "data=synthshapes"}, "task: found SegmentationTask, which needs pixel_classes"),
+        ({"data": "data=synthshapes"}, "task: found a head for pixel_classes"),
         ({"checkpoint": "checkpoint=none.onnx"}, r"none\.onnx: found no such file"),
     ],
 )

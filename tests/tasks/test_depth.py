@@ -165,7 +165,7 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
 
 
 def test_the_report_has_no_score_of_an_image_without_true_distances() -> None:
-    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), area=None)
+    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), valid=None)
     steps = torch.zeros(8, 16, dtype=torch.int32)
     for target, note in ((steps, ""), (steps + 1024, "AbsRel 0.5")):
         found = _task(nn.Identity()).report_image("a", image, target, torch.ones(8, 16))
