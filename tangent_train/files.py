@@ -10,14 +10,11 @@ import os
 import re
 import shutil
 import tempfile
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import reduce
 from pathlib import Path
 from typing import IO, Any
-from zipfile import ZipFile, is_zipfile
 
 from tangent_train.errors import DataError, SettingError
 from tangent_train.imports import elsewhere
@@ -144,15 +141,13 @@ def _refused(path: Path) -> OSError:
     return OSError()
 
 
-def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = True) -> Any:
+def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     """Load tensors and plain values from a file of `torch.save`; nothing else is unpickled.
 
     Args:
         path: File to load.
         expected: Expected file, for the message.
         mmap: True to map the tensors into memory instead of reading them.
-        whole: True to compare the whole file with its checksums, which torch does not do. Files of
-            torch before version 1.6 lack checksums.
 
     Raises:
         DataError: The file is missing, damaged, or contains other objects.
@@ -164,10 +159,6 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
 
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-        damaged = None
-        if whole and is_zipfile(path):
-            with ZipFile(path) as archive:
-                damaged = archive.testzip()
     except Exception as error:
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
@@ -176,32 +167,7 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
             found = "a damaged file, or not a file of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    check_sum(path, damaged is None)
     return content
-
-
-def check_sum(path: Path, is_right: bool) -> None:
-    """Refuse a file whose content has changed since it was written.
-
-    Args:
-        path: File, for the message.
-        is_right: True if the checksum is right.
-
-    Raises:
-        DataError: The checksum is wrong.
-    """
-    if not is_right:
-        raise DataError(
-            path,
-            found="a damaged file, whose checksum is wrong",
-            expected="the file as it was written",
-            remedy="Copy the original file again.",
-        )
-
-
-def crc32_of(parts: Iterable[bytes | memoryview]) -> str:
-    """Return the CRC-32 of consecutive bytes as eight hexadecimal digits."""
-    return f"{reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0):08x}"
 
 
 def parse_json(text: str | bytes) -> Any:
@@ -228,19 +194,27 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def read_json(path: Path, expected: str, remedy: str = "") -> Any:
+def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> Any:
     """Read a JSON file.
 
     Args:
         path: File to read.
         expected: Expected file, for the message.
         remedy: Remedy, for the message.
+        kind: Type of the content, e.g. a pydantic model or ``dict[str, float]``; by default any.
 
     Raises:
-        DataError: The file cannot be read, or is not JSON.
+        DataError: The file cannot be read, is not JSON or has other content.
     """
+    from pydantic import TypeAdapter, ValidationError  # slow to import
+
     try:
-        return parse_json(path.read_bytes())
+        content = parse_json(path.read_bytes())
+        return content if kind is None else TypeAdapter(kind).validate_python(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise DataError(path, found=found, expected=expected, remedy=remedy) from error
     except (OSError, ValueError) as error:
         raise DataError(path, found=error, expected=expected, remedy=remedy) from error
 

@@ -35,7 +35,7 @@ def export(config: Mapping[str, Any]) -> None:
         trained = load_network(settings.checkpoint, settings.trust)
         size, opset = settings.image_size, settings.opset
         written = export_network(trained, output, image_size=size, opset=opset)
-    fixed, multiple = written.trained.fixed_size, trained.size_multiple
+    fixed, multiple = written.loaded.fixed_size, trained.size_multiple
     sides = width_height(fixed) if fixed else "any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
     scores, of_what = f"scores: {trained.network.num_scores} classes", "scores"

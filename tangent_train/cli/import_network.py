@@ -37,8 +37,6 @@ _LIBRARIES = ("torchvision", "huggingface", "smp")
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "logits": "scores before a softmax",
     "probabilities": "probabilities after a softmax",
-    "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
-    "sigmoid": "probabilities after a sigmoid, with ½ as the threshold",
     "labels": "label maps, of which other values are unknown",
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
@@ -77,7 +75,6 @@ def import_network(config: Mapping[str, Any]) -> None:
             check_unread(settings, "for networks of classes", depth=None)
         else:
             check_unread(settings, "for depth networks", **_OF_CLASSES)
-        remarks = list(network.remarks)
         trained = photo_networks.import_network(
             network,
             output,
@@ -89,11 +86,8 @@ def import_network(config: Mapping[str, Any]) -> None:
             unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
-            remark=remarks.append,
         )
     print_text(_understood(output, trained, settings))
-    for remark in remarks:
-        print_text(remark)
 
 
 def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
@@ -149,8 +143,8 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
         f"image size: {size}{multiple}",
         f"panoramas: {PanoramaViews(trained).description()}",
     ]
-    if trained.source is not None and trained.source.trust:
-        trust = ",".join(trained.source.trust)
+    if trained.trust:
+        trust = ",".join(trained.trust)
         lines.append(f"your own network: every command that reads it needs trust=[{trust}]")
     if settings.unknown_classes:
         effect = "written as unknown" if settings.unknown_wins else "never win"

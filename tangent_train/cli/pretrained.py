@@ -15,7 +15,7 @@ from models import initialize
 from tangent_train.checkpoints.loaded import (
     NetworkDescription,
     completed_settings,
-    describe_network,
+    read_description,
 )
 from tangent_train.cli.run import Run
 from tangent_train.cli.settings import Trust, parse_settings
@@ -55,23 +55,24 @@ def with_pretrained_network(
             expected="a checkpoint, a state dict or a .safetensors file",
             remedy="Use the checkpoint that it was exported from.",
         )
-    description, hydra = describe_network(path), HydraConfig.get()
+    description, hydra = read_description(path), HydraConfig.get()
     if description is None or "network" not in hydra.runtime.choices:
         return settings, None
     changed, source, notes = dict(settings), None, []
     network = changed["network"]
-    target = description.settings.get("_target_")
+    section = description.trainable_settings() or {}
+    target = section.get("_target_")
     if any(map(_TYPED.match, hydra.overrides.task)) or _wraps(network, target):
         notes.append(f"Network of the config: {network['_target_']}")
     else:
-        if description.score_kind in ("probabilities", "sigmoid", "labels"):
+        if description.score_kind in ("probabilities", "labels"):
             raise DataError(
                 path,
                 found=f"a network that returns {description.score_kind}",
                 expected="scores before a softmax or sigmoid, which the losses need",
                 remedy="Remove the last step of the network, and import it again.",
             )
-        changed["network"] = description.settings
+        changed["network"] = section
         trust = parse_settings(Trust, settings).trust
         source = SettingsFile(path, trust, settings.keys() - {"network"})
         notes.append(f"Network of {path}: {target} (another: network=…)")
@@ -110,7 +111,7 @@ def load_pretrained(path: Path | None, run: Run) -> None:
                 expected="1 without init_from=: the backbone is the part that is loaded",
             )
         return
-    description, network = describe_network(path), run.task.network
+    description, network = read_description(path), run.task.network
     channels = None
     of_other_classes: Collection[str] = ()
     if description is not None:
@@ -118,7 +119,7 @@ def load_pretrained(path: Path | None, run: Run) -> None:
         if description.groups is not None or description.class_names != names:
             of_other_classes = _heads(run)
         inputs = getattr(run.data, "inputs", None)
-        if description.inputs is not None and inputs is not None:
+        if description.inputs and inputs is not None:
             channels = (channel_names(description.inputs), channel_names(inputs))
     origins = initialize(network, path, channels, of_other_classes)
     run.task.fresh = frozenset(origins.fresh)
@@ -141,13 +142,13 @@ def _normalization(
 ) -> dict[str, list[float]] | None:
     """Return a file's normalization for the inputs of the data; None to keep that of the data."""
     inputs = data.get("inputs")
-    if description.inputs is None or inputs is None or data.get("normalization") is not None:
+    if not description.inputs or inputs is None or data.get("normalization") is not None:
         return None
     default = {"mean": RGBD_NORMALIZATION.mean, "std": RGBD_NORMALIZATION.std}
     count = _RGB + ("depth" in inputs)
     return {
         name: [*values, *default[name][len(values) :]][:count]
-        for name, values in ((name, description.normalization.get(name, ())) for name in default)
+        for name, values in ((name, getattr(description.normalization, name)) for name in default)
     }
 
 

@@ -22,8 +22,12 @@ from datamodules.core.loading import explained, gathered_order
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
-from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
-from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
+from tangent_train.checkpoints.loaded import (
+    METADATA_KEY,
+    LoadedNetwork,
+    completed_settings,
+    declared_sizes,
+)
 from tangent_train.cli.command_settings import LabelMapSettings
 from tangent_train.cli.settings import parse_settings
 from tangent_train.cli.stored import GROUPS
@@ -113,8 +117,7 @@ class Run:
         # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
         config = {name: value for name, value in self.settings.items() if name != "logger"}
         contents = {
-            "predicts": self.task.head.kind,
-            "depth_kind": getattr(self.task.head, "depth_kind", None),
+            METADATA_KEY: self.loaded().plain(),
             "config": config,
             **inputs_and_classes(self.data),
         }
@@ -134,7 +137,7 @@ class Run:
             self._load(content["state_dict"], checkpoint)
         by_classes = self.task.head.kind == PIXEL_CLASSES  # else upright=auto is by the image alone
         if getattr(self.data, "upright", None) == "auto" and by_classes:
-            self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
+            self.data.estimate_up(NetworkJudge(self.loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
@@ -163,22 +166,27 @@ class Run:
             for group, some in sorted(places.items())
         ]
 
-    def _as_trained(self) -> LoadedNetwork:
+    def loaded(self) -> LoadedNetwork:
         """Return the network of the run with its inputs, classes and representation."""
         if self.trained is not None:
             return self.trained
-        data = self.data
-        network = ClassScoreNetwork(self.task.network, data.num_classes).eval()
+        data, module = self.data, self.task.network
+        channels, outputs = data.in_channels, self.task.head.num_outputs
+        multiple, fixed = declared_sizes(module)
         return LoadedNetwork(
-            module=self.task.network,
+            module=module,
+            predicts=self.task.head.kind,
             class_names=data.class_names,
-            inputs=data.inputs,
+            inputs=getattr(data, "inputs", ()),
             normalization=data.normalization,
             level=self.settings["level"],
             representation=self.settings["representation"],
             image_size=data.representation.image_size,
-            size_multiple=size_multiple_of(network, data.in_channels) or 1,
-            source=self.source,
+            size_multiple=multiple,
+            fixed_size=fixed,
+            depth_kind=getattr(self.task.head, "depth_kind", None),
+            fill=getattr(data, "fill", None) or "mean",
+            settings=completed_settings(self.settings["network"], channels, outputs, restored=True),
         )
 
     def _load(self, tensors: Mapping[str, Any], checkpoint: Path) -> None:

@@ -22,7 +22,7 @@ from tangent_train.heads.alignment import (
     sphere_points,
 )
 from tangent_train.rendering import Blend
-from tangent_train.rendering.mosaic import DepthMosaic
+from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views
 
 _FARTHEST = 100.0
@@ -95,13 +95,13 @@ class AlignedMosaic:
             samples.append(sample_views(array, views, self._shape, self._points))
         alignment = align_views(samples, kind, self._align)
         self.report = alignment.report
-        mosaic = DepthMosaic(self._shape, self._blend, device=depths[0].device)
+        mosaic = MeanMosaic(self._shape, self._blend, device=depths[0].device)
         count = 0
         for (views, _, lengths), depth in zip(self._parts, depths, strict=True):
             part = slice(count, count + len(views))
             mosaic.add(alignment.applied(depth, part, lengths), views)
             count = part.stop
-        distance = distance_of(mosaic.values(), kind)
+        distance = distance_of(mosaic.values()[0], kind)
         if not is_metric(self._kind):
             distance = distance / self._median(distance)
             distance = distance.where(distance <= _FARTHEST, torch.nan)

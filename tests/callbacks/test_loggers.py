@@ -59,7 +59,7 @@ def _fit(folder: Path, data: Any, task: Any, *overrides: str) -> None:
 @pytest.fixture(scope="module")
 def trained(
     stanford_root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
+) -> tuple[Path, PixelTask, Stanford2D3DS]:
     """Two epochs of panoramas with all loggers."""
     import wandb
 
@@ -177,7 +177,7 @@ def _without_epochs(scalars: Scalars) -> Scalars:
 
 
 def test_all_loggers_hold_the_same_scalars_and_pictures(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder = trained[0]
     expected, pictures = _of_tensorboard(folder)
@@ -203,7 +203,7 @@ def test_all_loggers_hold_the_same_scalars_and_pictures(
 
 
 def test_hyperparameters_name_and_group_are_logged_once(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder = trained[0]
     run = _of_mlflow(folder)[2]
@@ -219,7 +219,7 @@ def test_hyperparameters_name_and_group_are_logged_once(
 
 
 def test_the_same_images_are_shown_after_every_validation(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     shown, source = _of_tensorboard(folder)[1], data.source("val")
@@ -237,7 +237,7 @@ def test_the_same_images_are_shown_after_every_validation(
 
 
 def test_figures_of_every_class_are_those_of_numpy(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     scalars = _of_csv(folder)
@@ -254,7 +254,7 @@ def test_figures_of_every_class_are_those_of_numpy(
 
 
 def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     total, norm, source = 0.0, 0.0, data.source("val")

@@ -80,7 +80,7 @@ def _task(kind: str, network: nn.Module | None = None) -> PixelTask:
     return segmentation_task(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
 
 
-def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanoramas:
+def _data(root: Path, task: PixelTask, **settings: Any) -> FolderPanoramas:
     area = AREA if root.name == "part" else None
     chosen: Any = {"area": area, "fill": "edge", "val_fraction": 0, "seed": 3, **settings}
     return FolderPanoramas(root, task.representation, **chosen)

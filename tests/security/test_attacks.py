@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from tangent_train.checkpoints.loaded import METADATA_KEY, describe_network, load_network
+from tangent_train.checkpoints.loaded import METADATA_KEY, load_network, read_description
 from tangent_train.cli.keypoints import earlier_results
 from tangent_train.cli.run import build
 from tangent_train.cli.stored import StoredRun, stored_run
@@ -54,7 +54,7 @@ def test_in_a_checkpoint(content: dict[str, Any], forbidden: Path) -> None:
     all_places += [("normalization",), ("normalization", "mean")]
     for place, value in sampled(list(attacks(forbidden)), all_places):
         torch.save(replaced(lighter, place, value), path)
-        for use in (load_network, evaluated, describe_network):
+        for use in (load_network, evaluated, read_description):
             _nothing_happens(use, path, forbidden, (place, value))
 
 
@@ -97,7 +97,7 @@ def test_under_names_that_can_be_read_in_two_ways(content: dict[str, Any], forbi
     assert ("data", "mask") in at
     for config in second_readings(content["config"], at, forbidden):
         torch.save(lighter | {"config": config}, path)
-        for use in (load_network, evaluated, describe_network):
+        for use in (load_network, evaluated, read_description):
             _nothing_happens(use, path, forbidden, config)
 
 
@@ -124,7 +124,7 @@ def test_in_the_metadata_of_an_exported_network(run: Path, forbidden: Path) -> N
         onnx.save(model, other)
         for path in (one, other):
             _nothing_happens(load_network, path, forbidden, (place, value))
-        _nothing_happens(describe_network, one, forbidden, (place, value))
+        _nothing_happens(read_description, one, forbidden, (place, value))
     for place, text in _named_twice(described, forbidden, json.dumps):
         save_file(tensors, one, {METADATA_KEY: text})
         with pytest.raises(DataError, match="is repeated"):

@@ -12,14 +12,16 @@ from torchmetrics import MeanAbsoluteError
 
 from tangent_train.heads import Head, Scores
 from tangent_train.metrics.score_columns import ScoreColumn
-from tangent_train.rendering.mosaic import DepthMosaic
+from tangent_train.rendering.mosaic import MeanMosaic
 
 
-class ShareMosaic(DepthMosaic):
+class ShareMosaic(MeanMosaic):
     """The mean of all views."""
 
     facts: ClassVar[dict[str, Any]] = {}
-    pixels = DepthMosaic.values
+
+    def pixels(self) -> Tensor:
+        return self.values()[0]
 
 
 class ShareHead(Head):

@@ -10,7 +10,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.run import build
-from tangent_train.cli.transfer_stages import plan
+from tangent_train.cli.transfer import Stage, stage_settings
 from tangent_train.config.build import build_from_config
 from tests.cli.test_compose import EXPERIMENTS
 from tests.running import command_of, composed
@@ -25,7 +25,7 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
     settings: Any = OmegaConf.to_container(config, resolve=True)
     with torch.device("meta"):  # shapes only: build runs the network on an image of full size
         data, task = build(settings)
-    assert task.class_names == data.class_names
+    assert task.head.class_names == data.class_names
     trainer = build_from_config(
         settings["trainer"], "trainer", logger=False, enable_checkpointing=False
     )
@@ -40,13 +40,11 @@ def test_every_experiment_composes_and_instantiates(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", TRANSFERS)
-def test_both_kinds_of_images_of_a_transfer_get_one_network(
-    experiment: str, tmp_path: Path
-) -> None:
+def test_both_kinds_of_images_of_a_transfer_get_one_network(experiment: str) -> None:
     config = composed("transfer", f"experiment={experiment}")
-    stages = plan(config, tmp_path, {})
-    first = [stage for stage in stages if stage.fold == stages[0].fold]
-    assert first[-1].name.startswith("S-FT-" if config.fine_tuning.epochs else "S")
-    photos = next(stage for stage in first if stage.name == "P")
-    names = [_builds_at_full_size(OmegaConf.create(s.config)) for s in (photos, first[-1])]
+    names = []
+    for kind in ("P", "S"):
+        stage = Stage(kind, "train", {})
+        settings = stage_settings(config, Path(), stage)
+        names.append(_builds_at_full_size(OmegaConf.create(settings)))
     assert names[0] == names[1]
