@@ -9,8 +9,8 @@ from typing import Any
 
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
+from tangent_train.config.settings import PredictSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.heads import HEADS, PredictedImage, head_of

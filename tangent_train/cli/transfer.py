@@ -33,9 +33,9 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.scores import network_for_views
-from tangent_train.cli.processes import command_line, run_process
+from tangent_train.cli.processes import command_line, quoted, run_process
 from tangent_train.cli.run import build_data
-from tangent_train.config.settings import SETTINGS
+from tangent_train.config.settings import SETTINGS, validate
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
@@ -214,7 +214,7 @@ def _views(config: Any, loaded: LoadedNetwork | None) -> Iterator[tuple[str, dic
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
-    sets the level of the stage; names such as ``task.align`` change the task. Distortion-aware
+    sets the level of the stage; names such as ``task.head.align`` change the task. Distortion-aware
     views of a network that does not allow them are left out.
     """
     if config.study_levels:
@@ -261,7 +261,8 @@ def _check_data(stages: Sequence[Mapping[str, Any]]) -> None:
     for settings in stages:
         target = settings["data"]["_target_"]
         if target not in built:
-            built[target] = build_data(settings)
+            of_run = {n: settings[n] for n in SETTINGS["check"].model_fields if n in settings}
+            built[target] = build_data(validate("check", of_run))
             built[target].make_files()
             built[target].setup()
     names = {target: data.class_names for target, data in built.items()}
@@ -279,14 +280,14 @@ def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading:
         print_text(f"{heading}: finished before.")
         return
     if (run / "checkpoints" / "last.ckpt").is_file():
-        arguments = [f"resume={run}"]
+        arguments = [f"resume={quoted(run)}"]
     else:
         shutil.rmtree(run, ignore_errors=True)
         file = manifest.folder / "stages" / f"{'-'.join(stage.path.parts)}.yaml"
         write_text(file, OmegaConf.to_yaml(OmegaConf.create({**_HEAD, **settings})))
         arguments = [f"--config-dir={file.parent}", f"--config-name={file.stem}"]
     line = command_line(stage.command, arguments, run)
-    print_text(f"{heading}: tangent-{shlex.join(line[3:])}")
+    print_text(f"{heading}: tangent-{stage.command} {shlex.join(line[1:])}")
     if status := run_process(line):
         message = f"Stage {stage.name} ended with status {status}; the same command continues."
         print_text(message, error=True)

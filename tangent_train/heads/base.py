@@ -95,7 +95,8 @@ class Head(nn.Module, ABC):
         class_names: Names of the labels of the data; empty without classes.
 
     Attributes:
-        kind: Kind of the labels that are learned and predicted, see `datamodules.core.labels`.
+        kind: Kind of the predictions, by which files and commands select the head.
+        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
         columns: Names and units of the scores over a split, in the order of the tables.
         main_score: Score that selects the best epoch.
         takes: Input and output of a network for this head, for messages.
@@ -110,6 +111,7 @@ class Head(nn.Module, ABC):
     """
 
     kind: ClassVar[str]
+    labels: ClassVar[str]
     columns: ClassVar[Mapping[str, ScoreColumn]]
     main_score: ClassVar[str]
     takes: ClassVar[str]

@@ -75,6 +75,7 @@ class ClassesHead(Head):
     """
 
     kind: ClassVar[str] = PIXEL_CLASSES
+    labels: ClassVar[str] = PIXEL_CLASSES
     columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
             "macc": ScoreColumn("mAcc", "%", "accuracy", "accuracy"),
@@ -212,12 +213,12 @@ class ClassesHead(Head):
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return the labels of the largest logits."""
-        return self.labels(outputs.argmax(dim=1))
+        return self.labels_of(outputs.argmax(dim=1))
 
-    def labels(self, best: Tensor) -> Tensor:
+    def labels_of(self, best: Tensor) -> Tensor:
         """Return the labels of outputs: 0 where the best one belongs to none of the K classes."""
         if best.dtype == torch.uint16:  # torch has few operations on it
-            return self.labels(best.int()).to(torch.uint16)
+            return self.labels_of(best.int()).to(torch.uint16)
         return (best + 1).where(best < len(self.class_names) - 1, 0)
 
     # Pictures and files
@@ -330,7 +331,7 @@ class LabelMosaic(ScoreMosaic):
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
-        labels, thresholds = self._head.labels(self.labels()), self._head.thresholds
+        labels, thresholds = self._head.labels_of(self.labels()), self._head.thresholds
         if thresholds is None:
             return labels
         is_sure = self.confidences() >= thresholds[labels.cpu().numpy()]

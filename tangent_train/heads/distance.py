@@ -110,6 +110,7 @@ class DistanceHead(Head):
     """
 
     kind: ClassVar[str] = DISTANCE
+    labels: ClassVar[str] = DISTANCE
     columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
         {
             "absrel": ScoreColumn("AbsRel", "", better="lower"),

@@ -24,6 +24,7 @@ class ImageClassHead(Head):
     """
 
     kind: ClassVar[str] = IMAGE_CLASS
+    labels: ClassVar[str] = IMAGE_CLASS
     columns: ClassVar[Mapping[str, ScoreColumn]] = {
         "accuracy": ScoreColumn("accuracy"),
         "class_accuracy": ScoreColumn("mean over classes", "%", "accuracy", "accuracy"),

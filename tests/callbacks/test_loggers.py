@@ -24,9 +24,10 @@ from torch import nn
 from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
-from tangent_train.cli.trainer import build_trainer
+from tangent_train.cli.run import Run
 from tangent_train.heads.pictures import prediction_panel
 from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import PixelTask
 from tests.decoded import decoded
 from tests.running import composed_settings
 from tests.tasks.builders import predict_labels, segmentation_task
@@ -48,11 +49,12 @@ def _fit(folder: Path, data: Any, task: Any, *overrides: str) -> None:
     (folder / "runs" / "mine" / "seed_0").mkdir(parents=True)
     typed = ("trainer.max_epochs=2", "trainer.log_every_n_steps=1", "trainer.accelerator=cpu")
     settings = composed_settings("train", *typed, "validation_images=2", *overrides)
-    settings["trainer"] |= {"num_sanity_val_steps": 1, "enable_checkpointing": False}
-    contents = {"config": {"network": {"widths": [4, 8]}, "seed": 0}}
+    more = {"num_sanity_val_steps": 1, "enable_checkpointing": False}
+    settings = settings.model_copy(update={"trainer": settings.trainer | more})
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        trainer = build_trainer(settings, Path("runs/mine/seed_0/P"), task, contents)
+        patch.setattr(Run, "contents", lambda _: {})
+        trainer = Run(Path("runs/mine/seed_0/P"), settings, data, task).trainer()
         trainer.fit(task, datamodule=data)
 
 
@@ -73,7 +75,7 @@ def trained(
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("WANDB_MODE", "offline")
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
-        wandb_settings = composed_settings("train", "logger=wandb")["logger"]["wandb"]
+        wandb_settings = composed_settings("train", "logger=wandb").logger["wandb"]
         text = ", ".join(f"{n}: {'null' if v is None else v}" for n, v in wandb_settings.items())
         _fit(folder, data, task, "logger=many", f"+logger.wandb={{{text}}}")
         wandb.finish()
@@ -207,7 +209,7 @@ def test_hyperparameters_name_and_group_are_logged_once(
 ) -> None:
     folder = trained[0]
     run = _of_mlflow(folder)[2]
-    assert run.data.params == {"network.widths": "[4, 8]", "seed": "0"}
+    assert run.data.params["network.widths"] == "[16, 32, 64, 128, 256, 256]"
     assert run.info.run_name == "mine/seed_0/P"
     assert run.data.tags["group"] == "mine"
     records = list(_wandb_records(folder))

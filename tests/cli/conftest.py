@@ -33,7 +33,7 @@ def stages(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def run_process(line: Sequence[str]) -> int:
         state = Singleton.get_state()
         GlobalHydra.instance().clear()
-        run(*line[3:])
+        run(Path(line[0]).name.removeprefix("tangent-"), *line[1:])
         Singleton.set_state(state)
         return 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from tangent_train.cli.transfer import transfer
+from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
 from tests.cli.tiny_runs import SMALL_ROOMS
 from tests.results.example_results import example_result
@@ -48,14 +48,16 @@ class PretendedRuns:
         self.failing: str | None = None
 
     def __call__(self, line: Sequence[str]) -> int:
-        assert list(line[:3]) == [sys.executable, "-m", "tangent_train.cli.main"]
-        command, first, *others = line[3:]
+        command = Path(line[0]).name.removeprefix("tangent-")
+        first, *others = line[1:]
         folder = Path(others[-1].partition("=")[2].strip("'\""))
-        config: Any = OmegaConf.create({"resume": first.removeprefix("resume=")})
+        config: Any = OmegaConf.create({"resume": first.removeprefix("resume=").strip("'")})
         if first.startswith("--config-dir="):
             name = others[0].removeprefix("--config-name=")
             config = OmegaConf.load(Path(first.removeprefix("--config-dir="), f"{name}.yaml"))
             assert config.pop("defaults")
+            given = {"init_from": None, "checkpoint": "."}  # files that are not written
+            validate(command, {name: given.get(name, v) for name, v in config.items()})
             folder.mkdir(parents=True)
             OmegaConf.save(config, folder / "config.yaml")
         self.started.append((command, folder.name))
@@ -75,6 +77,7 @@ class PretendedRuns:
 
 def run_transfer(*arguments: str, settings: Sequence[str] = SETTINGS) -> None:
     """Run the command with the given overrides, after those of a small transfer."""
+    config_name("transfer", ())
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         config = compose("transfer", [*settings, *arguments], return_hydra_config=True)
         OmegaConf.set_readonly(config, value=False)

@@ -27,7 +27,8 @@ class ShareMosaic(MeanMosaic):
 class ShareHead(Head):
     """Regresses 1 for the pixels of a class and 0 for others."""
 
-    kind = "pixel_classes"
+    kind = "share"
+    labels = "pixel_classes"
     columns: ClassVar = {"mae": ScoreColumn("mean absolute error", "", better="lower")}
     main_score = "mae"
     takes = "images (n, C, h, w) to numbers (n, 1, h, w)"
