@@ -186,10 +186,10 @@ def test_an_alignment_without_anything_to_align_changes_nothing_and_a_constant_g
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"alignment": "mean"}, "task.alignment"),
-        ({"alignment_in": "log"}, "task.alignment_in"),
-        ({"min_distance": -1}, "task.min_distance"),
-        ({"min_distance": 2, "max_distance": 2}, "task.max_distance"),
+        ({"alignment": "mean"}, "task.head.alignment"),
+        ({"alignment_in": "log"}, "task.head.alignment_in"),
+        ({"min_distance": -1}, "task.head.min_distance"),
+        ({"min_distance": 2, "max_distance": 2}, "task.head.max_distance"),
     ],
 )
 def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
