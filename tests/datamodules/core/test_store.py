@@ -13,7 +13,7 @@ import torch
 
 from datamodules import Stanford2D3DS
 from datamodules.core.store import Declared, Store
-from tangent_train.cli.jobs import Shard
+from tangent_train.manifest import Shard
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.conftest import fabricate
