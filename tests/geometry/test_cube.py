@@ -33,14 +33,6 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
 
 
-def test_numpy_integers_are_accepted() -> None:
-    grid = CubeGrid(np.int64(9), margin=np.int32(1))  # type: ignore[arg-type]
-    assert (type(grid.dim), grid.pitch) == (int, 2 / 7)
-    for dim in (True, 9.0):
-        with pytest.raises(SettingError, match="dim: "):
-            CubeGrid(dim)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("rotation", [None, ROTATION])
 def test_only_the_owner_contains_a_direction(
     rotation: NDArray[np.float64] | None,
@@ -83,9 +75,3 @@ def test_a_rotation_replaces_that_of_the_grid(grid: CubeGrid | TangentGrid) -> N
     np.testing.assert_allclose(
         rotated.directions([2]), plain.directions([2]) @ ROTATION.T, atol=1e-14
     )
-
-
-@pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])
-def test_impossible_sides_are_refused(dim: int) -> None:
-    with pytest.raises(SettingError, match=r"dim: found .*; expected an integer of 2 or more"):
-        CubeGrid(dim)
