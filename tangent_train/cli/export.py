@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.loaded import load_network
-from tangent_train.cli.command_settings import ExportSettings
-from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.cli.settings import check_new
+from tangent_train.config.settings import ExportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
 from tangent_train.inference.engine import sees_rays
 from tangent_train.inference.export import export_network
 
 
-def export(config: Mapping[str, Any]) -> None:
+def export(settings: ExportSettings) -> None:
     """Write a trained network to a file, and print the largest difference from PyTorch's scores.
 
     Args:
-        config: Composed ``export.yaml``.
+        settings: Settings of the command.
 
     Raises:
         DataError: The checkpoint cannot be used.
         SettingError: A setting is missing or impossible, the file exists, or the network cannot be
             exported.
     """
-    settings = parse_settings(ExportSettings, config)
     output = settings.output
     check_new(settings, output)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):

@@ -13,9 +13,8 @@ from typing import Any
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
-from tangent_train.cli.command_settings import KeypointSettings
-from tangent_train.cli.settings import parse_settings
-from tangent_train.config.build import build_from_config, check_fields, resolve_target
+from tangent_train.config.build import build_from_config, check_fields
+from tangent_train.config.settings import KeypointSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import read_json, write_bytes
@@ -28,29 +27,29 @@ from tangent_train.keypoints.two_view import colmap
 _IMAGE_SETTINGS = ("left", "right", "input", "pairing")
 
 
-def keypoints(config: Mapping[str, Any]) -> None:
+def keypoints(settings: KeypointSettings) -> None:
     """Compare keypoints of panoramas and of tangent images on pairs, and write the scores.
 
     Args:
-        config: Composed ``keypoints.yaml``.
+        settings: Settings of the command.
 
     Raises:
         SettingError: A setting is missing or invalid.
         DataError: No pairs are found.
     """
-    parsed, comparer = parse_settings(KeypointSettings, config), parse_settings(Comparer, config)
-    output = parsed.output
+    of_comparer = {field.name: getattr(settings, field.name) for field in fields(Comparer)}
+    output, comparer = settings.output, Comparer(**of_comparer)
     colmap()  # refuses a missing pycolmap before minutes of work
-    data, pairs = _pairs(config)
-    names = ("export", *(field.name for field in fields(Comparer)))
-    settings = {name: config[name] for name in names} | {"data": data}
-    done = earlier_results(output, settings)
+    data, pairs = _pairs(settings)
+    names = {"export", *of_comparer}
+    content = settings.model_dump(mode="json", include=names) | {"data": data}
+    done = earlier_results(output, content)
     pairs.make_files()
-    pair_names = pairs.names[: parsed.max_pairs]
+    pair_names = pairs.names[: settings.max_pairs]
 
     def report() -> KeypointReport:
         rows = [row for name in pairs.names for row in done.get(name, ())]
-        return KeypointReport(rows, comparer.representations, settings, pairs.published)
+        return KeypointReport(rows, comparer.representations, content, pairs.published)
 
     missing = [(k, name) for k, name in enumerate(pair_names) if name not in done]
     count = len(pair_names)
@@ -59,12 +58,12 @@ def keypoints(config: Mapping[str, Any]) -> None:
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
-            if parsed.export:
+            if settings.export:
                 _export(output / "export", pairs.files, pair, comparison)
         except (DataError, MemoryError) as error:  # a SettingError would concern all pairs
             print_text(f"Pair {name}: {error or 'not enough memory'}")
             continue
-        if index < parsed.pictures:
+        if index < settings.pictures:
             for condition in comparison.images:
                 file = f"{index:03}_{file_name(name)}_{condition}.png"
                 write_bytes(output / "matches" / file, matches_png(comparison, condition))
@@ -73,24 +72,22 @@ def keypoints(config: Mapping[str, Any]) -> None:
     for table in report().means():
         table.print()
     print_text(f"Results are in {output}." if done else "There are no results.")
-    if parsed.export:
+    if settings.export:
         print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
     if failed := len(set(pair_names) - set(done)):
         sys.exit(f"tangent-keypoints: {failed} of {count} pairs could not be used, see above")
 
 
-def _pairs(config: Mapping[str, Any]) -> tuple[Any, PanoramaPairs]:
+def _pairs(settings: KeypointSettings) -> tuple[Any, PanoramaPairs]:
     """Return the settings of the pairs, and the pairs, from images or from a data set."""
-    images = {name: config[name] for name in _IMAGE_SETTINGS}
+    images = {name: getattr(settings, name) for name in _IMAGE_SETTINGS}
     if any(images[name] is not None for name in ("left", "right", "input")):
-        return images, ImagePairs(**images)
-    if not issubclass(resolve_target(config["data"], "data"), PanoramaPairs):
-        raise SettingError(
-            "data",
-            found=config["data"]["_target_"],
-            expected="a data set of pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
-        )
-    return config["data"], build_from_config(config["data"], "data")
+        return settings.model_dump(mode="json", include=set(_IMAGE_SETTINGS)), ImagePairs(**images)
+    pairs = build_from_config(settings.data, "data")
+    if not isinstance(pairs, PanoramaPairs):
+        expected = "a data set of pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs"
+        raise SettingError("data", found=type(pairs).__name__, expected=expected)
+    return settings.data, pairs
 
 
 def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
@@ -142,7 +139,7 @@ def _export(
             found = f"{width_height(shape)}, a part of a panorama"
             raise DataError(file, found=found, expected="a whole panorama for COLMAP")
         images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
-    for name, matched in comparison.found[AS_GIVEN].items():
+    for name, matched in comparison.matched[AS_GIVEN].items():
         path = folder / file_name(name) / "database.db"
         keypoints = (matched.left, matched.right)
         add_pair(path, images, keypoints, matched.matches, matched.geometry)

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.reader import class_masks
-from tangent_train.cli.command_settings import RenderSettings
-from tangent_train.cli.settings import check_new, parse_settings
+from tangent_train.cli.settings import check_new
 from tangent_train.config.build import build_from_config
+from tangent_train.config.settings import RenderSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
@@ -44,17 +44,16 @@ from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
 
 
-def render(config: Mapping[str, Any]) -> None:
+def render(settings: RenderSettings) -> None:
     """Render panoramas to tangent images, or results for tangent images to panoramas.
 
     Args:
-        config: Composed ``render.yaml``.
+        settings: Settings of the command.
 
     Raises:
         DataError: No files to render are found.
         SettingError: A setting is invalid, or the output was written with other settings.
     """
-    settings = parse_settings(RenderSettings, config)
     modes = [name for name in _MODES if getattr(settings, name) is not None]
     if len(modes) != 1:
         raise SettingError(
@@ -65,7 +64,7 @@ def render(config: Mapping[str, Any]) -> None:
         )
     if settings.output is None and settings.figure is None:
         raise SettingError("output", found="null", expected="a folder, or with back= a file")
-    content = {name: value for name, value in config.items() if name not in _NOT_CONTENT}
+    content = settings.model_dump(mode="json", exclude=set(_NOT_CONTENT))
     _MODES[modes[0]](settings, content)
 
 

@@ -142,7 +142,6 @@ def test_a_broken_pair_is_named_and_the_others_are_compared(
         (["left={}", "right={}/a.png", "output=o"], "found 4; expected two panoramas"),
         (["input={}/a.png", "output=o"], "a.png: found 1; expected two panoramas or more"),
         (["data=synthrooms", "output=o"], "SynthRooms; expected a data set of pairs:"),
-        (["margin=-1", "output=o"], "margin: found -1"),
     ],
 )
 def test_settings_that_cannot_work_are_named(
