@@ -33,9 +33,9 @@ def gnomonic_points_xyz(
 ) -> NDArray[np.float64]:
     """Return where a convolution samples the sphere (Coors et al. 2018, Tateno et al. 2018).
 
-    The points of a direction form a grid on its tangent plane, aligned to north: the inverse gnomonic
-    projection. They are in the order of a convolution's weight on an image: rows from north to
-    south, columns from west to east.
+    The points of a direction form a grid on its tangent plane, aligned to north: the inverse
+    gnomonic projection. They are in the order of a convolution's weight on an image: rows from
+    north to south, columns from west to east.
 
     Args:
         directions_xyz: ``(P, 3)`` non-zero vectors of any length.

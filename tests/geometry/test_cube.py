@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about
+from tangent_train.geometry import CubeGrid, rotation_about
 from tests.geometry.directions import random_directions
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
@@ -60,18 +60,3 @@ def test_a_margin_shows_what_is_beyond_the_face() -> None:
     for margin in (-1, 7, 0.5):
         with pytest.raises(SettingError, match=r"margin: found|dim: found 14; expected .* 16 or"):
             CubeGrid(14, margin=margin)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    "grid", [CubeGrid(5, ROTATION.T), CubeGrid(9, ROTATION.T, 2), TangentGrid(0, 4, 20, ROTATION.T)]
-)
-def test_a_rotation_replaces_that_of_the_grid(grid: CubeGrid | TangentGrid) -> None:
-    rotated = grid.with_rotation(ROTATION)
-    assert type(rotated) is type(grid)
-    assert rotated != grid
-    assert rotated.with_rotation(ROTATION.T) == grid
-    plain = grid.with_rotation(None)
-    assert (plain.rotation, plain.dim) == (None, grid.dim)
-    np.testing.assert_allclose(
-        rotated.directions([2]), plain.directions([2]) @ ROTATION.T, atol=1e-14
-    )

@@ -1,4 +1,4 @@
-"""Tangent axes and gnomonic taps against tangent images; other tests have their formulas."""
+"""Tangent axes and gnomonic points against tangent images; other tests have their formulas."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from tangent_train.geometry import TangentGrid
 from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz, tangent_axes
 
 
-def test_taps_are_the_pixels_of_tangent_images() -> None:
+def test_points_are_the_pixels_of_tangent_images() -> None:
     grid = TangentGrid(base_level=1, level=4)
-    taps = gnomonic_points_xyz(grid.centers_xyz, grid.dim, grid.pitch)
-    np.testing.assert_allclose(taps, grid.directions().reshape(taps.shape), atol=1e-12)
+    points = gnomonic_points_xyz(grid.centers_xyz, grid.dim, grid.pitch)
+    np.testing.assert_allclose(points, grid.directions().reshape(points.shape), atol=1e-12)
 
 
 @pytest.mark.parametrize("pole", [1.0, -1.0])
@@ -20,6 +20,6 @@ def test_taps_are_the_pixels_of_tangent_images() -> None:
 def test_poles_have_longitude_zero(pole: float, noise: float) -> None:
     axes = tangent_axes([noise, -noise, 2 * pole])
     np.testing.assert_allclose(axes, np.array([[0, 1, 0], [-pole, 0, 0], [0, 0, pole]]), atol=1e-12)
-    taps = gnomonic_points_xyz([[noise, -noise, pole]], 3, 0.1)[0]
-    np.testing.assert_allclose(taps[4], [0, 0, pole], atol=1e-12)
-    assert len(np.unique(taps.round(6), axis=0)) == 9
+    points = gnomonic_points_xyz([[noise, -noise, pole]], 3, 0.1)[0]
+    np.testing.assert_allclose(points[4], [0, 0, pole], atol=1e-12)
+    assert len(np.unique(points.round(6), axis=0)) == 9

@@ -18,8 +18,6 @@ from tangent_train.geometry import (
     equirect_directions,
     rotation_about,
 )
-from tangent_train.geometry.coverage import check_coverage, overlaps
-from tangent_train.geometry.equirect import area_mask
 from tangent_train.rendering.tables import owners
 from tests.geometry.directions import angle_deg, random_directions
 
@@ -141,33 +139,3 @@ def test_a_direction_may_be_shown_by_another_view_than_its_owner() -> None:
     grid_of(rings, fov, size, by_owners=False)
     with pytest.raises(SettingError, match=r"nearest center \(blend=nearest\)"):
         grid_of(rings, fov, size, by_owners=True)
-
-
-def _mask(*angles: float) -> NDArray[np.bool_]:
-    return area_mask(angles, (360, 720))
-
-
-def test_some_views_can_cover_a_part_of_the_sphere() -> None:
-    flat = grid_of(((0, 1),), valid=_mask(-49, 49, -35, 35))
-    assert (flat.num_images, flat.is_overlapping) == (1, True)
-    with pytest.raises(SettingError, match="expected views that cover the area"):
-        grid_of(((0, 1),), valid=_mask(-49, 49, -39, 39))
-    front = grid_of(STANDARD).subset([0, 8, 13])
-    check_coverage([front], _mask(-20, 20, -80, 80), by_owners=True)
-    assert overlaps(front, _mask(-20, 20, -80, 80))
-    np.testing.assert_array_equal(front.directions(), grid_of(STANDARD).directions([0, 8, 13]))
-    assert front != grid_of(STANDARD).subset([0, 8, 12])
-    assert front.with_rotation(ROTATION) == grid_of(STANDARD, rotation=ROTATION).subset([0, 8, 13])
-
-
-def test_other_sizes_keep_the_outer_edges_and_the_ratio() -> None:
-    grid = grid_of(((0, 5), (50, 4), (-50, 4)), (100, 90), (24, 32))
-    small = grid.resized((6, 8))
-    assert small.half_size == pytest.approx(grid.half_size)
-    wide = grid.widened(2)
-    np.testing.assert_allclose(
-        wide.directions([3])[:, 2:-2, 2:-2], grid.directions([3]), atol=1e-12
-    )
-    for size in ((6, 9), (1, 1)):
-        with pytest.raises(SettingError, match=r"in the ratio of 32 × 24 \(width × height\)"):
-            grid.resized(size)

@@ -10,7 +10,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
@@ -19,7 +18,6 @@ from tangent_train.geometry import (
     checked_rotation,
     lonlat_to_xyz,
     random_rotation,
-    rotation_about,
     xyz_to_lonlat,
 )
 
@@ -55,14 +53,6 @@ def test_lonlat_is_recovered_from_xyz(lon: float, lat: float) -> None:
     # Near a pole longitude is imprecise: compare the distance on the sphere.
     assert math.cos(lat) * math.sin((lon_back - lon) / 2) == pytest.approx(0, abs=1e-12)
     assert -math.pi <= lon_back <= math.pi
-
-
-@given(st.integers(0, 2**32 - 1), st.floats(-7, 7))
-def test_rotation_about_an_axis_is_scipys(seed: int, angle: float) -> None:
-    axis = np.random.default_rng(seed).normal(size=3)
-    unit = axis / np.linalg.norm(axis)
-    expected = Rotation.from_rotvec(angle * unit).as_matrix()
-    np.testing.assert_allclose(rotation_about(axis, angle), expected, atol=1e-12)
 
 
 def test_random_rotations_are_proper_and_uniform() -> None:

@@ -127,5 +127,5 @@ def test_settings_and_signals_that_do_not_fit_are_refused() -> None:
     with pytest.raises(SettingError, match=r"unpooling: found zeros; expected repeat .* faces"):
         IcosphereUNet(3, 4, 1, face_neighbors, (4, 4), "max")
     network = IcosphereUNet(3, 4, 1, mesh_operators, (4, 4))
-    with pytest.raises(SettingError, match="expected a signal on the 42 vertices"):
+    with pytest.raises(SettingError, match="expected a signal of 42 values"):
         network(torch.zeros(1, 3, 32, 64))
