@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from datamodules.folder.classes import UNKNOWN_NAME
 from tangent_train.errors import SettingError, counted
-from tangent_train.files import csv_text, parse_json, write_text
+from tangent_train.files import csv_text, write_text
 from tangent_train.io.image_files import composed
 from tangent_train.io.videos import write_video
 from tangent_train.results.html import EncodedImage, encode_image, write_report
@@ -123,7 +123,7 @@ class PredictionFolder:
             SettingError: Earlier predictions have other settings.
         """
         try:
-            content = parse_json((summary or self.path / _SUMMARY).read_bytes())
+            content = json.loads((summary or self.path / _SUMMARY).read_bytes())
             entries = {entry["name"]: entry for entry in self.predicted(content["images"])}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):
