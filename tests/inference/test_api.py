@@ -16,7 +16,7 @@ from PIL.PngImagePlugin import PngInfo
 
 import tangent_train as tt
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.network import Network
+from tangent_train.inference.api import Network
 from tests.cli.tiny_runs import run_command
 from tests.datamodules.data_files import gpano_xmp
 from tests.inference.trained import CUBE, PERSPECTIVE, TANGENT, sphere, write_checkpoint
@@ -78,7 +78,7 @@ def test_panoramas_and_photos_get_the_labels_and_scores_of_tangent_predict(
     np.testing.assert_array_equal(labels, expected)
     if fov is None:
         assert len(np.unique(labels)) == 3 + ("min_confidence" in settings)  # unknown
-    scores = network.scores(image, fov=fov)
+    scores = network.probabilities(image, fov=fov)
     assert scores.dtype == np.float32
     np.testing.assert_allclose(scores, probabilities, atol=1e-3)
     np.testing.assert_allclose(scores.sum(axis=-1), 1, atol=1e-5)
@@ -87,11 +87,11 @@ def test_panoramas_and_photos_get_the_labels_and_scores_of_tangent_predict(
 def test_tensors_get_what_arrays_get(network: Network) -> None:
     panorama = sphere(33)
     tensor = torch.from_numpy(panorama).permute(2, 0, 1)
-    labels, scores = network.labels(tensor), network.scores(tensor)
+    labels, scores = network.labels(tensor), network.probabilities(tensor)
     assert (labels.dtype, labels.shape) == (torch.int64, (33, 66))
     assert (scores.dtype, scores.shape) == (torch.float32, (3, 33, 66))
     np.testing.assert_array_equal(labels.numpy(), network.labels(panorama))
-    np.testing.assert_array_equal(scores.movedim(0, -1).numpy(), network.scores(panorama))
+    np.testing.assert_array_equal(scores.movedim(0, -1).numpy(), network.probabilities(panorama))
     photo = tensor[:, :20, :30]
     expected = network.labels(panorama[:20, :30], fov=60)
     np.testing.assert_array_equal(network.labels(photo, fov=60).numpy(), expected)
@@ -155,7 +155,7 @@ def test_files_get_the_labels_and_scores_of_tangent_predict(
     for given in ("room.png", tmp_path / "room.png"):
         np.testing.assert_array_equal(network.labels(given, **settings), expected)
     without = {name: value for name, value in settings.items() if name != "mask"}
-    np.testing.assert_allclose(network.scores("room.png", **without), probabilities, atol=1e-3)
+    np.testing.assert_allclose(network.probabilities("room.png", **without), probabilities, atol=1e-3)
     assert (expected == 0).any() == ("mask" in settings)
     if not tags and not Path(str(settings.get("mask"))).is_dir():
         np.testing.assert_array_equal(network.labels(rgb, **settings), expected)
@@ -171,9 +171,9 @@ def test_the_zenith_of_a_tilted_panorama_matters(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     _write(sphere(50), POSE)
-    upright = network.scores("room.png", upright="pose")
-    np.testing.assert_array_equal(network.scores("room.png", upright="auto"), upright)
-    assert np.abs(upright - network.scores("room.png")).max() > 0.01, "other images, other scores"
+    upright = network.probabilities("room.png", upright="pose")
+    np.testing.assert_array_equal(network.probabilities("room.png", upright="auto"), upright)
+    assert np.abs(upright - network.probabilities("room.png")).max() > 0.01, "other images, other scores"
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "CMYK", "1", "I;16"])
@@ -213,7 +213,7 @@ def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> Non
 def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
     network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), view_batch_size=7)
     counts: list[int] = []
-    network.trained.network.register_forward_pre_hook(
+    network.loaded.network.register_forward_pre_hook(
         lambda _, images: counts.append(len(images[0]))
     )
     network.labels(sphere(32))
@@ -251,7 +251,7 @@ def test_label_maps_convert_labels_and_scores(
     assert network.class_names == ("unknown", "light", "shade")
     assert len(network.palette) == 3
     expected, probabilities = predicted(sphere(32), "label_map=map.json", f"unmapped={unmapped}")
-    labels, scores = network.labels(sphere(32)), network.scores(sphere(32))
+    labels, scores = network.labels(sphere(32)), network.probabilities(sphere(32))
     np.testing.assert_array_equal(labels, expected)
     np.testing.assert_allclose(scores, probabilities, atol=1e-3)
     assert (scores.sum(axis=-1).min() < 0.9) == (unmapped == "unknown")
@@ -341,7 +341,7 @@ def test_impossible_settings_of_a_network_are_refused(
 
 def test_scores_are_not_masked(network: Network) -> None:
     with pytest.raises(SettingError, match="mask: found one; expected None for scores"):
-        network.scores(_RGB, mask=-30)
+        network.probabilities(_RGB, mask=-30)
 
 
 def test_photos_without_a_field_of_view_are_explained(network: Network, tmp_path: Path) -> None:
