@@ -317,16 +317,8 @@ def test_networks_name_the_method_that_suits_them(
             method(panorama)
     with pytest.raises(SettingError, match=r"predicts pixel_classes; .*Use labels\(\) or prob"):
         classes.depth(panorama)
-    automatic: Any = "auto"
-    with pytest.raises(SettingError, match=r"upright: found auto; .*Use pose for files"):
-        network.depth(panorama, upright=automatic)
-    trained = depth_network()
-    with pytest.raises(SettingError, match=r"min_confidence: found 0\.5; expected 0 for depth"):
-        loaded(trained, monkeypatch, min_confidence=0.5)
-    with pytest.raises(SettingError, match="align: found 'median'; expected"):
-        loaded(trained, monkeypatch, align="median")
-    with pytest.raises(SettingError, match="align: found scale; expected None for networks of cl"):
-        loaded(trained_network(TANGENT), monkeypatch, align="scale")
+    with pytest.raises(TypeError, match="min_confidence"):
+        loaded(depth_network(), monkeypatch, min_confidence=0.5)
 
 
 # Functions.
