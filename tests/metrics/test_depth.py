@@ -176,10 +176,10 @@ def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> No
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"alignment": "mean"}, "task.alignment"),
-        ({"alignment_in": "log"}, "task.alignment_in"),
-        ({"min_distance": -1}, "task.min_distance"),
-        ({"min_distance": 2, "max_distance": 2}, "task.max_distance"),
+        ({"alignment": "mean"}, "task.head.alignment"),
+        ({"alignment_in": "log"}, "task.head.alignment_in"),
+        ({"min_distance": -1}, "task.head.min_distance"),
+        ({"min_distance": 2, "max_distance": 2}, "task.head.max_distance"),
     ],
 )
 def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
