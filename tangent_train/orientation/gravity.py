@@ -28,7 +28,7 @@ _EVEN_CHANCE = 3.1  # significance at which half of the frames are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
 _HOPELESS = 1 / 400
-"""Directions less likely than the best by this factor are not passed to `likelihood`, to save time."""
+"""Directions less likely than the best by this factor are not passed on, to save time."""
 _LEAST_ROWS = 64
 """In panoramas with fewer rows, noise is mistaken for a room."""
 _DISTINCT = np.cos(np.radians(6))
