@@ -13,11 +13,11 @@ from typing import Any
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
-from tangent_train.config.build import build_from_config, check_fields
+from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import KeypointSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.files import read_json, write_bytes
+from tangent_train.files import check_fields, read_json, write_bytes
 from tangent_train.io.pixel_files import read_image_size
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
