@@ -19,11 +19,10 @@ from tangent_train.results.evaluation import (
     confusion_table,
     headline,
     result_tables,
-    summary_lines,
     write_results,
 )
 from tangent_train.results.evaluation_result import EvaluationResult
-from tangent_train.tasks import SegmentationTask
+from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import shape_task
 
 NAMES = ("unknown", "wall", "floor", "=sofa")
@@ -47,15 +46,17 @@ def _record(
     counts: SegmentationCounts | None = None, absent: Any = "skip", noun: str = "panoramas"
 ) -> EvaluationResult:
     """The record of seven images."""
-    task = SegmentationTask(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
+    task = segmentation_task(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
     task.evaluated = 7
-    return task.evaluation_result(counts or _matrices(), noun)
+    task.result = counts or _matrices()
+    return task.evaluation_result(noun)
 
 
 def _record_of_shapes() -> EvaluationResult:
     task = shape_task(nn.Identity(), SHAPES)
     task.evaluated = 16
-    return task.evaluation_result(SHAPE_MATRIX, "shapes")
+    task.result = SHAPE_MATRIX
+    return task.evaluation_result("shapes")
 
 
 def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:
@@ -135,16 +136,6 @@ def test_means_over_fewer_classes_have_a_note() -> None:
     as_zero = _record(_matrices({(1, 1): 90}), "zero")
     assert headline(as_zero).endswith(" over 7 panoramas")
     assert result_tables(as_zero)[0].note == ""
-
-
-def test_facts_of_the_protocol_stand_below_the_headline(tmp_path: Path) -> None:
-    record = replace(_record(), protocol={"range": "0 to 10 m", "test_rotation": "none"})
-    facts = "range: 0 to 10 m; test rotation: none"
-    assert summary_lines(record) == [headline(record), facts]
-    assert summary_lines(_record()) == [headline(_record())]
-    write_results(record, tmp_path, ["a note"])
-    text = (tmp_path / "results.md").read_text()
-    assert f"{headline(record)}\n\n{facts}\n\na note\n" in text
 
 
 def test_means_stand_with_their_intervals(tmp_path: Path) -> None:

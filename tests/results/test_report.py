@@ -13,18 +13,17 @@ import yaml  # type: ignore[import-untyped]
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.files import write_text
+from tangent_train.heads import DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
 from tangent_train.results.published import (
     facts,
-    publications,
     published_lines,
     published_rows,
     published_table,
 )
 from tangent_train.results.report import Report, levels_report, runs_report, transfer_report
 from tangent_train.results.rows import RunRow
-from tangent_train.tasks import ClassificationTask, DepthTask
 from tests.decoded import decoded
 from tests.results.example_results import PROTOCOL, example_result, without_solid_angle
 
@@ -179,19 +178,6 @@ def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> N
         assert 0 < float(line["mean"] or 50) < 100
 
 
-def test_rows_are_in_the_order_of_their_levels() -> None:
-    records = [example_result([0.5] * 3, name=str(level), level=level) for level in (10, 9)]
-    assert list(_cells(_runs_report(*records))) == ["9", "10"]
-
-
-@pytest.mark.parametrize(
-    "changes", [{"protocol": {"data": "SynthRooms"}}, {"protocol": {}}, {"level": 6}]
-)
-def test_nothing_published_stands_beside_other_data(changes: dict[str, Any]) -> None:
-    assert _paper()
-    assert not {name for name in _paper(**changes) if name[0] == "S"}
-
-
 @pytest.mark.parametrize(("name", "macc", "miou"), [("P", 61.8, 45.7), ("S-FT-10", 64.0, 49.6)])
 def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
     name: str, macc: float, miou: float
@@ -222,7 +208,7 @@ def test_reports_of_shapes_have_the_published_scores_of_the_same_rotation() -> N
     settings = {"data._target_": "datamodules.ModelNet40", "level": 5, "name": "shapes"}
     settings["representation.base_level"] = 0
     scores = {"accuracy": 0.8, "class_accuracy": 0.7}
-    columns = ClassificationTask.columns
+    columns = ImageClassHead.columns
     result = EvaluationResult("shapes", 120, columns, scores, classes, settings=settings)
     aligned = replace(result, protocol=facts("paper_modelnet40"))
     rotated = replace(result, protocol={**aligned.protocol, "test_rotation": "so3"})
@@ -256,37 +242,9 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     assert high - low > 200
 
 
-def test_published_depth_has_its_units_and_the_smallest_error_is_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The file has no such scores yet."""
-    lines = [
-        dict.fromkeys(next(published_lines()), "")
-        | {"protocol": "stanford2d3ds_depth", "method": method, "score": score, "mean": mean}
-        for method, scores in (("far", ("0.12", "88", "0.4")), ("near", ("0.1", "92.5", "0.36")))
-        for score, mean in zip(("absrel", "delta1", "rmse"), scores, strict=True)
-    ]
-    monkeypatch.setattr("tangent_train.results.published.published_lines", lambda: lines)
-    uncached = publications.__wrapped__
-    monkeypatch.setattr("tangent_train.results.published.publications", uncached)
-    protocol = facts("stanford2d3ds_depth")
-    means = dict.fromkeys(DepthTask.columns, 0.25)
-    record = EvaluationResult("panoramas", 2, DepthTask.columns, means, protocol=protocol)
-    aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
-    rows, _ = published_rows([aligned])
-    table = published_table(rows, aligned)
-    assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
-    assert table.rows == [
-        ("far (paper)", "–", "0.12", "88.0", "0.4"),
-        ("near (paper)", "–", "0.1", "92.5", "0.36"),
-    ]
-    _, (note,) = published_rows([replace(record, protocol=protocol | {"mask": "-60"})])
-    assert note.startswith("Not comparable: near: 0.1 and 1 more (stanford2d3ds_depth). mask: ")
-
-
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
-    columns = DepthTask.columns
+    columns = DistanceHead.columns
     means = dict.fromkeys(columns, 0.25)
     protocol = {"data": "Stanford2D3DS", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}
