@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
-from torch import nn
 
 from datamodules.core.store import Store
 from models.pretrained import read_tensors
@@ -28,7 +25,6 @@ from tangent_train.io.pixel_files import read_array, write_pixels
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
-from tests.security.watch import watched
 
 
 class Creating:
