@@ -55,7 +55,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
     """Return the settings that come from the file: views, level, inputs and normalization."""
     level, section = settings.level or loaded.level, settings.representation or {}
     if "_target_" not in section:  # changes of the views of the file
-        stored = panorama_settings(loaded, level) if level != loaded.level else {}
+        stored = {} if settings.level is None else panorama_settings(loaded, level)
         section = {**loaded.representation, **stored, **section}
     if section.get("level", 0) is None:
         section = {**section, "level": level}

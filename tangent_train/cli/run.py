@@ -32,7 +32,7 @@ from tangent_train.checkpoints.loaded import (
 )
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
-from tangent_train.config.settings import RunSettings, flat_settings
+from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
@@ -43,7 +43,7 @@ from tangent_train.results.evaluation import (
     summary_lines,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
+from tangent_train.results.evaluation_result import EvaluationResult, flat_settings, plain_scores
 from tangent_train.results.html import write_report
 from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.schedules import Schedule

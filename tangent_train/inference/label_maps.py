@@ -22,9 +22,8 @@ from typing import Literal
 
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import read_json
+from tangent_train.files import Text, check_fields, read_json
 from tangent_train.io.image_files import composed
 
 Unmapped = Literal["unknown", "never"]
