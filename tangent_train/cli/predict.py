@@ -25,9 +25,9 @@ from tangent_train.inference.images import (
     read_photo,
     with_up,
 )
-from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.inference.up_likelihood import UpLikelihood
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
@@ -119,7 +119,7 @@ class _Prediction:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
             print_text(f"Label map {label_map.name}: {mapped}.")
-            loaded = mapped.trained
+            loaded = mapped.loaded
         of_head = type(head_of(loaded)).predict_settings
         check_read(settings, _read(settings, loaded) | set(of_head))
         head: Any = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
@@ -130,7 +130,7 @@ class _Prediction:
         given = settings.device, settings.view_batch_size
         self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
         self._predictor = Predictor(loaded, head, views, *given)
-        self._judge = NetworkJudge(original, self._predictor.device)
+        self._up_likelihood = UpLikelihood(original, self._predictor.device)
         self._depth = _depth_folder(settings, loaded)
         if settings.upright == "auto" and loaded.depth_kind is not None:
             expected = "pose or null: depth networks do not estimate the up direction"
@@ -161,7 +161,7 @@ class _Prediction:
     def _upright(self, image: InputImage) -> InputImage:
         if self._settings.upright != "auto":
             return image
-        return with_up(image, self._settings.max_tilt_deg, self._judge)
+        return with_up(image, self._settings.max_tilt_deg, self._up_likelihood)
 
     def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
         """Predict one image, and write the files that need more than the pixels."""

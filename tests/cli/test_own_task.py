@@ -59,7 +59,7 @@ def test_a_head_of_ones_own_trains_evaluates_reports_and_resumes(
 
     views = "representation.base_level=0"
     typed = (SETTINGS[0], "task=share", *SMALL_ROOMS, rooms, views, "hydra.run.dir=again")
-    run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", *typed)
+    run("evaluate", *typed, f"checkpoint={folder}/checkpoints/best.ckpt")
     again = json.loads(Path("again/results.json").read_text())
     assert again["scores"]["mae"] == results["scores"]["mae"]
     capsys.readouterr()

@@ -15,12 +15,12 @@ from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
 from datamodules.core.samples import valid_mask
 from tangent_train.config.build import build_from_config
+from tangent_train.geometry.coverage import is_valid
 from tangent_train.geometry.equirect import area_mask
-from tangent_train.geometry.valid_views import is_valid
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
