@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.made_folders import claim_folder
-from datamodules.core.panoramas import ImageFiles, check_headers, distance_from_z_depth
+from datamodules.core.images import ImageFiles, check_headers, distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.synthia import reader
 from tangent_train.errors import DataError, at_least

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from datamodules.core.index import DatasetIndex
+from datamodules.core.splits import DatasetIndex
 from datamodules.core.made_folders import require_generated
 from datamodules.core.problems import Problems
 from datamodules.modelnet40.datamodule import ModelNet40
