@@ -228,19 +228,27 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return content
 
 
-def read_json(path: Path, expected: str, remedy: str = "") -> Any:
+def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> Any:
     """Read a JSON file.
 
     Args:
         path: File to read.
         expected: Expected file, for the message.
         remedy: Remedy, for the message.
+        kind: Type of the content, e.g. a pydantic model or ``dict[str, float]``; by default any.
 
     Raises:
-        DataError: The file cannot be read, or is not JSON.
+        DataError: The file cannot be read, is not JSON or has other content.
     """
+    from pydantic import TypeAdapter, ValidationError  # slow to import
+
     try:
-        return parse_json(path.read_bytes())
+        content = parse_json(path.read_bytes())
+        return content if kind is None else TypeAdapter(kind).validate_python(content)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise DataError(path, found=found, expected=expected, remedy=remedy) from error
     except (OSError, ValueError) as error:
         raise DataError(path, found=error, expected=expected, remedy=remedy) from error
 

@@ -73,7 +73,15 @@ def fabricate(
                 focal = height / (2 * math.tan(math.radians(60 + 2 * frame) / 2))
                 matrix = [[focal, 0, height / 2], [0, focal, height / 2], [0, 0, 1]]
                 (data / "pose").mkdir(exist_ok=True)
-                pose = json.dumps({"camera_k_matrix": matrix})
+                axes = [[0, 1, 0, 0], [0, 0, -1, 0], [-1, 0, 0, 0]]
+                pose = json.dumps(
+                    {
+                        "camera_k_matrix": matrix,
+                        "camera_rt_matrix": axes,
+                        "camera_original_rotation": [math.pi / 2, 0, 0],
+                        "camera_location": [0, 0, 0],
+                    }
+                )
                 (data / "pose" / f"{stem}_pose.json").write_text(pose)
     return root
 

@@ -65,10 +65,8 @@ def find_shapes(root: Path) -> list[ShapeFile]:
         root: Folder of the data set.
 
     Raises:
-        DataError: The folder is missing or has another layout, or a class has no training shape.
+        DataError: The folder is missing or has another layout.
     """
-    if not root.is_dir():
-        raise DataError(root, found="no such folder", expected="the data set", remedy=_GET_IT)
     shapes: list[ShapeFile] = []
     for part in _PARTS:
         for path in (*root.glob(f"*/{part}/*.off"), *root.glob(f"modelnet40_{part}/*.off")):
@@ -79,11 +77,4 @@ def find_shapes(root: Path) -> list[ShapeFile]:
                 shapes.append(ShapeFile(path, name, label, part))
     if not shapes:
         raise DataError(root, found="no meshes", expected=_TREE, remedy=_GET_IT)
-    training = {shape.label for shape in shapes if shape.part == "train"}
-    if untrained := sorted({shape.label for shape in shapes} - training):
-        raise DataError(
-            root,
-            found=f"only test shapes of {', '.join(untrained)}",
-            expected="shapes to train on of every class",
-        )
     return sorted(shapes, key=lambda shape: (shape.part, shape.name))

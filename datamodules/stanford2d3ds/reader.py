@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.images import ImageFiles, PngReader, resize_nearest
 from datamodules.stanford2d3ds.files import CLASSES, MISSING_DEPTH, MISSING_LABEL, UNKNOWN_CLASS
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError, counted
-from tangent_train.files import parse_json, read_json
-from tangent_train.geometry import PanoramaPose, is_camera_matrix
+from tangent_train.files import read_json
+from tangent_train.geometry import PanoramaPose
 from tangent_train.io.pixel_files import read_pixels, read_rgb
 
 UNKNOWN = 0
@@ -25,12 +24,6 @@ UNKNOWN = 0
 
 _FORMATS = {"rgb": (8, ("RGB", "RGBA")), "labels": (8, ("RGB", "RGBA")), "depth": (16, ("gray",))}
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_PANORAMA_KEYS = {
-    "camera_rt_matrix": (3, 4),
-    "camera_original_rotation": (3,),
-    "camera_location": (3,),
-}
-_MOST = 1e6  # meters, radians, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,16 +50,12 @@ class LabelTable:
         Raises:
             DataError: The file cannot be read or is not such a list.
         """
-        expected = f"a JSON list of names that begin with {', '.join(CLASSES)} or {UNKNOWN_CLASS}"
-        remedy = "Copy semantic_labels.json of the Stanford2D3DS release."
-        names = read_json(path, expected, remedy)
-        if not isinstance(names, list) or not names:
-            raise DataError(path, found=type(names).__name__, expected=expected, remedy=remedy)
+        expected = "semantic_labels.json of the release: a list of names"
+        names = read_json(path, expected, kind=list[str])
         ids = {UNKNOWN_CLASS: UNKNOWN} | {name: i for i, name in enumerate(CLASSES, start=1)}
-        classes = [str(name).partition("_")[0] for name in names]
-        strange = sorted(set(classes) - set(ids))
-        if strange:
-            raise DataError(path, found=f"class {strange[0]!r}", expected=expected, remedy=remedy)
+        classes = [name.partition("_")[0] for name in names]
+        if strange := sorted(set(classes) - set(ids)):
+            raise DataError(path, found=f"class {strange[0]!r}", expected=expected)
         return cls(np.array([ids[name] for name in classes], np.uint8))
 
     def decode(self, colors: NDArray[np.uint8]) -> NDArray[np.uint8]:
@@ -166,6 +155,22 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     return steps
 
 
+class _PoseRecord(BaseModel):
+    """Numbers of a pose file; some releases have a fourth row 0 0 0 1."""
+
+    model_config = ConfigDict(allow_inf_nan=False)
+
+    camera_k_matrix: list[tuple[float, float, float]] = Field(min_length=3, max_length=3)
+    camera_rt_matrix: list[tuple[float, float, float, float]] = Field(min_length=3, max_length=4)
+    camera_original_rotation: tuple[float, float, float]
+    camera_location: tuple[float, float, float]
+
+
+def _read_pose_file(path: Path) -> _PoseRecord:
+    record: _PoseRecord = read_json(path, "a pose file of the release", kind=_PoseRecord)
+    return record
+
+
 def read_camera_matrix(path: Path) -> NDArray[np.float64]:
     """Read the camera matrix of a pose file.
 
@@ -176,12 +181,9 @@ def read_camera_matrix(path: Path) -> NDArray[np.float64]:
         ``(3, 3)`` K for integer pixel centers (the file counts from pixel corners).
 
     Raises:
-        DataError: The file is missing or broken, or lacks the matrix.
+        DataError: The file is missing or broken.
     """
-    (matrix,) = read_pose_numbers(path, {"camera_k_matrix": (3, 3)})
-    if not is_camera_matrix(matrix):
-        expected = "a camera_k_matrix without skew"
-        raise DataError(path, found=matrix.tolist(), expected=expected)
+    matrix: NDArray[np.float64] = np.array(_read_pose_file(path).camera_k_matrix)
     return _CENTERS_FROM_CORNERS @ matrix
 
 
@@ -192,13 +194,16 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
         path: ``…_domain_pose.json``.
 
     Raises:
-        DataError: It cannot be read, or holds no pose.
+        DataError: It cannot be read.
     """
-    rt, angles, location = read_pose_numbers(path, _PANORAMA_KEYS)
+    record = _read_pose_file(path)
+    angles = np.array(record.camera_original_rotation)
     if np.abs(angles).max() > 2 * math.pi:
         angles = np.radians(angles)
     original = euler_rotation(angles)
-    return _checked_pose(path, original @ rt[:, :3] @ original @ CAMERA_FROM_SPHERE, location)
+    rotation = np.array(record.camera_rt_matrix)[:3, :3]
+    world_from_panorama = original @ rotation @ original @ CAMERA_FROM_SPHERE
+    return _checked_pose(path, world_from_panorama, np.array(record.camera_location))
 
 
 def read_photo_pose(path: Path) -> PanoramaPose:
@@ -211,35 +216,12 @@ def read_photo_pose(path: Path) -> PanoramaPose:
         path: ``camera_…_domain_pose.json``.
 
     Raises:
-        DataError: It cannot be read, or holds no pose.
+        DataError: It cannot be read.
     """
-    (rt,) = read_pose_numbers(path, {"camera_rt_matrix": (3, 4)})
-    world_from_camera = rt[:, :3].T
-    return _checked_pose(
-        path, world_from_camera @ CAMERA_FROM_SPHERE, -world_from_camera @ rt[:, 3]
-    )
-
-
-def read_pose_numbers(path: Path, keys: Mapping[str, tuple[int, ...]]) -> list[NDArray[np.float64]]:
-    """Read numbers in a pose file.
-
-    Args:
-        path: ``camera_…_domain_pose.json``.
-        keys: Names and shapes of the numbers to read.
-
-    Raises:
-        DataError: It cannot be read, or lacks one of them.
-    """
-    try:
-        record = parse_json(path.read_bytes())
-        return [_numbers(record[key], shape) for key, shape in keys.items()]
-    except (OSError, ValueError, TypeError, KeyError, OverflowError) as error:
-        raise DataError(
-            path,
-            found=f"{type(error).__name__}: {error}",
-            expected=f"a pose as JSON, with {', '.join(keys)}",
-            remedy="Copy or extract the file again.",
-        ) from error
+    rt = np.array(_read_pose_file(path).camera_rt_matrix)
+    world_from_camera = rt[:3, :3].T
+    location_m = -world_from_camera @ rt[:3, 3]
+    return _checked_pose(path, world_from_camera @ CAMERA_FROM_SPHERE, location_m)
 
 
 def _checked_pose(
@@ -249,12 +231,3 @@ def _checked_pose(
         return PanoramaPose(world_from_panorama, location_m)
     except SettingError as error:
         raise DataError(path, found=error.found, expected="a rotation") from error
-
-
-def _numbers(value: Any, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    numbers = np.array(value, np.float64)
-    # Some releases have a fourth row 0 0 0 1.
-    numbers = numbers[:3] if numbers.shape == (4, 4) else numbers
-    if numbers.shape != shape or not np.abs(numbers).max() <= _MOST:
-        raise ValueError(f"{value}, not {'×'.join(map(str, shape))} numbers")
-    return numbers

@@ -8,7 +8,7 @@ including labels.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -18,26 +18,22 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.made_folders import claim_folder
-from datamodules.core.images import ImageFiles, check_headers, distance_from_z_depth
+from datamodules.core.images import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.synthia import reader
-from tangent_train.errors import DataError, at_least
 from tangent_train.geometry import (
     equirect_latitudes,
     equirect_longitudes,
     lonlat_to_xyz,
     rotation_about,
 )
-from tangent_train.io.pixel_files import read_rgb, write_pixels
+from tangent_train.io.pixel_files import read_image_size, read_rgb, write_pixels
+from tangent_train.manifest import MANIFEST, Manifest
 from tangent_train.progress import show_progress
 from tangent_train.threads import in_threads
 
 HEIGHT = 2096
 """Rows of the published panoramas."""
-
-MANIFEST = "tangent_train.json"
-"""File in ``pano`` that marks generated panoramas and holds their settings."""
 
 _NOWHERE = -2  # a position outside all images, whatever interpolation reads around it
 
@@ -125,11 +121,11 @@ def make_panoramas(
     *,
     frames: int = reader.FRAMES,
     height: int = HEIGHT,
-) -> int:
+) -> None:
     """Write the panoramas of OmniSYNTHIA, as published, from the views of SYNTHIA.
 
-    Complete files are kept, so that the work can be interrupted. Published panoramas stay unchanged
-    and are not mixed with generated ones, whose heading differs.
+    Finished panoramas are kept, so that the work can be interrupted. Published panoramas stay
+    unchanged and are not mixed with generated ones, whose heading differs.
 
     Args:
         root: Folder of the sequences.
@@ -138,95 +134,57 @@ def make_panoramas(
         frames: Approximate number of frames per sequence, see `choose_frames`.
         height: Rows of the panoramas.
 
-    Returns:
-        Number of panoramas to generate.
-
     Raises:
-        DataError: A sequence has neither views nor panoramas, or panoramas generated with other
-            settings.
-        SettingError: A number is out of range.
+        DataError: A sequence has neither views nor panoramas.
+        SettingError: A sequence has panoramas that were generated with other settings.
     """
-    at_least("data.panorama_height", height, 1)
-    jobs: list[Callable[[], None]] = []
-    total = 0
     for sequence in sequences:
-        if _claim(reader.sequence_folder(root, sequence), frames, height):
-            chosen = reader.choose_frames(
-                reader.list_frames(reader.sequence_folder(root, sequence)), frames
-            )
-            jobs += _unfinished(root, sequence, chosen, height, problems)
-            total += len(chosen)
-    # Threads, as fast as processes: OpenCV releases the GIL, and the tables are shared.
-    # Closed, so that an interrupt drops queued work.
-    with closing(in_threads(lambda make: make(), jobs)) as done:
-        show_progress(done, "Making panoramas", "panoramas", total, total - len(jobs))
-    return len(jobs)
-
-
-def _claim(folder: Path, frames: int, height: int) -> bool:
-    """Mark a folder for generated panoramas; return False if none are to be generated."""
-    pano = folder / "pano"
-    is_ours, has_files = (pano / MANIFEST).exists(), any(pano.glob("**/[!.]*.png"))
-    if not reader.list_frames(folder):
-        if is_ours or has_files:
-            return False
-        raise DataError(
-            folder,
-            found="neither views nor panoramas",
-            expected="RGB, GT, Depth",
-            remedy=reader.GET_IT,
+        folder = reader.sequence_folder(root, sequence)
+        is_published = (
+            any(folder.glob("pano/RGB/*.png")) and not (folder / "pano" / MANIFEST).exists()
         )
-    if has_files and not is_ours:
-        return False
-    claim_folder(pano, MANIFEST, "OmniSYNTHIA", 1, {"frames": frames, "height": height})
-    return True
-
-
-def _unfinished(
-    root: Path, sequence: str, frames: Sequence[str], height: int, problems: Problems
-) -> list[Callable[[], None]]:
-    """Return the panoramas to generate, after checking all their sources."""
-    size: tuple[int, int] | None = None
-    whole = []
-    for frame in frames:
-        target = reader.panorama_files(root, sequence, frame, with_depth=True)
-        if _is_whole(target, height):
+        views = reader.list_frames(folder)
+        if is_published or not views:
             continue
-        views = [
-            reader.view_files(root, sequence, frame, view, with_depth=True) for view in reader.VIEWS
-        ]
-        for view in views:
-            one = view._replace(name=target.name)
-            size = check_headers(one, reader.SynthiaReader(reader.VIEW_FORMATS), problems) or size
-        if target.name not in problems.items:
-            whole.append((views, target))
-    if size is None or not whole:
-        return []
-    stitcher = ViewStitcher(
-        reader.read_view_camera(reader.sequence_folder(root, sequence), size), size, height
-    )
-    return [partial(_make, stitcher, views, target, problems) for views, target in whole]
+        settings = {"generator": "OmniSYNTHIA", "frames": frames, "height": height}
+        manifest = Manifest.open(folder / "pano", settings)
+        chosen = reader.choose_frames(views, frames)
+        missing = manifest.missing(chosen)
+        first = reader.view_files(root, sequence, chosen[0], reader.VIEWS[0], with_depth=False)
+        size = read_image_size(first.rgb)
+        stitcher = ViewStitcher(reader.read_view_camera(folder, size), size, height)
+        make = partial(_make, stitcher, root, sequence, problems)
+        # Threads, as fast as processes: OpenCV releases the GIL, and the tables are shared.
+        # Closed, so that an interrupt drops queued work.
+        with closing(in_threads(make, missing)) as made:
+            done = _note_finished(made, manifest)
+            before = len(chosen) - len(missing)
+            show_progress(done, f"Making panoramas of {sequence}", "panoramas", len(chosen), before)
 
 
-def _is_whole(files: ImageFiles, height: int) -> bool:
-    problems = Problems()
-    size = check_headers(files, reader.SynthiaReader(reader.PANORAMA_FORMATS), problems)
-    return size == (height, 2 * height) and not problems.items
+def _note_finished(made: Iterable[str | None], manifest: Manifest) -> Iterator[None]:
+    for frame in made:
+        if frame is not None:
+            manifest.finish(frame)
+        yield
 
 
 def _make(
-    stitcher: ViewStitcher, views: Sequence[ImageFiles], target: ImageFiles, problems: Problems
-) -> None:
+    stitcher: ViewStitcher, root: Path, sequence: str, problems: Problems, frame: str
+) -> str | None:
+    """Write the panorama of a frame; return the frame, or None if a view is broken."""
+    target = reader.panorama_files(root, sequence, frame, with_depth=True)
+    views = [reader.view_files(root, sequence, frame, v, with_depth=True) for v in reader.VIEWS]
     with problems.noted(target.name):
         depth = [reader.read_first_channel(view.parts["depth"]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
+        ids = [reader.read_ids(view.parts["labels"]) for view in views]
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
-            "labels": stitcher.stitch(
-                [reader.read_ids(v.parts["labels"]) for v in views], "nearest", reader.INVALID
-            ),
-            # Written last: this file marks a complete panorama.
+            "labels": stitcher.stitch(ids, "nearest", reader.INVALID),
             "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }
         for part, image in parts.items():
             write_pixels(target.parts[part], image)
+        return frame
+    return None

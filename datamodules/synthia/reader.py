@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +30,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
 from datamodules.core.images import ImageFiles, PngReader, meters_to_steps, resize_nearest
-from tangent_train.errors import DataError, at_least, width_height
+from tangent_train.errors import DataError, at_least
 from tangent_train.io.pixel_files import read_pixels
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
@@ -47,7 +46,7 @@ FRAMES = 500
 """Approximate number of frames of each sequence in OmniSYNTHIA."""
 
 _SIZE = (760, 1280)
-_CAMERA = (532.740352, 640.0, 380.0)  # of views of that size, center from pixel corners
+_CAMERA = "532.740352 640 380"  # of views of that size, center from pixel corners
 _NAME = "[0-9]" * 6 + ".png"
 
 CLASSES: tuple[str, ...] = (
@@ -190,22 +189,16 @@ def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]
         ``(3, 3)`` K for integer pixel centers; the file counts from pixel corners.
 
     Raises:
-        DataError: The file has another content, or is missing and the views have another size.
+        DataError: The file has other content, or is missing and the views have another size.
     """
     path = _camera_file(folder)
-    text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else ""
-    numbers = list(_CAMERA) if size == _SIZE and not path.exists() else []
-    with suppress(ValueError):
-        numbers = [float(number) for number in text.replace(",", " ").split()] or numbers
-    focal, x, y = numbers[:3] if len(numbers) in (3, 4) else (0.0, 0.0, 0.0)
-    if not (0 < focal < math.inf and 0 < x < size[1] and 0 < y < size[0]):
-        raise DataError(
-            path,
-            found=repr(text[:80]) if path.exists() else "no such file",
-            expected="focal length, center x and y, and perhaps the baseline, in pixels of "
-            f"views of {width_height(size)}; only of {width_height(_SIZE)} is it known without",
-            remedy="Extract the file again.",
-        )
+    try:
+        is_known = size == _SIZE and not path.exists()
+        text = _CAMERA if is_known else path.read_text(encoding="utf-8")
+        focal, x, y = [float(number) for number in text.replace(",", " ").split()][:3]
+    except (OSError, ValueError) as error:
+        expected = "focal length, center x and y, in pixels, and perhaps the baseline"
+        raise DataError(path, found=error, expected=expected) from error
     return np.array([[focal, 0, x - 0.5], [0, focal, y - 0.5], [0, 0, 1]])
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from datamodules.core.splits import DatasetIndex
-from datamodules.core.made_folders import require_generated
 from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.pairs import StanfordPairs
@@ -18,7 +17,7 @@ from datamodules.stanford2d3ds.panoramas import (
     StanfordAreas,
 )
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 
 
 @dataclass(kw_only=True, eq=False, repr=False)
@@ -43,7 +42,9 @@ class SynthRoomsAreas(StanfordAreas):
 
     def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
         """See `LabeledData`."""
-        require_generated(self.root)
+        if not self.root.is_dir():
+            remedy = "Run tangent-prepare with the same settings."
+            raise DataError(self.root, found="no such folder", expected="rooms", remedy=remedy)
         return super().find(problems)
 
 

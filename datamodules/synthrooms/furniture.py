@@ -1,17 +1,44 @@
-"""Chairs, sofas, tables, boards and bookcases.
+"""Room types, and their furniture: chairs, sofas, tables, boards, bookcases and clutter.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. Items that do not fit raise `NoPlaceError`.
+back at +y. Items that do not fit raise `NoPlaceError`. Parts and sizes are in ``parts.csv``.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Any, NamedTuple
+
 import numpy as np
 
-from datamodules.synthrooms.clutter import add_desk_things
-from datamodules.synthrooms.layout import Frame, NoPlaceError, Rectangle
-from datamodules.synthrooms.materials import Material, Pattern
+from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
+from datamodules.synthrooms import structure
+from datamodules.synthrooms.layout import FloorPlan, Frame, NoPlaceError, Rectangle
+from datamodules.synthrooms.materials import Palette, Pattern
 from datamodules.synthrooms.room import Room, RoomItem
+
+_UNLABELED = 0.12  # share of clutter
+_BOARD = 0.035  # thickness of the boards of a bookcase in meters
+_HEIGHTS = (2.5, 3.3)
+_L_SHAPED = 0.35
+
+
+def _build_chair(room: Room, place: Frame) -> None:
+    """Build a chair: four legs, star base, sledge, or tub; with or without armrests."""
+    chair = room.item("chair", place)
+    design = room.pick(0.35, 0.3, 0.15, 0.2)
+    cover, frame = room.palette.material(), room.palette.material(Pattern.PLAIN, Pattern.WOOD)
+    values = room.sizes(wide=(0.44, 0.56), seat=(0.42, 0.5), back=(0.4, 0.6), thick=(0.05, 0.11))
+    values |= {"cover": cover, "frame": frame}
+    if design == 3:
+        chair.put("tub chair", **values)
+        return
+    chair.put("chair", gap=room.rng.uniform(0, 0.12), **values)
+    chair.put(("chair legs", "chair star", "chair sledge")[design], **values)
+    chair.put("chair posts", **values)
+    if room.chance(0.4):
+        chair.put("chair arms", **values)
 
 
 def add_chair(room: Room) -> None:
@@ -20,70 +47,17 @@ def add_chair(room: Room) -> None:
     _build_chair(room, frame.at(0, 0, yaw=room.rng.uniform(0, 2 * np.pi)))
 
 
-def add_chair_at(room: Room, frame: Frame) -> None:
+def _add_chair_at(room: Room, frame: Frame) -> None:
     """Add a chair at a place unless it is occupied."""
     area = Rectangle.around(Frame(frame.x, frame.y), (-0.24, 0.24), (-0.24, 0.24))
     if room.plan.claim(area, margin=0.2):
         _build_chair(room, frame)
 
 
-def _build_chair(room: Room, frame: Frame) -> None:
-    """Build a chair: four legs, star base, sledge, or tub; with or without armrests."""
-    rng = room.rng
-    chair = room.item("chair", frame)
-    design = room.pick((0.35, 0.3, 0.15, 0.2))
-    cover = room.palette.material()
-    frame_material = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
-    wide, seat = rng.uniform(0.44, 0.56), rng.uniform(0.42, 0.5)
-    back = rng.uniform(0.4, 0.6)
-    thick = rng.uniform(0.05, 0.11)
-    if design == 3:
-        chair.cylinder(cover, (0, 0, seat / 2), (wide + 0.1, wide + 0.1, seat))
-        chair.box(cover, (0, wide / 2, seat), (wide + 0.15, 0.14, seat + 0.35))
-        for side in (-1, 1):
-            chair.box(cover, (side * wide / 2, 0.03, seat * 0.75), (0.12, wide, seat + 0.15))
-        return
-    chair.box(cover, (0, 0, seat), (wide, wide, thick))
-    gap = rng.uniform(0, 0.12)
-    chair.box(cover, (0, wide / 2 - 0.02, seat + gap + back / 2), (wide * 0.95, 0.06, back))
-    _add_base(chair, frame_material, design, wide, seat)
-    for side in (-1, 1):
-        x = side * (wide / 2 - 0.03)
-        chair.box(frame_material, (x, wide / 2 - 0.02, seat + 0.1), (0.04, 0.04, 0.25))
-    if room.chance(0.4):
-        for side in (-1, 1):
-            x = side * (wide / 2 + 0.02)
-            chair.box(frame_material, (x, 0, seat + 0.22), (0.06, wide * 0.8, 0.04))
-            chair.box(frame_material, (x, -0.1, seat + 0.1), (0.04, 0.04, 0.24))
-
-
-def _add_legs(
-    item: RoomItem, material: Material, spread: tuple[float, float], height: float, thick: float
-) -> None:
-    """Add four upright legs from the floor, ``±spread`` meters from the middle."""
-    for x in (-spread[0], spread[0]):
-        for y in (-spread[1], spread[1]):
-            item.box(material, (x, y, height / 2), (thick, thick, height))
-
-
-def _add_base(chair: RoomItem, material: Material, design: int, wide: float, seat: float) -> None:
-    spread = wide / 2 - 0.03
-    if design == 0:
-        _add_legs(chair, material, (spread, spread), seat, 0.045)
-    elif design == 1:
-        chair.cylinder(material, (0, 0, seat / 2 + 0.03), (0.08, 0.08, seat - 0.06))
-        for k in range(3):
-            chair.box(material, (0, 0, 0.06), (wide + 0.12, 0.06, 0.06), yaw=k * np.pi / 3)
-    else:
-        for side in (-1, 1):
-            chair.box(material, (side * spread, 0, 0.02), (0.045, wide, 0.04))
-            chair.box(material, (side * spread, -spread, seat / 2), (0.045, 0.045, seat))
-
-
 def add_sofa(room: Room) -> None:
     """Add a sofa at a wall or in the open: with arms, a bench, round arms, or around a corner."""
-    rng = room.rng
-    design = room.pick((0.45, 0.15, 0.2, 0.2))
+    rng, material = room.rng, room.palette.material
+    design = room.pick(0.45, 0.15, 0.2, 0.2)
     wide, deep = rng.uniform(1.5, 2.4), rng.uniform(0.8, 1.0)
     reach = deep + (0.7 if design == 3 else 0.0)
     try:
@@ -93,46 +67,33 @@ def add_sofa(room: Room) -> None:
         frame = room.plan.in_the_open(rng, wide, deep)
         frame = frame.at(0, 0, yaw=np.pi * room.count(0, 1))
     sofa = room.item("sofa", frame)
-    cover = room.palette.material(Pattern.PLAIN, Pattern.SPECKLE, Pattern.STRIPES)
-    cushion = cover if room.chance(0.6) else room.palette.material(Pattern.PLAIN, Pattern.SPECKLE)
-    seat = rng.uniform(0.36, 0.46)
-    sofa.box(cover, (0, 0, seat / 2 + 0.03), (wide, deep, seat - 0.06))
+    cover = material(Pattern.PLAIN, Pattern.SPECKLE, Pattern.STRIPES)
+    cushion = cover if room.chance(0.6) else material(Pattern.PLAIN, Pattern.SPECKLE)
+    values: dict[str, Any] = {"cover": cover, "cushion": cushion, "wide": wide, "deep": deep}
+    values["seat"] = rng.uniform(0.36, 0.46)
+    sofa.put("sofa", **values)
     if design == 3:
-        sofa.box(cover, (wide / 2 - 0.4, -deep / 2 - 0.33, seat / 2 + 0.05), (0.8, 0.7, seat))
-    back = rng.uniform(0.4, 0.52)
-    sofa.box(cover, (0, deep / 2 - 0.11, seat + back / 2), (wide, 0.22, back))
-    arm = _add_arms(room, sofa, cover, design, (wide, deep, seat))
+        sofa.put("sofa corner", **values)
+    sofa.put("sofa back", back=rng.uniform(0.4, 0.52), **values)
+    arm = 0.0 if design == 1 else rng.uniform(0.14, 0.24)
+    for side in ((-1, 1), (), (-1, 1), (-1,))[design]:
+        values |= {"arm": arm, "x": side * (wide / 2 - arm / 2)}
+        if design == 2:
+            sofa.put("sofa round arm", **values)
+        sofa.put("sofa arm", **values)
     seats = max(1, round((wide - 2 * arm) / 0.7))
     pitch = (wide - 2 * arm) / seats
     for k in range(seats):
-        x = (k + 0.5 - seats / 2) * pitch
-        sofa.box(cushion, (x, -0.1, seat + 0.06), (pitch - 0.02, deep - 0.24, 0.12))
+        values |= {"pitch": pitch, "x": (k + 0.5 - seats / 2) * pitch}
+        sofa.put("sofa seat", **values)
         if room.chance(0.7):
-            sofa.box(cushion, (x, deep / 2 - 0.26, seat + 0.3), (pitch - 0.06, 0.12, 0.36))
-
-
-def _add_arms(
-    room: Room, sofa: RoomItem, cover: Material, design: int, size: tuple[float, float, float]
-) -> float:
-    """Add the arms of a sofa; returns the width of one."""
-    wide, deep, seat = size
-    if design == 1:
-        return 0.0
-    arm = room.rng.uniform(0.14, 0.24)
-    for side in (-1, 1):
-        if design == 3 and side == 1:
-            continue
-        x = side * (wide / 2 - arm / 2)
-        if design == 2:
-            sofa.ball(cover, (x, 0, seat + 0.12), (arm * 1.3, deep, 0.3))
-        sofa.box(cover, (x, 0, seat / 2 + 0.12), (arm, deep, seat + 0.18))
-    return arm
+            sofa.put("sofa cushion", **values)
 
 
 def add_table(room: Room) -> None:
     """Add a table in the open: four legs, round, panel ends, or a trestle; with chairs around."""
     rng = room.rng
-    design = room.pick((0.4, 0.2, 0.25, 0.15))
+    design = room.pick(0.4, 0.2, 0.25, 0.15)
     wide, deep = rng.uniform(1.2, 2.4), rng.uniform(0.75, 1.2)
     if design == 1:
         wide = deep = rng.uniform(1.0, 1.5)
@@ -147,7 +108,7 @@ def add_table(room: Room) -> None:
             if room.chance(0.7):
                 away = side * (deep / 2 + rng.uniform(0.27, 0.4))
                 heading = (0 if side > 0 else np.pi) + rng.normal(0, 0.25)
-                add_chair_at(room, frame.at(float(x), away, yaw=heading))
+                _add_chair_at(room, frame.at(float(x), away, yaw=heading))
 
 
 def add_desk(room: Room) -> None:
@@ -158,148 +119,263 @@ def add_desk(room: Room) -> None:
     _build_table(room, frame.at(0, deep / 2 + 0.02), 0 if room.chance(0.5) else 2, wide, deep)
     if room.chance(0.8):
         heading = rng.normal(0, 0.4)
-        add_chair_at(room, frame.at(rng.uniform(-0.2, 0.2), deep + 0.33, yaw=heading))
+        _add_chair_at(room, frame.at(rng.uniform(-0.2, 0.2), deep + 0.33, yaw=heading))
 
 
 def _build_table(room: Room, frame: Frame, design: int, wide: float, deep: float) -> None:
-    rng = room.rng
-    high = rng.uniform(0.68, 0.78)
+    """Build one of the designs of `add_table`, with up to four items of clutter on it."""
+    rng, high = room.rng, room.rng.uniform(0.68, 0.78)
     table = room.item("table", frame)
     top = room.palette.material()
     base = room.palette.material() if room.chance(0.5) else top
-    if design == 1:
-        table.cylinder(top, (0, 0, high), (wide, deep, 0.05))
-        table.cylinder(base, (0, 0, high / 2), (0.14, 0.14, high))
-        table.cylinder(base, (0, 0, 0.03), (0.65, 0.65, 0.06))
-    else:
-        table.box(top, (0, 0, high), (wide, deep, 0.05))
+    values: dict[str, Any] = {"top": top, "base": base, "wide": wide, "deep": deep, "high": high}
+    table.put("round table" if design == 1 else "table top", **values)
     if design == 0:
-        thick = rng.uniform(0.05, 0.1)
-        _add_legs(table, base, (wide / 2 - 0.06, deep / 2 - 0.06), high, thick)
-        table.box(base, (0, 0, high - 0.07), (wide - 0.15, deep - 0.15, 0.1))
+        table.put("table legs", thick=rng.uniform(0.05, 0.1), **values)
     elif design == 2:
-        for side in (-1, 1):
-            table.box(base, (side * (wide / 2 - 0.05), 0, high / 2), (0.05, deep * 0.92, high))
-        table.box(base, (0, deep * 0.3, high * 0.6), (wide * 0.92, 0.03, high * 0.6))
         drawers = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
-        table.box(drawers, (wide * 0.3, 0, high * 0.45), (wide * 0.28, deep * 0.8, high * 0.75))
+        table.put("table panels", drawers=drawers, **values)
     elif design == 3:
-        for side in (-1, 1):
-            x = side * wide * 0.36
-            table.box(base, (x, 0, high / 2), (0.09, 0.09, high))
-            table.box(base, (x, 0, 0.03), (0.09, deep * 0.85, 0.06))
-            table.box(base, (x, 0, high - 0.05), (0.09, deep * 0.85, 0.06))
-        table.box(base, (0, 0, high * 0.35), (wide * 0.72, 0.05, 0.1))
-    add_desk_things(room, frame, (wide, deep, high + 0.025))
+        table.put("table trestle", **values)
+    number = room.count(0, 4)
+    for k in range(number):
+        x = wide * 0.8 * ((k + 0.5) / number - 0.5)
+        y = deep * rng.uniform(-0.2, 0.2)
+        place = frame.at(x, y, high + 0.025, yaw=rng.normal(0, 0.4))
+        _build_desk_item(room, _add_clutter(room, place))
 
 
-_BOARD = 0.035
+def _add_clutter(room: Room, frame: Frame) -> RoomItem:
+    return room.item(UNKNOWN_CLASS if room.chance(_UNLABELED) else "clutter", frame)
+
+
+def _build_desk_item(room: Room, item: RoomItem) -> None:
+    """Build a monitor, a pile of books, a vase, a box, or a desk lamp."""
+    rng, draw = room.rng, room.palette.material
+    material = draw()
+    kind = room.pick(0.4, 0.2, 0.15, 0.15, 0.1)
+    if kind == 0:
+        wide, high = rng.uniform(0.45, 0.65), rng.uniform(0.32, 0.42)
+        values = {"material": material, "plastic": draw(Pattern.PLAIN), "wide": wide, "high": high}
+        item.put("monitor", z=0.12 + high / 2, **values)
+    elif kind == 1:
+        for k in range(room.count(3, 6)):
+            cover, yaw = draw(Pattern.PLAIN), rng.uniform(-0.4, 0.4)
+            item.box(cover, (0, 0, 0.025 + 0.05 * k), (0.32, 0.24, 0.05), yaw)
+    elif kind == 2:
+        item.put("vase", material=material, flowers=draw(Pattern.SPECKLE))
+    elif kind == 3:
+        high, wide, deep = rng.uniform((0.18, 0.2, 0.2), (0.36, 0.42, 0.34))
+        item.put("carton", material=material, wide=wide, deep=deep, high=high)
+    else:
+        item.put("desk lamp", material=material, shade=draw(Pattern.PLAIN))
+
+
+def add_floor_clutter(room: Room) -> None:
+    """Add boxes, a plant, a bin, a cabinet, a standing lamp, or a ball."""
+    rng, draw = room.rng, room.palette.material
+    size = rng.uniform(0.4, 0.65)
+    if room.chance(0.6):
+        frame = room.plan.against_wall(rng, size + 0.1, size, "low").at(0, size / 2 + 0.02)
+    else:
+        frame = room.plan.in_the_open(rng, size, size)
+    kind = room.pick(0.25, 0.2, 0.1, 0.25, 0.1, 0.1)
+    item = _add_clutter(room, frame)
+    if kind == 0:
+        for k in range(room.count(1, 3)):
+            side, yaw = size * (0.95 - 0.15 * k), rng.normal(0, 0.08)
+            center = (0, 0, size * (0.35 + 0.7 * k))
+            item.box(draw(), center, (side, side, size * 0.7), yaw)
+        return
+    values: dict[str, Any] = {"material": draw(), "size": size}
+    if kind == 1:
+        item.put("pot", **values)
+        leaves = draw(Pattern.SPECKLE, frequency=(3, 8))
+        for z, wide in ((0.6, 0.85), (0.95, 1.0), (1.25, 0.75)):
+            x, y = rng.uniform(-0.05, 0.05, 2)
+            item.ball(leaves, (x, y, z), (size * wide, size * wide, 0.5))
+    elif kind == 3:
+        item.put("cabinet", high=rng.uniform(0.6, 1.25), **values)
+    elif kind == 4:
+        item.put("standing lamp", shade=draw(Pattern.PLAIN), **values)
+    else:
+        item.put("bin" if kind == 2 else "ball", **values)
+
+
+def add_wall_clutter(room: Room) -> None:
+    """Hang an item on a wall: a picture, a screen, a wall cupboard, or a clock."""
+    rng = room.rng
+    wide, high = rng.uniform(0.5, 1.3), rng.uniform(0.45, 0.9)
+    key = ("picture", "screen", "wall cupboard", "clock")[room.pick(0.4, 0.25, 0.2, 0.15)]
+    frame = room.plan.against_wall(rng, wide, 0, "high")
+    z = min(rng.uniform(1.45, 1.75), room.plan.height - high / 2 - 0.1)
+    item = _add_clutter(room, frame)
+    face, trim = room.palette.material(), room.palette.material(Pattern.PLAIN)
+    item.put(key, face=face, trim=trim, wide=wide, high=high, z=z)
 
 
 def add_board(room: Room) -> None:
     """Add a board: white, black or colored with writing, or a pin board with papers."""
-    rng = room.rng
+    rng, palette = room.rng, room.palette
     wide, high = rng.uniform(1.5, 3.2), rng.uniform(1.05, 1.45)
     bottom = min(rng.uniform(0.75, 0.95), room.plan.height - high - 0.15)
     frame = room.plan.against_wall(rng, wide + 0.1, 0, "high")
-    design = room.pick((0.45, 0.2, 0.2, 0.15))
+    design = room.pick(0.45, 0.2, 0.2, 0.15)
     color = (
-        room.palette.hsv((0, 1), (0, 0.04), (0.85, 1.0)),
-        room.palette.hsv((0.3, 0.5), (0, 0.45), (0.15, 0.35)),
-        room.palette.color(),
-        room.palette.hsv((0.06, 0.12), (0.3, 0.6), (0.5, 0.8)),
+        palette.hsv((0, 1), (0, 0.04), (0.85, 1.0)),
+        palette.hsv((0.3, 0.5), (0, 0.45), (0.15, 0.35)),
+        palette.color(),
+        palette.hsv((0.06, 0.12), (0.3, 0.6), (0.5, 0.8)),
     )[design]
     pattern = Pattern.PAPERS if design == 3 else Pattern.STROKES
-    dark = color.mean() < 0.5
-    value = (0.8, 1.0) if dark or design == 3 else (0.1, 0.4)
-    writing = room.palette.hsv((0, 1), (0.1, 0.8), value)
-    face = room.palette.material(pattern, color=color, second=writing, frequency=(2.5, 5))
-    trim = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
+    value = (0.8, 1.0) if color.mean() < 0.5 or design == 3 else (0.1, 0.4)
+    writing = palette.hsv((0, 1), (0.1, 0.8), value)
+    values: dict[str, Any] = {
+        "face": palette.material(pattern, color=color, second=writing, frequency=(2.5, 5)),
+        "trim": palette.material(Pattern.PLAIN, Pattern.WOOD),
+        "wide": wide,
+        "high": high,
+        "bottom": bottom,
+        "middle": bottom + high / 2,
+    }
     board = room.item("board", frame)
-    middle = bottom + high / 2
-    board.box(face, (0, 0.015, middle), (wide, 0.03, high))
-    for side in (-1, 1):
-        board.box(trim, (side * wide / 2, 0.02, middle), (0.05, 0.045, high + 0.05))
-        board.box(trim, (0, 0.02, middle + side * high / 2), (wide, 0.045, 0.05))
+    board.put("board", **values)
     if design < 3:
-        board.box(trim, (0, 0.06, bottom), (wide * 0.7, 0.1, 0.025))
-    if room.chance(0.35):  # a second panel slid aside, as in lecture rooms
-        board.box(face, (wide * 0.22, 0.04, middle), (wide * 0.5, 0.02, high * 0.9))
+        board.put("board tray", **values)
+    if room.chance(0.35):  # a second panel slid aside, common in lecture rooms
+        board.put("board panel", **values)
 
 
 def add_bookcase(room: Room) -> None:
     """Add a bookcase: open, with doors below, a low shelf, or a metal rack."""
     rng = room.rng
-    design = room.pick((0.45, 0.25, 0.15, 0.15))
+    design = room.pick(0.45, 0.25, 0.15, 0.15)
     wide, deep = rng.uniform(1.0, 2.4), rng.uniform(0.3, 0.45)
     high = rng.uniform(1.0, 1.3) if design == 2 else rng.uniform(1.7, 2.3)
     high = min(high, room.plan.height - 0.3)
-    frame = room.plan.against_wall(rng, wide, deep, "full")
-    case = room.item("bookcase", frame)
-    body = room.palette.material()
+    case = room.item("bookcase", room.plan.against_wall(rng, wide, deep, "full"))
     columns = 1 + int(wide > 1.3) + int(wide > 2.0)
-    bottom = high * 0.35 if design == 1 else 0.04
+    values: dict[str, Any] = {"body": room.palette.material(), "wide": wide, "deep": deep}
+    values |= {"high": high, "bottom": high * 0.35 if design == 1 else 0.04}
     if design == 3:
-        for x in (-wide / 2 + 0.03, wide / 2 - 0.03):
-            for y in (0.03, deep - 0.03):
-                case.box(body, (x, y, high / 2), (0.05, 0.05, high))
+        case.put("bookcase posts", **values)
     else:
-        case.box(body.shaded(0.75), (0, 0.01, high / 2), (wide, 0.02, high))
+        case.put("bookcase back", **values)
         for k in range(columns + 1):
-            x = (wide - _BOARD) * (k / columns - 0.5)
-            case.box(body, (x, deep / 2, high / 2), (_BOARD, deep, high))
+            case.put("bookcase side", x=(wide - _BOARD) * (k / columns - 0.5), **values)
     if design == 1:
-        _add_cupboard(room, case, body, wide, deep, bottom, columns)
-    _add_shelves(room, case, body, (wide, deep, high), bottom, columns)
+        front = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
+        for k in range(columns):
+            x = wide * ((k + 0.5) / columns - 0.5)
+            case.put("cupboard door", front=front, x=x, door=wide / columns, **values)
+    _add_shelves(room, case, values, columns)
 
 
-def _add_cupboard(
-    room: Room, case: RoomItem, body: Material, wide: float, deep: float, high: float, doors: int
-) -> None:
-    front = room.palette.material(Pattern.PLAIN, Pattern.WOOD)
-    for k in range(doors):
-        x = wide * ((k + 0.5) / doors - 0.5)
-        case.box(front, (x, deep / 2, high / 2), (wide / doors - 0.04, deep + 0.03, high - 0.06))
-        case.box(body.shaded(0.4), (x, deep + 0.03, high * 0.8), (0.1, 0.02, 0.02))
-
-
-def _add_shelves(
-    room: Room,
-    case: RoomItem,
-    body: Material,
-    size: tuple[float, float, float],
-    bottom: float,
-    columns: int,
-) -> None:
+def _add_shelves(room: Room, case: RoomItem, values: dict[str, Any], columns: int) -> None:
     """Add shelves with rows of books or boxes, which belong to the bookcase."""
-    wide, deep, high = size
+    wide, deep, high, bottom = (values[name] for name in ("wide", "deep", "high", "bottom"))
     shelves = max(2, round((high - bottom) / room.rng.uniform(0.32, 0.42)))
     pitch = (high - bottom - _BOARD) / shelves
     for k in range(shelves + 1):
-        case.box(body, (0, deep / 2, bottom + _BOARD / 2 + k * pitch), (wide, deep, _BOARD))
+        case.put("bookcase shelf", z=bottom + _BOARD / 2 + k * pitch, **values)
     for k in range(shelves):
         for column in range(columns):
             if room.chance(0.85):
-                start = wide * (column / columns - 0.5) + _BOARD
-                z = bottom + _BOARD + k * pitch
-                _add_row(room, case, start, wide / columns - 2 * _BOARD, deep, z, pitch - _BOARD)
+                start = Frame(
+                    wide * (column / columns - 0.5) + _BOARD, 0, bottom + _BOARD + k * pitch
+                )
+                size = (wide / columns - 2 * _BOARD, deep, pitch - _BOARD)
+                _add_row(room, case, start, size)
 
 
-def _add_row(
-    room: Room, case: RoomItem, start: float, wide: float, deep: float, z: float, room_above: float
-) -> None:
-    rng = room.rng
+def _add_row(room: Room, case: RoomItem, start: Frame, size: tuple[float, float, float]) -> None:
+    """Fill a compartment of a bookcase with a box or with books."""
+    rng, (wide, deep, space) = room.rng, size
     if room.chance(0.2):
-        high = room_above * rng.uniform(0.5, 0.8)
-        x = start + wide * rng.uniform(0.35, 0.65)
-        material = room.palette.material()
-        case.box(material, (x, deep / 2, z + high / 2), (wide * 0.55, deep * 0.7, high))
+        high = space * rng.uniform(0.5, 0.8)
+        center = (start.x + wide * rng.uniform(0.35, 0.65), deep / 2, start.z + high / 2)
+        case.box(room.palette.material(), center, (wide * 0.55, deep * 0.7, high))
         return
     books = room.palette.material(Pattern.BOOKS, frequency=(14, 28))
-    place = start
-    while place < start + wide * 0.55:
-        stretch = min(wide * rng.uniform(0.3, 0.6), start + wide - place)
-        high = room_above * rng.uniform(0.6, 0.95)
-        size = (stretch, deep * rng.uniform(0.55, 0.8), high)
-        case.box(books, (place + stretch / 2, deep * 0.45, z + high / 2), size)
+    place, end = start.x, start.x + wide
+    while place < start.x + wide * 0.55:
+        stretch = min(wide * rng.uniform(0.3, 0.6), end - place)
+        high = space * rng.uniform(0.6, 0.95)
+        center = (place + stretch / 2, deep * 0.45, start.z + high / 2)
+        case.box(books, center, (stretch, deep * rng.uniform(0.55, 0.8), high))
         place += stretch
+
+
+class RoomType(NamedTuple):
+    """Share of rooms, and limits of the long and the short side in meters."""
+
+    share: float
+    long: tuple[float, float]
+    short: tuple[float, float]
+
+
+ROOM_TYPES = {
+    "office": RoomType(0.36, (4.0, 6.0), (3.4, 5.0)),
+    "hallway": RoomType(0.1, (6.0, 8.5), (2.7, 3.4)),
+    "conferenceRoom": RoomType(0.12, (5.0, 7.0), (4.0, 5.5)),
+    "lounge": RoomType(0.09, (4.5, 6.5), (4.0, 5.5)),
+    "storage": RoomType(0.06, (3.6, 5.0), (3.2, 4.2)),
+    "WC": RoomType(0.04, (3.4, 4.6), (3.0, 3.8)),
+    "copyRoom": RoomType(0.05, (3.8, 5.0), (3.2, 4.4)),
+    "lobby": RoomType(0.06, (5.5, 7.5), (4.5, 6.0)),
+    "pantry": RoomType(0.05, (3.8, 5.2), (3.2, 4.4)),
+    "openspace": RoomType(0.04, (6.0, 8.0), (5.0, 6.5)),
+    "auditorium": RoomType(0.03, (6.5, 8.5), (5.5, 7.0)),
+}
+"""Room types of Stanford2D3DS."""
+
+_PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
+    (structure.add_column, 0.75, 1, 2),
+    (structure.add_door, 1.0, 1, 2),
+    (add_bookcase, 0.85, 1, 2),
+    (add_board, 0.9, 1, 2),
+    (structure.add_window, 0.95, 1, 2),
+    (add_sofa, 0.85, 1, 2),
+    (structure.add_beams, 0.75, 1, 1),
+    (structure.add_lamp, 1.0, 1, 2),
+    (add_table, 0.95, 1, 2),
+    (add_desk, 0.75, 1, 2),
+    (add_chair, 0.8, 1, 3),
+    (add_floor_clutter, 1.0, 2, 5),
+    (add_wall_clutter, 0.9, 1, 3),
+)
+"""Furniture in order of placement: function, share of rooms, smallest and largest number."""
+
+
+def draw_room_type(rng: np.random.Generator) -> str:
+    """Draw one of `ROOM_TYPES`."""
+    shares = np.array([kind.share for kind in ROOM_TYPES.values()])
+    return list(ROOM_TYPES)[rng.choice(len(shares), p=shares / shares.sum())]
+
+
+def build_empty_room(rng: np.random.Generator, plan: FloorPlan) -> Room:
+    """Build floor, ceiling and walls."""
+    room = Room(rng, plan, Palette(rng))
+    structure.add_shell(room)
+    return room
+
+
+def build_room(rng: np.random.Generator, room_type: str) -> Room:
+    """Build a furnished room.
+
+    Args:
+        rng: The room's source of randomness.
+        room_type: One of `ROOM_TYPES`.
+    """
+    limits = ROOM_TYPES[room_type]
+    long, short, notch = rng.uniform(*limits.long), rng.uniform(*limits.short), None
+    size = (long, short, rng.uniform(*_HEIGHTS))
+    if rng.random() < _L_SHAPED and short >= 3.2:
+        notch = (long * rng.uniform(0.25, 0.5), short * rng.uniform(0.25, 0.45))
+    room = build_empty_room(rng, FloorPlan(size, notch))
+    for add, share, least, most in _PROGRAM:
+        if room.chance(share):
+            for _ in range(room.count(least, most)):
+                with suppress(NoPlaceError):
+                    add(room)
+    return room

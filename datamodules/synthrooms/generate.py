@@ -1,35 +1,70 @@
-"""Generating a data set: rooms in parallel, each file written atomically; resumable."""
+"""Generating a data set in Stanford2D3DS's format: rooms in parallel, resumable.
+
+Every picture is four files in ``area_<a>/<pano|data>/<kind>/``, named
+``camera_<uuid>_<room>_frame_<frame>_domain_<kind>.<png|json>``. A panorama's frame is
+``equirectangular``, a perspective view's is its number.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.core.made_folders import claim_folder
 from datamodules.core.processes import in_processes
-from datamodules.stanford2d3ds.files import AREAS
-from datamodules.synthrooms import writer
-from datamodules.synthrooms.camera import PanoramaRays, PictureRays, Pose, ViewKind, draw_rays
-from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
-from datamodules.synthrooms.scene import draw_room_type, furnish
+from datamodules.stanford2d3ds.files import (
+    AREAS,
+    CLASSES,
+    MISSING_DEPTH,
+    MISSING_LABEL,
+    UNKNOWN_CLASS,
+)
+from datamodules.synthrooms.camera import (
+    PanoramaRays,
+    PerspectiveRays,
+    PictureRays,
+    Pose,
+    ViewKind,
+    draw_rays,
+    euler_angles,
+)
+from datamodules.synthrooms.furniture import build_room, draw_room_type
+from datamodules.synthrooms.render import (
+    MISSING,
+    Camera,
+    Picture,
+    RayScene,
+    draw_camera,
+    draw_holes,
+    render_picture,
+)
 from tangent_train.errors import SettingError, at_least
 from tangent_train.files import write_bytes, write_text
+from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
 
-MANIFEST = "synthrooms.json"
-"""File that marks a folder as SynthRooms and holds its settings."""
+INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
+"""Number of entries per room and class in the label table, used or not.
 
-_VERSION = 1
-"""Version of the generator; other versions render other pictures from the same settings."""
+So the indices of a room do not depend on other rooms. Further instances share the last entry.
+"""
 
-_LEAST = {"height": 8, "view_size": 8, "supersample": 1, "least_cameras": 1}
+PANORAMA = "equirectangular"
+"""Frame of panoramas in file names and poses."""
+
+_VERSION = 1  # other versions render other pictures from the same settings
+_LEAST = {"seed": 0, "height": 8, "views_per_camera": 0, "view_size": 8, "supersample": 1}
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # shares of rooms with one, two and three cameras
+_DEPTH_UNITS = 512  # per meter
+_NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
 
 
 @dataclass(frozen=True)
@@ -75,10 +110,8 @@ class RoomSettings:
         object.__setattr__(self, "rooms", {area: rooms[area] for area in AREAS if area in rooms})
         if self.views not in get_args(ViewKind):
             raise SettingError("views", found=self.views, expected=get_args(ViewKind))
-        numbers = {f"rooms[{area}]": count for area, count in rooms.items()}
-        names = ("seed", "views_per_camera", *_LEAST)
-        for name, value in {**numbers, **{name: getattr(self, name) for name in names}}.items():
-            at_least(name, value, _LEAST.get(name, 0))
+        for name, least in _LEAST.items():
+            at_least(name, getattr(self, name), least)
 
     @property
     def areas(self) -> list[str]:
@@ -86,20 +119,39 @@ class RoomSettings:
         return [area for area, count in self.rooms.items() if count]
 
 
-def plan_rooms(settings: RoomSettings) -> list[writer.RoomPlan]:
+class RoomPlan(NamedTuple):
+    """A planned room.
+
+    Attributes:
+        area: ``"1"`` to ``"6"``, with ``"5a"`` and ``"5b"``.
+        name: Room type and number from 1, e.g. ``office_7``; numbers are unique in an area, and 5a
+            and 5b count as one area, as in the real set.
+        order: Index of the room in the label table, from 0.
+        cameras: Identifier of each of its panoramas, 32 hexadecimal digits.
+        rng: Random generator of the room.
+    """
+
+    area: str
+    name: str
+    order: int
+    cameras: Sequence[str]
+    rng: np.random.Generator
+
+
+def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
     """Return all rooms of a data set, in the order of the label table."""
-    plans: list[writer.RoomPlan] = []
+    plans: list[RoomPlan] = []
     numbers = {area[0]: 0 for area in AREAS}
     for area in (area for area, count in settings.rooms.items() for _ in range(count)):
         number = numbers[area[0]] = numbers[area[0]] + 1
         rng = np.random.default_rng((settings.seed, AREAS.index(area), number))
-        kind = draw_room_type(rng)
+        name = f"{draw_room_type(rng)}_{number}"
         drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
-        cameras = tuple(
-            writer.camera_identifier(settings.seed, area, f"{kind}_{number}", k)
+        cameras = [
+            uuid.uuid5(_NAMESPACE, f"{settings.seed}/{area}/{name}/{k}").hex
             for k in range(max(settings.least_cameras, drawn))
-        )
-        plans.append(writer.RoomPlan(area, kind, number, len(plans), cameras, rng))
+        ]
+        plans.append(RoomPlan(area, name, len(plans), cameras, rng))
     return plans
 
 
@@ -115,47 +167,137 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
         workers: Number of processes, by default one per CPU core; 0 and 1 mean this process.
 
     Raises:
-        DataError: The folder holds other files, or rooms of other settings; nothing is written.
+        SettingError: The folder holds other files, or rooms of other settings.
     """
-    claim_folder(root, MANIFEST, "SynthRooms", _VERSION, asdict(settings))
-    plans = plan_rooms(settings)
-    labels = root / "semantic_labels.json"
-    if not labels.exists():
-        write_text(labels, json.dumps(writer.label_strings(plans)))
-    frames = (writer.PANORAMA, *map(str, range(settings.views_per_camera)))
-    unfinished = [
-        plan for plan in plans if not all((root / file).exists() for file in plan.files(frames))
-    ]
-    making = in_processes(make_room, [(root, settings, plan) for plan in unfinished], workers)
-    before = len(plans) - len(unfinished)
-    show_progress(making, "Rendering rooms", "rooms", len(plans), before)
+    about = {"generator": "SynthRooms", "version": _VERSION}
+    manifest = Manifest.open(root, about | asdict(settings))
+    plans = {f"area_{plan.area}/{plan.name}": plan for plan in plan_rooms(settings)}
+    missing = manifest.missing(plans)
+    if missing:
+        write_text(root / "semantic_labels.json", json.dumps(label_strings([*plans.values()])))
+
+    def rooms() -> Iterator[None]:
+        pieces = [(root, settings, plans[name], name) for name in missing]
+        for name in in_processes(make_room, pieces, workers):
+            manifest.finish(name)
+            yield
+
+    show_progress(rooms(), "Rendering rooms", "rooms", len(plans), len(plans) - len(missing))
 
 
-def make_room(root: Path, settings: RoomSettings, plan: writer.RoomPlan) -> None:
+def make_room(root: Path, settings: RoomSettings, plan: RoomPlan, name: str) -> str:
     """Furnish a room, render its pictures and write their files.
 
     Args:
         root: Folder of the data set.
         settings: Settings of the data set.
         plan: Plan of the room.
+        name: Name of the room in the manifest, which is returned.
     """
     rng = plan.rng
-    room = furnish(rng, plan.kind)
+    room = build_room(rng, plan.name.partition("_")[0])
     scene = RayScene(room)
     holes = draw_holes(rng, scene)
-    labels = writer.label_indices(plan, room.items)
+    labels = label_indices(plan, room.items)
     cameras: list[Camera] = []
     for identifier in plan.cameras:
         camera = draw_camera(rng, scene, room.plan, cameras)
         cameras.append(camera)
         original = Pose.looking(camera.location, camera.heading)
-        views: dict[str, PictureRays] = {writer.PANORAMA: PanoramaRays(original, settings.height)}
+        views: dict[str, PictureRays] = {PANORAMA: PanoramaRays(original, settings.height)}
         for k in range(settings.views_per_camera):
             views[str(k)] = draw_rays(rng, settings.views, camera.location, settings.view_size)
         for frame, view in views.items():
             picture = render_picture(scene, view, camera, holes, settings.supersample, rng)
-            files = writer.encode_picture(picture, labels)
-            pose = writer.pose_record(plan, identifier, frame, view, original)
-            files["pose"] = json.dumps(pose).encode() + b"\n"
-            for kind, content in files.items():
-                write_bytes(root / plan.file(identifier, frame, kind), content)
+            files = encode_picture(picture, labels)
+            pose = pose_record(plan, identifier, frame, view, original)
+            files["pose.json"] = json.dumps(pose).encode() + b"\n"
+            folder = root / f"area_{plan.area}" / ("pano" if frame == PANORAMA else "data")
+            for end, content in files.items():
+                file = f"camera_{identifier}_{plan.name}_frame_{frame}_domain_{end}"
+                write_bytes(folder / end.partition(".")[0] / file, content)
+    return name
+
+
+def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
+    """Return the label table: ``class_instance_roomtype_roomnumber_area``, unknown first."""
+    return [f"{UNKNOWN_CLASS}_0_{UNKNOWN_CLASS}_0_0"] + [
+        f"{name}_{instance}_{room.name}_{room.area[0]}"
+        for room in rooms
+        for name, count in INSTANCES.items()
+        for instance in range(1, count + 1)
+    ]
+
+
+def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
+    """Return index into the label table of every item of a room, ``(n,)``."""
+    first = 1 + room.order * sum(INSTANCES.values())
+    starts = dict(zip(INSTANCES, np.cumsum([first, *INSTANCES.values()]).tolist(), strict=False))
+    seen = dict.fromkeys(INSTANCES, 0)
+    indices = np.zeros(len(items), np.uint32)
+    for k, name in enumerate(items):
+        if name != UNKNOWN_CLASS:
+            indices[k] = starts[name] + min(seen[name], INSTANCES[name] - 1)
+            seen[name] += 1
+    return indices
+
+
+def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, bytes]:
+    """Encode a picture as PNG files.
+
+    Args:
+        picture: Rendered picture.
+        labels: Index into the label table of every item.
+
+    Returns:
+        File content of ``rgb.png`` (8 bit), ``depth.png`` (16 bit, 1/512 m, 65535 missing) and
+        ``semantic.png`` (24-bit index R·65536 + G·256 + B, #0D0D0D missing).
+    """
+    missing = picture.items == MISSING
+    index = np.where(missing, MISSING_LABEL, labels[picture.items])
+    blue_first = np.stack([index, index >> 8, index >> 16], axis=-1) & 0xFF
+    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=MISSING_DEPTH)
+    images: dict[str, NDArray[Any]] = {
+        "rgb.png": np.ascontiguousarray(picture.rgb[..., ::-1]),
+        "depth.png": np.clip(depth + 0.5, 0, MISSING_DEPTH).astype(np.uint16),
+        "semantic.png": blue_first.astype(np.uint8),
+    }
+    fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+    return {end: cv2.imencode(".png", image, fast)[1].tobytes() for end, image in images.items()}
+
+
+def pose_record(
+    room: RoomPlan, camera: str, frame: str, view: PictureRays, original: Pose
+) -> dict[str, Any]:
+    """Return the pose file of a picture, with all keys of the real set.
+
+    `datamodules.synthrooms.camera` states the formulas. The camera matrix counts from pixel corners
+    (the middle of n pixels is n/2), as in the real set. Also as there, a panorama has the field of
+    view (90°) and the camera matrix of one cube face.
+
+    Args:
+        room: Plan of the room.
+        camera: Identifier of one of its cameras.
+        frame: `PANORAMA`, or the number of a perspective view.
+        view: Camera of the picture.
+        original: Pose of the panorama of the same camera.
+    """
+    pose = view.pose
+    image = view
+    if not isinstance(image, PerspectiveRays):
+        image = PerspectiveRays(pose, image.height, math.pi / 2)
+    focal, center = image.size / (2 * math.tan(image.fov_rad / 2)), image.size / 2
+    rotation = pose.world_from_camera @ original.world_from_camera.T
+    return {
+        "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
+        "field_of_view_rads": image.fov_rad,
+        "camera_original_rotation": original.euler_angles.tolist(),
+        "rotation_from_original_to_point": euler_angles(rotation).tolist(),
+        "point_uuid": camera,
+        "camera_location": pose.location.tolist(),
+        "frame_num": frame,
+        "camera_rt_matrix": pose.rt_matrix.tolist(),
+        "final_camera_rotation": pose.euler_angles.tolist(),
+        "camera_uuid": camera,
+        "room": f"{room.name}_{room.area[0]}",
+    }

@@ -1,12 +1,20 @@
-"""Rooms under construction: items composed of boxes, cylinders and balls, with materials."""
+"""Rooms under construction: items composed of boxes, cylinders and balls, with materials.
+
+``parts.csv`` is the table of parts of all furniture. A position or size in it is a sum such as
+``0.5wide-0.03``, in meters and in values of the piece. `mirror` repeats rows at −x (``x``), or at
+−x and −y (``xy``). ``body:0.6`` is the material `body`, shaded by 0.6.
+"""
 
 from __future__ import annotations
 
+import csv
 import math
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass, field
-from functools import partialmethod
-from typing import NamedTuple
+from functools import cache, partialmethod
+from itertools import groupby
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +31,29 @@ _SHAPES = {
 }
 """Unit shapes: each fills the cube of side 1 around the origin; cylinder and prism are upright."""
 
+_SIGNS = {"": ((1, 1),), "x": ((-1, 1), (1, 1)), "xy": ((-1, -1), (-1, 1), (1, -1), (1, 1))}
+"""Signs of x and y by the column `mirror`."""
+
+_Row = dict[str, str]
 _Triple = tuple[float, float, float]
+
+
+@cache
+def _part_table() -> dict[str, list[tuple[str, list[_Row]]]]:
+    """Return the rows of ``parts.csv`` by key, as runs of rows that are mirrored together."""
+    with Path(__file__).with_name("parts.csv").open(encoding="utf-8", newline="") as file:
+        keys = groupby(csv.DictReader(file), key=lambda row: row["key"])
+        return {
+            key: [(mirror, list(run)) for mirror, run in groupby(rows, lambda row: row["mirror"])]
+            for key, rows in keys
+        }
+
+
+@cache
+def _terms(text: str) -> list[tuple[float, str]]:
+    """Return factor and name of each term of a sum, e.g. ``[(0.5, "wide"), (-0.03, "")]``."""
+    found = re.findall(r"([+-]?)([\d.]*)([a-z]*)", text)[:-1]  # the last match is empty
+    return [(float(f"{sign}{factor or 1}"), name) for sign, factor, name in found]
 
 
 class RoomPart(NamedTuple):
@@ -85,10 +115,32 @@ class RoomItem:
     cylinder = partialmethod(add, "cylinder")
     ball = partialmethod(add, "ball")
 
+    def put(self, key: str, **values: Any) -> None:
+        """Add the parts of a key of ``parts.csv``.
+
+        Args:
+            key: Key of the rows.
+            **values: Sizes in meters and materials that the rows name.
+        """
+
+        def size(row: _Row, column: str) -> float:
+            terms = _terms(row[column])
+            return sum(factor * (values[name] if name else 1.0) for factor, name in terms)
+
+        for mirror, rows in _part_table()[key]:
+            for sign_x, sign_y in _SIGNS[mirror]:
+                for row in rows:
+                    name, _, shade = row["material"].partition(":")
+                    material = values[name].shaded(float(shade)) if shade else values[name]
+                    center = (sign_x * size(row, "x"), sign_y * size(row, "y"), size(row, "z"))
+                    extent = (size(row, "width"), size(row, "depth"), size(row, "height"))
+                    yaw = math.radians(float(row["degrees"] or 0))
+                    self.add(row["shape"], material, center, extent, yaw)
+
 
 @dataclass
 class Room:
-    """A room and everything in it.
+    """A room that is being furnished.
 
     Attributes:
         rng: Source of randomness.
@@ -117,9 +169,13 @@ class Room:
         """Return True with a probability."""
         return bool(self.rng.random() < probability)
 
-    def pick(self, shares: Sequence[float]) -> int:
+    def pick(self, *shares: float) -> int:
         """Draw an index with the given shares."""
         return int(self.rng.choice(len(shares), p=np.asarray(shares) / np.sum(shares)))
+
+    def sizes(self, **limits: tuple[float, float]) -> dict[str, Any]:
+        """Draw sizes uniformly between their limits, in order."""
+        return {name: self.rng.uniform(*between) for name, between in limits.items()}
 
     def count(self, least: int, most: int) -> int:
         """Draw an integer between two limits, inclusive."""

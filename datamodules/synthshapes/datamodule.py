@@ -6,11 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from datamodules.core.splits import DatasetIndex
-from datamodules.core.made_folders import require_generated
-from datamodules.core.problems import Problems
 from datamodules.modelnet40.datamodule import ModelNet40
-from datamodules.modelnet40.shape_files import ShapeFile
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 
 
@@ -40,8 +36,3 @@ class SynthShapes(ModelNet40):
         """Generate the files, unless they are there."""
         shapes: Any = self.shapes
         generate_shapes(self.root, shapes)
-
-    def find(self, problems: Problems) -> DatasetIndex[ShapeFile]:
-        """See `LabeledData`."""
-        require_generated(self.root)
-        return super().find(problems)

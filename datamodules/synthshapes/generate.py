@@ -1,44 +1,105 @@
-"""SynthShapes: ten families of shapes, generated in the tree of ModelNet40."""
+"""SynthShapes: ten classes of shapes made of simple parts, generated in the tree of ModelNet40.
+
+Like models in catalogs, the shapes are open, overlap, and have any scale and origin. They are built
+in meters, stand on z = 0 and face +x.
+"""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
-from trimesh import Trimesh
+from trimesh import Trimesh, creation, util
+from trimesh.convex import convex_hull
 from trimesh.exchange.off import export_off
+from trimesh.transformations import rotation_matrix
 
-from datamodules.core.made_folders import claim_folder
-from datamodules.core.processes import in_processes
-from datamodules.synthshapes import furniture, vessels
-from datamodules.synthshapes.parts import Parts
 from tangent_train.errors import at_least
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
+from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
 
-MANIFEST = "synthshapes.json"
-"""File that marks a folder as SynthShapes and holds its settings."""
+_VERSION = 3  # other versions make other shapes from the same settings
+_Range = tuple[float, float]
 
-_VERSION = 2
-_PER_PROCESS = 200
-_FAMILIES: dict[str, Callable[[Parts], None]] = {
-    "airplane": vessels.airplane,
-    "bench": furniture.bench,
-    "bottle": vessels.bottle,
-    "bowl": vessels.bowl,
-    "chair": furniture.chair,
-    "cup": vessels.cup,
-    "lamp": furniture.lamp,
-    "stool": furniture.stool,
-    "table": furniture.table,
-    "vase": vessels.vase,
+
+class _Seat(NamedTuple):
+    """Ranges of sizes in meters, and shares of shapes with a round top, a pedestal and others."""
+
+    width: _Range
+    depth: _Range
+    height: _Range
+    thick: _Range
+    round_top: float
+    pedestal: float
+    back: float = 0.0
+    back_height: _Range = (0.0, 0.0)
+    arms: float = 0.0
+
+
+class _Vessel(NamedTuple):
+    """Ranges of sizes of a surface of revolution.
+
+    Attributes:
+        height: In meters.
+        radius: Relative to the height.
+        outline: Ranges of height and radius of each point, relative to those of the vessel.
+        is_open: Share of vessels with a wall and an open top.
+        handle: Share of vessels with a handle.
+    """
+
+    height: _Range
+    radius: _Range
+    outline: Sequence[tuple[_Range, _Range]]
+    is_open: float
+    handle: float
+
+
+_SEATS = {
+    "bench": _Seat((0.8, 2), (0.3, 0.6), (0.3, 0.55), (0.03, 0.14), 0, 0, 0.5, (0.2, 0.55), 0.25),
+    "chair": _Seat(
+        (0.4, 0.65), (0.36, 0.6), (0.3, 0.55), (0.02, 0.1), 0.15, 0.25, 1, (0.2, 0.7), 0.4
+    ),
+    "stool": _Seat((0.26, 0.5), (0.24, 0.5), (0.35, 0.95), (0.02, 0.1), 0.6, 0.4, 0.2, (0.05, 0.2)),
+    "table": _Seat((0.5, 2), (0.4, 1.2), (0.35, 1), (0.02, 0.08), 0.35, 0.3),
 }
-
-CLASSES = tuple(_FAMILIES)
+_BOTTOM, _TOP = (0.0, 0.0), (1.0, 1.0)
+_VESSELS = {
+    "bottle": _Vessel(
+        (0.15, 0.4),
+        (0.12, 0.32),
+        [(_BOTTOM, (0.7, 1)), ((0.2, 0.3), (0.8, 1.1)), ((0.4, 0.7), _TOP), (_TOP, (0.2, 0.8))],
+        is_open=0,
+        handle=0.15,
+    ),
+    "bowl": _Vessel(
+        (0.05, 0.25),
+        (0.55, 2.8),
+        [(_BOTTOM, (0.2, 0.8)), ((0.2, 0.3), (0.6, 0.9)), ((0.6, 0.7), (0.9, 1)), (_TOP, _TOP)],
+        is_open=1,
+        handle=0.2,
+    ),
+    "cup": _Vessel(
+        (0.06, 0.15),
+        (0.28, 0.9),
+        [(_BOTTOM, (0.45, 1.05)), ((0.4, 0.6), (0.7, 1.2)), (_TOP, _TOP)],
+        is_open=1,
+        handle=0.55,
+    ),
+    "vase": _Vessel(
+        (0.12, 0.45),
+        (0.14, 0.45),
+        [(_BOTTOM, (0.4, 1)), ((0.25, 0.65), _TOP), ((0.75, 0.9), (0.25, 1)), (_TOP, (0.4, 1.5))],
+        is_open=0.5,
+        handle=0.2,
+    ),
+}
+CLASSES = tuple(sorted([*_SEATS, *_VESSELS, "airplane", "lamp"]))
 """Names of the classes, in alphabetical order."""
 
 
@@ -60,54 +121,41 @@ class ShapeSettings:
     test: int = 30
 
     def __post_init__(self) -> None:
-        at_least("data.shapes.seed", self.seed, 0)
-        at_least("data.shapes.train", self.train, 1)
-        at_least("data.shapes.test", self.test, 1)
+        for name, least in {"seed": 0, "train": 1, "test": 1}.items():
+            at_least(f"data.shapes.{name}", getattr(self, name), least)
 
 
-def plan_shapes(settings: ShapeSettings) -> dict[str, tuple[str, int]]:
-    """Return class and number of every shape by its file, test shapes last."""
-    parts = ["train"] * settings.train + ["test"] * settings.test
-    return {
-        f"{label}/{part}/{label}_{number:04d}.off": (label, number)
-        for label in CLASSES
-        for number, part in enumerate(parts, start=1)
-    }
-
-
-def generate_shapes(root: Path, settings: ShapeSettings, *, workers: int | None = None) -> None:
+def generate_shapes(root: Path, settings: ShapeSettings) -> None:
     """Write a data set in ModelNet40's tree; finished files are kept.
-
-    The same settings give the same bytes for any number of workers, whether or not the work was
-    interrupted.
 
     Args:
         root: Folder of the data set: new, empty, or generated with the same settings.
         settings: Settings of the generator.
-        workers: Number of processes, by default one per CPU core, fewer for little work; 0 and 1
-            mean this process.
 
     Raises:
-        DataError: The folder holds other files, or shapes of other settings; nothing is written.
+        SettingError: The folder holds other files, or shapes of other settings.
     """
-    plans = plan_shapes(settings)
-    claim_folder(root, MANIFEST, "SynthShapes", _VERSION, asdict(settings))
-    missing = [file for file in plans if not (root / file).exists()]
-    pieces = [(root / file, settings.seed, *plans[file]) for file in missing]
-    making = in_processes(_write, pieces, workers, _PER_PROCESS)
-    before = len(plans) - len(missing)
-    show_progress(making, "Generating shapes", "shapes", len(plans), before)
+    about = {"generator": "SynthShapes", "version": _VERSION}
+    manifest = Manifest.open(root, about | asdict(settings))
+    parts = ["train"] * settings.train + ["test"] * settings.test
+    shapes = {
+        f"{label}/{part}/{label}_{number:04d}.off": (label, number)
+        for label in CLASSES
+        for number, part in enumerate(parts, start=1)
+    }
+    missing = manifest.missing(shapes)
 
+    def write() -> Iterator[None]:
+        for file in missing:
+            write_text(root / file, export_off(make_shape(settings.seed, *shapes[file])))
+            manifest.finish(file)
+            yield
 
-def _write(path: Path, seed: int, label: str, number: int) -> None:
-    write_text(path, export_off(make_shape(seed, label, number)))
+    show_progress(write(), "Generating shapes", "shapes", len(shapes), len(shapes) - len(missing))
 
 
 def make_shape(seed: int, label: str, number: int) -> Trimesh:
     """Make a shape, the same for the same arguments.
-
-    Like models in catalogs, each shape has a different scale and origin, and roughly the heading of
-    its class.
 
     Args:
         seed: Seed of the data set.
@@ -116,33 +164,139 @@ def make_shape(seed: int, label: str, number: int) -> Trimesh:
     """
     # The name, not its index, so that classes added later do not change the others.
     rng = np.random.default_rng((seed, zlib.crc32(label.encode()), number))
-    parts = Parts(rng)
-    _FAMILIES[label](parts)
-    if parts.chance(0.25):
-        _put_beside(parts)
-    mesh = parts.mesh()
-    vertices = mesh.vertices
-    # Stretched, and tapered a little towards the top or the bottom.
-    size = vertices.max(axis=0) - vertices.min(axis=0)
-    stretch = np.exp(rng.normal(0, 0.12, 3))
-    share = (vertices[:, 2:] - vertices[:, 2:].min()) / size[2] - 0.5
-    taper = 1 + rng.normal(0, 0.08) * share
-    vertices = vertices * stretch * np.concatenate([taper, taper, np.ones_like(taper)], axis=1)
+    shape = _Shape(rng)
+    shape.build(label)
+    mesh = util.concatenate(shape.pieces)
+    if rng.random() < 0.25:  # an object beside the shape that is not a part of it
+        reach = mesh.extents[:2] * 0.6
+        place = mesh.bounds.mean(axis=0)[:2] + reach * rng.choice([-1, 1], 2)
+        shape.box((*place, mesh.bounds[0, 2]), rng.uniform(0.1, 0.3, 3) * mesh.extents.max())
+        mesh = util.concatenate(shape.pieces)
     heading = rotation_about((0, 0, 1), rng.normal(0, 0.12))
-    unit, origin = np.exp(rng.uniform(-3, 4)), rng.normal(0, 1, 3)
-    mesh.vertices = (vertices @ heading.T + origin * size) * unit
+    vertices = mesh.vertices * np.exp(rng.normal(0, 0.12, 3)) @ heading.T
+    mesh.vertices = (vertices + rng.normal(0, 1, 3) * mesh.extents) * np.exp(rng.uniform(-3, 4))
     return mesh
 
 
-def _put_beside(parts: Parts) -> None:
-    """Put an object next to the shape that is not a part of it."""
-    low, high = parts.mesh().bounds
-    size = float(np.max(high - low)) * parts.between(0.06, 0.2)
-    angle = parts.between(0, 2 * np.pi)
-    reach = (high - low)[:2] / 2 + size
-    x, y = (low + high)[:2] / 2 + reach * (np.cos(angle), np.sin(angle))
-    center = (float(x), float(y), float(low[2]) + size)
-    if parts.chance(0.5):
-        parts.ellipsoid(center, (size, size, size))
-    else:
-        parts.box(center, [2 * size] * 3, rotation_about((0, 0, 1), angle))
+class _Shape:
+    """A shape under construction."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.pieces: list[Trimesh] = []
+        self._between, self._rng = rng.uniform, rng
+
+    def build(self, label: str) -> None:
+        """Add the pieces of a class."""
+        if label in _SEATS:
+            self._build_seat(_SEATS[label])
+        elif label in _VESSELS:
+            self._build_vessel(_VESSELS[label])
+        elif label == "lamp":
+            self._build_lamp()
+        else:
+            self._build_airplane()
+
+    def _chance(self, share: float) -> bool:
+        return bool(self._rng.random() < share)
+
+    def box(self, center: Any, size: Any) -> None:
+        """Add a box."""
+        self.pieces.append(creation.box(size).apply_translation(center))
+
+    def _rod(self, start: Any, end: Any, radius: float) -> None:
+        self.pieces.append(creation.cylinder(radius, segment=(start, end), sections=12))
+
+    def _revolve(self, outline: Any) -> None:
+        """Add the surface of revolution of an outline of (radius, height)."""
+        self.pieces.append(creation.revolve(outline, sections=24))
+
+    def _build_seat(self, kind: _Seat) -> None:
+        """Add a top on four legs or a pedestal, perhaps with a back and arms."""
+        between = self._between
+        width, depth, height = (between(*r) for r in (kind.width, kind.depth, kind.height))
+        thick = between(*kind.thick)
+        inner = 0.8
+        if self._chance(kind.round_top):
+            self._revolve(
+                [(0, height - thick), (width / 2, height - thick), (width / 2, height), (0, height)]
+            )
+            depth, inner = width, 0.6
+        else:
+            self.box((0, 0, height - thick / 2), (depth, width, thick))
+        if self._chance(kind.pedestal):
+            self._rod((0, 0, 0), (0, 0, height), between(0.02, 0.06))
+            self._revolve([(0, 0), (width * between(0.25, 0.5), 0), (0, 0.05)])
+        else:
+            radius, splay = between(0.012, 0.035), between(0.9, 1.2)
+            for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+                top = np.array([x * depth, y * width, 0]) * inner / 2
+                self._rod(top * splay, np.add(top, (0, 0, height - thick / 2)), radius)
+        if self._chance(kind.back):
+            high = between(*kind.back_height)
+            self.box((-depth / 2, 0, height + high / 2), (between(0.02, 0.08), width, high))
+        if self._chance(kind.arms):
+            for side in (-1, 1):
+                y, rise = side * width / 2, between(0.14, 0.26)
+                self.box((0, y, height + rise), (depth * between(0.6, 1), 0.05, 0.03))
+                self._rod((depth * 0.3, y, height - thick), (depth * 0.3, y, height + rise), 0.02)
+
+    def _build_vessel(self, kind: _Vessel) -> None:
+        """Add a surface of revolution, with a wall or closed, perhaps with a handle."""
+        height = self._between(*kind.height)
+        radius = height * self._between(*kind.radius)
+        outline = [
+            (radius * self._between(*r), height * self._between(*z)) for z, r in kind.outline
+        ]
+        if self._chance(kind.is_open):
+            wall = radius * self._between(0.04, 0.12)
+            inside = [(max(r - wall, 0.001), max(z, wall)) for r, z in reversed(outline)]
+            self._revolve([(0, 0), *outline, *inside, (0, wall)])
+        else:
+            self._revolve([(0, 0), *outline, (0, height)])
+        if self._chance(kind.handle):
+            size = height * self._between(0.15, 0.35)
+            ring = creation.torus(size, size * 0.18, major_sections=20, minor_sections=8)
+            ring.apply_transform(rotation_matrix(np.pi / 2, (1, 0, 0)))
+            self.pieces.append(ring.apply_translation((radius * 0.9, 0, height / 2)))
+
+    def _build_lamp(self) -> None:
+        """Add a foot, a pole, straight or bent, and a shade."""
+        between = self._between
+        height = between(0.3, 1.7)
+        base, thick = height * between(0.1, 0.24), height * between(0.008, 0.03)
+        self._revolve([(0, 0), (base, 0), (base * between(0.5, 1), 0.04), (0, 0.05)])
+        x = height * between(0.2, 0.5) if self._chance(0.3) else 0.0
+        elbow = (-0.3 * x, 0, height * between(0.4, 0.9))
+        self._rod((0, 0, 0), elbow, thick)
+        self._rod(elbow, (x, 0, height), thick)
+        wide, low = height * between(0.1, 0.28), height * between(0.12, 0.3)
+        shade = np.array([(wide, height - low), (wide * between(0.3, 1), height), (0, height)])
+        self.pieces.append(creation.revolve(shade, sections=24).apply_translation((x, 0, 0)))
+
+    def _build_airplane(self) -> None:
+        """Add a fuselage, two pairs of wings, a fin, and perhaps engines."""
+        between = self._between
+        length = between(8, 40)
+        radius = length * between(0.035, 0.075)
+        fuselage = creation.icosphere(subdivisions=2).apply_scale((length / 2, radius, radius))
+        self.pieces.append(fuselage)
+        span, chord = length * between(0.3, 0.75), length * between(0.1, 0.28)
+        sweep, z = length * between(-0.05, 0.25), radius * between(-0.7, 0.8)
+        tail, rear = length * between(0.08, 0.2), -length * between(0.38, 0.45)
+        for side in (-1, 1):
+            self._add_wing((0, 0, z), (-sweep, side * span, z), chord)
+            self._add_wing((rear, 0, z / 2), (rear - tail * 0.4, side * tail, z / 2), tail * 0.6)
+        self._add_wing((rear, 0, 0), (rear - tail * 0.4, 0, tail * 1.1), tail * 0.6)
+        for k in range(int(self._rng.integers(0, 3))):
+            share, size = 0.35 + 0.3 * k, radius * between(0.3, 0.55)
+            for side in (-1, 1):
+                start = np.array([-sweep * share, side * span * share, z - size])
+                self._rod(start, np.add(start, (chord * 0.8, 0, 0)), size)
+
+    def _add_wing(self, root: Any, tip: Any, chord: float) -> None:
+        """Add a tapered plate from the middle of its root to the middle of its tip."""
+        ends = [np.add(root, (x, 0, 0)) for x in (-chord / 2, chord / 2)]
+        ends += [np.add(tip, (x, 0, 0)) for x in (-chord / 4, chord / 4)]
+        across = np.cross(np.subtract(tip, root), (1, 0, 0))
+        across *= chord * 0.04 / np.linalg.norm(across)
+        self.pieces.append(convex_hull(np.concatenate([ends + across, ends - across])))

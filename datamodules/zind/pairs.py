@@ -46,10 +46,14 @@ class ZindPairs(PanoramaPairs):
         most_m = math.inf if self.max_distance_m is None else self.max_distance_m
         listed = list_home_panoramas(root, problems)
         problems.refuse(root)
-        usable = [p for p in listed if p.has_layout and p.is_inside and p.unit_m is not None]
+        usable = [p for p in listed if p.record.layout_visible and p.record.is_inside and p.unit_m]
         location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
         pairs = [
-            (f"{one.room}/{one.path[-1]} – {other.path[-1]}", one, other)
+            (
+                f"{one.room}/{one.name.rpartition('/')[2]} – {other.name.rpartition('/')[2]}",
+                one,
+                other,
+            )
             for one, other in combinations(usable, 2)
             if one.room == other.room
             and math.dist(location_m[one.name], location_m[other.name]) <= most_m
@@ -65,11 +69,11 @@ class ZindPairs(PanoramaPairs):
 
     def image(self, files: HomePanorama) -> Path:
         """See `PanoramaPairs`."""
-        return files.image()
+        return files.image
 
     def panorama(self, files: HomePanorama) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        path = files.image()
+        path = files.image
         rgb = read_rgb(path)
         shape = paired_shape(path, rgb, self.erp_height)
         pose, unit_m = files.pose()

@@ -49,7 +49,6 @@ from datamodules.core.images import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
-from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.io.pixel_files import read_image_size, read_rgb
@@ -126,14 +125,14 @@ class Zind(PanoramaDataModule):
 
     def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
         """See `ImageDataModule`."""
-        panoramas = [p for p in list_home_panoramas(self.root, problems) if p.has_layout]
+        panoramas = [p for p in list_home_panoramas(self.root, problems) if p.record.layout_visible]
         split_of = self._divided(panoramas)
         layouts: dict[str, Layout] = {}
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
         for panorama, split in zip(panoramas, split_of, strict=True):
             with problems.noted(panorama.name):
                 layouts[panorama.name] = panorama.layout()
-                files = ImageFiles(panorama.name, panorama.image(), panorama.file)
+                files = ImageFiles(panorama.name, panorama.image, panorama.file)
                 splits[split].append(files)
         if not self.val_fraction:
             splits["val"] = []
@@ -167,10 +166,8 @@ class Zind(PanoramaDataModule):
 
 def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
     """Return the split of every home in a ``zind_partition.json``."""
-    expected = "lists of homes for train, val and test"
-    content = read_json(path, expected)
-    lists = check_fields(path, content, dict.fromkeys(SPLITS, list[Text]), expected)
-    split_of = {home: split for split in SPLITS for home in lists[split]}
+    lists = read_json(path, "lists of homes for train, val and test", kind=dict[Split, list[str]])
+    split_of = {home: split for split, homes_of_split in lists.items() for home in homes_of_split}
     missing = sorted(homes - split_of.keys())
     if missing:
         raise DataError(

@@ -60,7 +60,10 @@ def test_a_task_of_ones_own_trains_evaluates_reports_and_resumes(
     assert (decoded(panel.read_bytes()) == (255, 0, 0)).all(-1).any(), "its own picture"
 
     run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", TRUST, "hydra.run.dir=again")
-    assert json.loads(Path("again/results.json").read_text())["scores"]["mae"] == results["scores"]["mae"]
+    assert (
+        json.loads(Path("again/results.json").read_text())["scores"]["mae"]
+        == results["scores"]["mae"]
+    )
     upright = ["data.upright=auto", "hydra.run.dir=upright"]  # by the images alone
     run("evaluate", f"checkpoint={folder}/checkpoints/best.ckpt", TRUST, *upright)
     assert Path("upright/results.json").is_file()

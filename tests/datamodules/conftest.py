@@ -37,5 +37,5 @@ def tiny_rooms(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def tiny_shapes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Shapes of `TINY_SHAPES`; not to be changed."""
     root = tmp_path_factory.mktemp("data") / "shapes"
-    generate_shapes(root, TINY_SHAPES, workers=0)
+    generate_shapes(root, TINY_SHAPES)
     return root

@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import draw_camera
-from datamodules.synthrooms.scene import draw_room_type, furnish
+from datamodules.synthrooms.furniture import build_room, draw_room_type
+from datamodules.synthrooms.render import RayScene, draw_camera
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
@@ -48,7 +47,7 @@ EXACT = 1e-6
 def _room(seed: int = 0) -> Any:
     """Return a function from directions ``(…, 3)`` to true distances, and its scene."""
     rng = np.random.default_rng(seed)
-    room = furnish(rng, draw_room_type(rng))
+    room = build_room(rng, draw_room_type(rng))
     scene = RayScene(room)
     location = draw_camera(rng, scene, room.plan, []).location
 

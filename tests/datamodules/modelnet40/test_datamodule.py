@@ -44,12 +44,6 @@ def test_both_layouts_are_found(tmp_path: Path, layout: Literal["by class", "by 
     assert found == sorted(found, key=lambda shape: (shape.part, shape.name))
 
 
-def test_a_class_that_is_only_tested(tmp_path: Path) -> None:
-    write_tree(tmp_path, counts={"cup": (1, 1), "chair": (0, 1)})
-    with pytest.raises(DataError, match="only test shapes of chair"):
-        find_shapes(tmp_path)
-
-
 MakeModule = Callable[..., ModelNet40]
 
 LEVEL = 3
@@ -104,7 +98,7 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
     module = ModelNet40(tmp_path / "ModelNet40", TangentRepresentation(0, LEVEL))
     assert module.class_names == MODELNET40
     for use in (module.setup, module.prepare_data):
-        with pytest.raises(DataError, match=r"no such folder.*princeton"):
+        with pytest.raises(DataError, match=r"no .*princeton"):
             use()
 
 

@@ -61,6 +61,7 @@ def write_panorama(root: Path, camera: str, room: str, gray: int, rows: int = 8)
     rotation = np.diag([1.0, -1, -1]) @ upright.T
     location = np.array([gray / 10, 1.0, 1.5])
     record = {
+        "camera_k_matrix": [[rows / 2, 0, rows / 2], [0, rows / 2, rows / 2], [0, 0, 1]],
         "camera_rt_matrix": np.hstack([rotation, -(rotation @ location)[:, None]]).tolist(),
         "camera_original_rotation": euler_angles(upright).tolist(),
         "camera_location": location.tolist(),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.problems import Problems
-from datamodules.synthia.generate import MANIFEST, make_panoramas
+from datamodules.synthia.generate import make_panoramas
 from tests.datamodules.data_files import write_png
 
 SIZE = (38, 64)  # the real 760×1280 by 20
@@ -96,5 +96,6 @@ def write_panoramas(root: Path, frames: Mapping[str, int], height: int = 32) -> 
     """Panoramas as if they were published, beside the views; returns `root`."""
     make_panoramas(write_views(root, frames), list(frames), Problems(), height=height)
     for name in frames:
-        (sequence(root, name) / "pano" / MANIFEST).unlink()
+        for file in ("manifest.json", "finished.jsonl"):
+            (sequence(root, name) / "pano" / file).unlink()
     return root

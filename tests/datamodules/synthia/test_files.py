@@ -36,11 +36,11 @@ def test_cameras_are_read(tmp_path: Path, text: str | None) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["focal 532 640 380", "532 640 380 0.8 1", "nan 640 380", "532 64000 380"],
+    ["focal 532 640 380", "532 640"],
 )
 def test_strange_cameras_are_refused(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
-    with pytest.raises(DataError, match=r"intrinsics\.txt: found .* views of 1280 × 760"):
+    with pytest.raises(DataError, match=r"intrinsics\.txt: found .* expected focal"):
         read_view_camera(tmp_path, (760, 1280))
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from datamodules.core.splits import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.data_files import names_of, read_png
 from tests.datamodules.synthia import synthia_format as synthia
@@ -130,5 +130,5 @@ def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     assert labels.shape == (16, 32)
     assert set(np.unique(labels).tolist()) == set(range(14))
     two(root, erp, panorama_height=64, frames=2).make_files()
-    with pytest.raises(DataError, match="found height=64"):
+    with pytest.raises(SettingError, match="height: found 2096; expected 64"):
         two(root, erp, frames=2).make_files()

@@ -10,20 +10,26 @@ import pytest
 
 from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.camera import PanoramaRays, PerspectiveRays, Pose, euler_rotation
-from datamodules.synthrooms.generate import RoomSettings, plan_rooms
-from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import MISSING, Picture, draw_camera, draw_holes, render_picture
-from datamodules.synthrooms.room import Room
-from datamodules.synthrooms.scene import draw_room_type, furnish
-from datamodules.synthrooms.writer import (
+from datamodules.synthrooms.furniture import build_room, draw_room_type
+from datamodules.synthrooms.generate import (
     INSTANCES,
     RoomPlan,
-    camera_identifier,
+    RoomSettings,
     encode_picture,
     label_indices,
     label_strings,
+    plan_rooms,
     pose_record,
 )
+from datamodules.synthrooms.render import (
+    MISSING,
+    Picture,
+    RayScene,
+    draw_camera,
+    draw_holes,
+    render_picture,
+)
+from datamodules.synthrooms.room import Room
 from tangent_train.errors import SettingError
 
 
@@ -40,9 +46,6 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
     ("wrong", "message"),
     [
         ({"rooms": {"7": 1}}, "rooms: found"),
-        ({"rooms": {"1": 0}}, "rooms: found"),
-        ({"rooms": {"1": -1}}, r"rooms\[1\]: found -1"),
-        ({"seed": True}, "seed"),
         ({"height": 7}, "height: found 7; expected an integer of 8 or more"),
         ({"views": "all"}, "views: found all"),
     ],
@@ -60,7 +63,7 @@ def rooms() -> list[Room]:
     made = []
     for seed in SEEDS:
         rng = np.random.default_rng(seed)
-        made.append(furnish(rng, draw_room_type(rng)))
+        made.append(build_room(rng, draw_room_type(rng)))
     return made
 
 
@@ -93,11 +96,11 @@ def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> 
     assert 0.02 < missing / total < 0.15
 
 
-CAMERA = camera_identifier(0, "5b", "WC_17", 0)
+CAMERA = "0f" * 16
 RNG = np.random.default_rng(0)
 ROOMS = [
-    RoomPlan("1", "office", 1, 0, (), RNG),
-    RoomPlan("5b", "WC", 17, 1, (CAMERA,), RNG),
+    RoomPlan("1", "office_1", 0, [], RNG),
+    RoomPlan("5b", "WC_17", 1, [CAMERA], RNG),
 ]
 
 
@@ -123,8 +126,10 @@ def test_pictures_survive_the_files() -> None:
     labels = np.array([0, 70_000, 300], np.uint32)
     files = encode_picture(Picture(rgb, depth, items), labels)
     read: dict[str, Any] = {
-        kind: cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-        for kind, content in files.items()
+        name.removesuffix(".png"): cv2.imdecode(
+            np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED
+        )
+        for name, content in files.items()
     }
     np.testing.assert_array_equal(read["rgb"][..., ::-1], rgb)
     assert read["depth"].dtype == np.uint16

@@ -15,11 +15,10 @@ from datamodules.synthrooms.camera import (
     euler_angles,
     euler_rotation,
 )
+from datamodules.synthrooms.furniture import build_empty_room
 from datamodules.synthrooms.layout import FloorPlan
-from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, render_picture
+from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, RayScene, render_picture
 from datamodules.synthrooms.room import Light, Room
-from datamodules.synthrooms.scene import shell
 from tangent_train.geometry import FLIP_Y, equirect_directions, random_rotation, rotation_about
 
 SIZE = np.array([5.0, 4.0, 3.0])
@@ -30,7 +29,7 @@ NO_HOLES = Holes(np.zeros((0, 3)), np.zeros(0))
 def empty_room() -> Room:
     """A lamp under the ceiling, which can be seen by its light only."""
     rng = np.random.default_rng(0)
-    room = shell(rng, FloorPlan((5.0, 4.0, 3.0)))
+    room = build_empty_room(rng, FloorPlan((5.0, 4.0, 3.0)))
     room.parts[:] = [
         part for part in room.parts if len(part.triangles) and _is_slab(part.triangles)
     ]

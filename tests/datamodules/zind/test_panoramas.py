@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,12 +97,6 @@ def test_the_partition_of_the_release_decides(root: Path) -> None:
     partition.write_text(json.dumps({"train": ["002"], "val": [], "test": ["000"]}))
     with pytest.raises(DataError, match=r"zind_partition\.json: found no home 001; expected every"):
         _zind(root).setup()
-    partition.write_text(json.dumps({"train": ["002"], "test": ["000"]}))
-    with pytest.raises(DataError, match=r"zind_partition\.json: found no val inside"):
-        _zind(root).setup()
-    partition.write_text("{")
-    with pytest.raises(DataError, match=r"zind_partition\.json: found .*; expected lists of homes"):
-        _zind(root).setup()
 
 
 def test_doors_may_be_unknown_and_a_store_is_of_one_choice_and_layout(
@@ -122,63 +115,47 @@ def test_doors_may_be_unknown_and_a_store_is_of_one_choice_and_layout(
         stored.source("test").read(0)
 
 
-def _set(*path: str | int, value: Any) -> Callable[[Any], None]:
-    def change(content: Any) -> None:
-        for name in path[:-1]:
-            content = content[name]
-        if value is None:
-            del content[path[-1]]
-        else:
-            content[path[-1]] = value
-
-    return change
-
-
-LAYOUT = "layout_visible"
-SEEN = r"in merger\.floor_01\..*\.partial_room_01\.pano_1\.layout_visible"
-BROKEN: dict[str, tuple[Callable[[Any], None], str]] = {
-    "no height": (_set("camera_height", value=None), "no camera_height in merger.*pano_1"),
-    "a ceiling below the camera": (
-        _set("ceiling_height", value=0.9),
-        r"camera_height=1, ceiling_height=0\.9 in merger.*pano_1; expected a camera between",
-    ),
-    "a picture elsewhere": (
-        _set("image_path", value="../other.jpg"),
-        r"image_path=\.\./other\.jpg",
-    ),
-    "a room without the camera": (
-        _set(LAYOUT, "vertices", value=[[1, 1], [2, 1], [2, 2], [1, 2]]),
-        f"4 vertices that do not surround the camera at \\(0, 0\\) {SEEN}",
-    ),
-    "a vertex nowhere": (_set(LAYOUT, "vertices", 0, value=[1e999, 0]), f"vertices=.* {SEEN}"),
-    "half a door": (_set(LAYOUT, "doors", value=[[1, 1], [1, 2]]), f"2 points for doors {SEEN}"),
-    "a window upside down": (
-        _set(LAYOUT, "windows", value=[[0, 1.5], [1, 1.5], [0.5, -0.5]]),
-        f"windows from .* with bottom 0.5, top -0.5 {SEEN}; expected .*",
+BROKEN: dict[str, tuple[dict[str, Any], str]] = {
+    "no height": ({"camera_height": None}, "pano_1.camera_height: Input should be a valid number"),
+    "a picture elsewhere": ({"image_path": "../other.jpg"}, "image_path: .*pattern"),
+    "half a door": (
+        {"layout_visible": {"doors": [[1]]}},
+        "layout_visible.vertices: Field required",
     ),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN)
-def test_a_broken_record_is_named_with_its_place(root: Path, name: str) -> None:
+def test_a_broken_home_is_named_with_its_place(root: Path, name: str) -> None:
     change, expected = BROKEN[name]
-    file = root / "000" / "zind_data.json"
-    content = json.loads(file.read_text())
-    change(content["merger"]["floor_01"]["complete_room_01"]["partial_room_01"]["pano_1"])
-    file.write_text(json.dumps(content))
+    file = _change(root, change)
     with pytest.raises(DataError, match=rf"000/zind_data\.json: found .*{expected}"):
         _zind(root).setup()
-    problems, count = _zind(root).check()
-    assert problems.items == {f"{ROOM}/pano_1"}
-    assert count == 6
+    assert _zind(root).check()[0].items == {"000"}
+    assert file.exists()
+
+
+def test_a_room_without_the_camera_is_left_out(root: Path) -> None:
+    around = {"openings": [], "doors": [], "windows": []}
+    corners = [[1, 1], [2, 1], [2, 2], [1, 2]]
+    _change(root, {"layout_visible": {"vertices": corners, **around}})
+    with pytest.raises(DataError, match=rf"expected a room around {ROOM}/pano_1"):
+        _zind(root).setup()
     data = _zind(root, test_fraction=1, skip_broken=True)
     assert len(names_of(data, "test")) == 5
 
 
+def _change(root: Path, change: dict[str, Any]) -> Path:
+    file = root / "000" / "zind_data.json"
+    content = json.loads(file.read_text())
+    content["merger"]["floor_01"]["complete_room_01"]["partial_room_01"]["pano_1"] |= change
+    file.write_text(json.dumps(content))
+    return file
+
+
 def test_a_folder_without_homes_is_refused(root: Path) -> None:
-    for wrong, found in ((root / "000", r"no \*/zind_data\.json"), (root / "no", "no such folder")):
-        with pytest.raises(DataError, match=rf"{wrong.name}: found {found}; .*github\.com/zillow"):
-            _zind(wrong).setup()
+    with pytest.raises(DataError, match=r"found no \*/zind_data\.json; .*github\.com/zillow"):
+        _zind(root / "000").setup()
 
 
 # --- pairs ----------------------------------------------------------------------------------------

@@ -11,9 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from datamodules.synthrooms.camera import PanoramaRays, Pose
-from datamodules.synthrooms.raycast import RayScene
-from datamodules.synthrooms.render import Camera, draw_camera, draw_holes, render_picture
-from datamodules.synthrooms.scene import furnish
+from datamodules.synthrooms.furniture import build_room
+from datamodules.synthrooms.render import Camera, RayScene, draw_camera, draw_holes, render_picture
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tests.cli.rendering import render_with
 from tests.geometry.directions import angle_deg
@@ -26,7 +25,7 @@ pycolmap.logging.minloglevel = 2
 def _panoramas(folder: Path) -> dict[str, Pose]:
     """Three of 512 rows in one room, tilted by up to 11°, within 0.6 m of the first."""
     rng = np.random.default_rng(1)
-    room = furnish(rng, "office")
+    room = build_room(rng, "office")
     scene = RayScene(room)
     holes, first = draw_holes(rng, scene), draw_camera(rng, scene, room.plan, [])
     poses = {}

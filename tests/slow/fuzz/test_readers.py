@@ -64,7 +64,6 @@ _FOUND = {
         _changed("pose").replace(b"2.25", _HUGE),
         _changed("pose", camera_rt_matrix=[[1e308] * 4] * 3),
         _changed("pose", camera_location="x" * 100_000),
-        b'{"camera_k_matrix": [[%b, 0, 1], [0, 1, 1], [0, 0, 1]]}' % _HUGE,
     ],
     "cameras": [
         _changed("cameras", level=10**400),
