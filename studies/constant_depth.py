@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 from torch import nn
 
-from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.images import STEPS_PER_M
 from tangent_train.cli.run import build_data
 from tangent_train.config.build import build_from_config
 from tangent_train.files import config_folder

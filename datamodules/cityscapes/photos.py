@@ -29,10 +29,10 @@ from numpy.typing import NDArray
 
 from datamodules.cityscapes.classes import CLASS_SETS
 from datamodules.core.image_module import PhotoDataModule
-from datamodules.core.index import Split, published_splits
+from datamodules.core.splits import Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.config.build import check_fields
 from tangent_train.errors import DataError

@@ -13,7 +13,7 @@ from tangent_train.files import NoRoomError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from datamodules.core.index import Item, Split
+    from datamodules.core.splits import Item, Split
 
 
 _Item = TypeVar("_Item", bound="Item")

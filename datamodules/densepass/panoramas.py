@@ -22,65 +22,64 @@ ITSC 2021.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Annotated
 
-from datamodules.cityscapes.classes import CLASS_SETS, CLASSES
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.index import Split
+from pydantic import Field
+
+from datamodules.cityscapes.classes import CLASSES, class_maps
+from datamodules.core.data_module import data_set
+from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import Input
-from datamodules.core.numbered import NumberedReader, number_table
-from datamodules.core.panoramas import ImageFiles
-from datamodules.core.problems import Problems
-from tangent_train.errors import DataError
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import Split
+from tangent_train.errors import DataError, SettingError
 
 _GET_IT = (
     "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
     "with leftImg8bit and gtFine."
 )
-_TABLE = number_table(range(len(CLASSES)), [255])
 _HEIGHT, _WIDTH = 400, 2048
 _LABELS = "_labelTrainIds.png"
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class DensePASS(PanoramaDataModule):
     """DensePASS, 19 or 13 classes.
 
     All labeled panoramas are for the test; training and validation are empty.
 
     Args:
-        horizon_row: Rows above the horizon, 0 to 400, which define `area`.
-
-    Raises:
-        SettingError: A setting is invalid.
+        horizon_row: Rows above the horizon, which define `area`.
     """
 
-    class_sets = CLASS_SETS
+    label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
 
     inputs: Sequence[Input] = ("rgb",)
-    horizon_row: float = _HEIGHT / 2
+    horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
 
     def __post_init__(self) -> None:
-        self.require("horizon_row", 0 <= self.horizon_row <= _HEIGHT, f"0 to {_HEIGHT}")
-        self.require("area", self.area is None, "null: horizon_row defines it")
+        if self.area is not None:
+            expected = "null: horizon_row defines it"
+            raise SettingError("data.area", found=list(self.area), expected=expected)
         south, north = self.horizon_row - _HEIGHT, self.horizon_row
         self.area = (-180, 180, south * 360 / _WIDTH, north * 360 / _WIDTH)
         super().__post_init__()
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        if split != "test":
+            return []
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
-        files = list(images.glob("[!.]*.png"))
-        paths = {path.stem.removesuffix("_"): path for path in files}
-        if not paths or len(paths) < len(files):
-            found = "panoramas in both spellings" if files else "no panoramas"
+        found = list(images.glob("[!.]*.png"))
+        paths = {path.stem.removesuffix("_"): path for path in found}
+        if not paths or len(paths) < len(found):
+            text = "panoramas in both spellings" if found else "no panoramas"
             expected = "1_.png or 1.png, and others"
-            raise DataError(images, found=found, expected=expected, remedy=_GET_IT)
+            raise DataError(images, found=text, expected=expected, remedy=_GET_IT)
         test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
-        problems.compare_counts({"test": test}, {"test": 100})
-        problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
-        return NumberedReader(_TABLE), {"train": [], "val": [], "test": test}
+        self.problems.compare_counts({"test": test}, {"test": 100})
+        self.problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
+        return test

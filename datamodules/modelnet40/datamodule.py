@@ -14,7 +14,7 @@ from typing import Any, ClassVar
 
 from torch import Tensor
 
-from datamodules.core.index import DatasetIndex, Split, draw_groups
+from datamodules.core.splits import DatasetIndex, Split, draw_groups
 from datamodules.core.inputs import Normalization
 from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.problems import Problems

@@ -11,7 +11,7 @@ from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
 if TYPE_CHECKING:  # slow to import; SynthRooms needs only the names
-    from datamodules.core.panoramas import ImageFiles
+    from datamodules.core.images import ImageFiles
 
 
 AREAS: tuple[str, ...] = ("1", "2", "3", "4", "5a", "5b", "6")
@@ -136,7 +136,7 @@ def list_pictures(
         with_depth: True to list depth files too.
         problems: Collects problems: no images, or unknown files.
     """
-    from datamodules.core.panoramas import ImageFiles
+    from datamodules.core.images import ImageFiles
 
     folder = root / f"area_{area}" / group
     found = []

@@ -24,7 +24,7 @@ from datamodules.core.panorama_pairs import (
     PublishedPair,
     paired_shape,
 )
-from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
+from datamodules.core.images import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
 from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose

@@ -35,8 +35,8 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.index import Split, draw_groups
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.splits import Split, draw_groups
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, CLASSES, FOLDS, GET_IT, list_pictures
 from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader

@@ -36,10 +36,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.index import SPLITS, Split, published_splits
+from datamodules.core.splits import SPLITS, Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.structured3d.classes import CLASS_SETS, CLASSES
 from tangent_train.errors import DataError

@@ -29,11 +29,11 @@ from typing import ClassVar, Literal
 
 from datamodules.cityscapes.classes import THIRTEEN
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.index import SPLITS, Split, published_splits
+from datamodules.core.splits import SPLITS, Split, published_splits
 from datamodules.core.inputs import Input
 from datamodules.core.labels import ClassSet, class_sets
 from datamodules.core.numbered import NumberedReader, number_table
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 

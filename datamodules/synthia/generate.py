@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import distance_from_z_depth
+from datamodules.core.images import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.synthia import reader
 from tangent_train.geometry import (

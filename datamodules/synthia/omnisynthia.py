@@ -21,9 +21,9 @@ from itertools import chain
 from typing import ClassVar
 
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.index import DatasetIndex, Split
+from datamodules.core.splits import DatasetIndex, Split
 from datamodules.core.inputs import Input
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas

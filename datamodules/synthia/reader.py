@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
+from datamodules.core.images import ImageFiles, PngReader, meters_to_steps, resize_nearest
 from tangent_train.errors import DataError, at_least
 from tangent_train.io.pixel_files import read_pixels
 

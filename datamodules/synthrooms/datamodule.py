@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from datamodules.core.index import DatasetIndex
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.splits import DatasetIndex
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import (

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
-from datamodules.core.panoramas import resize_area
+from datamodules.core.images import resize_area
 from datamodules.core.problems import Problems
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError

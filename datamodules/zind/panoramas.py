@@ -43,9 +43,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.index import SPLITS, Split, draw_groups
+from datamodules.core.splits import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Input
-from datamodules.core.panoramas import ImageFiles, ImageReader
+from datamodules.core.images import ImageFiles, ImageReader
 from datamodules.core.problems import Problems
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout

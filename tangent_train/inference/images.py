@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from datamodules.core.panoramas import meters_to_steps, resize_depth, resize_nearest
+from datamodules.core.images import meters_to_steps, resize_depth, resize_nearest
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.gpano import PanoramaArea, read_up, whole_area

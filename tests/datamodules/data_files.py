@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.index import Split
-from datamodules.core.panoramas import resize_nearest
+from datamodules.core.splits import Split
+from datamodules.core.images import resize_nearest
 from datamodules.core.split_module import SplitDataModule
 
 GPANO_TAGS = {

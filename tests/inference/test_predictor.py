@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
-from datamodules.core.panoramas import distance_from_z_depth
+from datamodules.core.images import distance_from_z_depth
 from datamodules.core.samples import render_inputs
 from models import make_distortion_aware
 from tangent_train.checkpoints.loaded import LoadedNetwork

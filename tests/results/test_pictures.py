@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.core.panoramas import Panorama
+from datamodules.core.images import Panorama
 from tangent_train.geometry.equirect import area_mask
 from tangent_train.io.palette import class_colors
 from tangent_train.results.pictures import (

@@ -11,7 +11,7 @@ import pytest
 from torchvision.datasets import Cityscapes as Published
 
 from datamodules import Cityscapes
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.cityscapes import street_format as streets

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datamodules import FolderPanoramas
-from datamodules.core.panoramas import ImageFiles, Panorama
+from datamodules.core.images import ImageFiles, Panorama
 from datamodules.core.transforms import EstimatedUp, RotatedPanoramas, placed
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.gpano import Fill, PanoramaArea

@@ -5,7 +5,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from datamodules.core.panoramas import mask_black, resize_area, resize_depth, resize_nearest
+from datamodules.core.images import mask_black, resize_area, resize_depth, resize_nearest
 from tests.datamodules.data_files import nearest_valid
 
 # --- sizes -------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.index import DatasetIndex
-from datamodules.core.panoramas import ImageFiles, Panorama
+from datamodules.core.splits import DatasetIndex
+from datamodules.core.images import ImageFiles, Panorama
 from datamodules.core.reading import SplitReader
 from datamodules.core.transforms import EstimatedUp, PosedUp, RotatedPanoramas
 from tangent_train.errors import DataError

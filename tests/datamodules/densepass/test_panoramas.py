@@ -11,7 +11,7 @@ import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules import DensePASS
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.cityscapes import street_format as streets

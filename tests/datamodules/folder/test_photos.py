@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.panoramas import Photo
+from datamodules.core.images import Photo
 from datamodules.folder.labeled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation

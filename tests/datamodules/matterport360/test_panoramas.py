@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datamodules import Matterport360
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from datamodules.matterport360.panoramas import CLASSES, read_table
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import names_of, write_png

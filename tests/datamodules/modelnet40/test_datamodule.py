@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.index import SPLITS, Split
+from datamodules.core.splits import SPLITS, Split
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40, find_shapes

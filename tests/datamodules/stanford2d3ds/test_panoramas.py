@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.core.index import SPLITS
-from datamodules.core.panoramas import distance_from_z_depth, steps_to_meters
+from datamodules.core.splits import SPLITS
+from datamodules.core.images import distance_from_z_depth, steps_to_meters
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, FileName
 from datamodules.stanford2d3ds.reader import LabelTable
 from tangent_train.errors import DataError

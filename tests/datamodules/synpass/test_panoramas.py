@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datamodules import SynPASS
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.cityscapes import street_format as streets

@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from datamodules import Zind, ZindPairs
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation

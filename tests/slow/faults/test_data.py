@@ -18,7 +18,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 
 from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
 from datamodules.core import index as index_module
-from datamodules.core.index import SPLITS
+from datamodules.core.splits import SPLITS
 from datamodules.core.split_module import SplitDataModule
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation

@@ -16,7 +16,7 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras as read_photo_cameras
 from datamodules.folder.classes import read_classes
