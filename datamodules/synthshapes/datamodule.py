@@ -2,31 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import field
 
-from datamodules.modelnet40.datamodule import ModelNet40
+from datamodules.core.data_module import data_set
+from datamodules.modelnet40.shapes import ModelNet40
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthShapes(ModelNet40):
     """Synthetic shapes, generated on first use and read as ModelNet40: no download.
 
     Args:
         shapes: Shapes to generate.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    shapes: ShapeSettings | Mapping[str, int] | None = None
-
-    def __post_init__(self) -> None:
-        given = self.shapes or {}
-        self.shapes = given if isinstance(given, ShapeSettings) else ShapeSettings(**given)
-        super().__post_init__()
+    shapes: ShapeSettings = field(default_factory=ShapeSettings)
 
     def find_classes(self) -> tuple[str, ...]:
         """Return the names of the ten classes."""
@@ -34,5 +25,4 @@ class SynthShapes(ModelNet40):
 
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
-        shapes: Any = self.shapes
-        generate_shapes(self.root, shapes)
+        generate_shapes(self.root, self.shapes)

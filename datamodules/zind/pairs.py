@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
 import numpy as np
+from pydantic import PositiveInt
 
+from datamodules.core.data_module import data_set
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
-from datamodules.core.images import resize_area
 from datamodules.core.problems import Problems
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 
-@dataclass(eq=False)
+@data_set
 class ZindPairs(PanoramaPairs):
     """Any two panoramas of a complete room whose cameras are inside.
 
@@ -31,9 +33,9 @@ class ZindPairs(PanoramaPairs):
         erp_height: Rows to downsample the panoramas to; by default unchanged.
     """
 
-    root: str | Path
-    max_distance_m: float | None = None
-    erp_height: int | None = None
+    root: Path = field(kw_only=False)
+    max_distance_m: float | None = field(kw_only=False, default=None)
+    erp_height: PositiveInt | None = None
 
     @cached_property
     def pairs(self) -> list[tuple[str, HomePanorama, HomePanorama]]:
@@ -42,7 +44,7 @@ class ZindPairs(PanoramaPairs):
         Raises:
             DataError: There are no pairs, or a file is broken.
         """
-        problems, root = Problems(), Path(self.root)
+        problems, root = Problems(), self.root
         most_m = math.inf if self.max_distance_m is None else self.max_distance_m
         listed = list_home_panoramas(root, problems)
         problems.refuse(root)
@@ -78,4 +80,4 @@ class ZindPairs(PanoramaPairs):
         shape = paired_shape(path, rgb, self.erp_height)
         pose, unit_m = files.pose()
         distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
-        return PairedPanorama(files.name, resize_area(rgb, shape), path, distance_m, pose)
+        return PairedPanorama(files.name, resize(rgb, shape, "bilinear"), path, distance_m, pose)

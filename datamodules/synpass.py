@@ -22,19 +22,18 @@ Transformers for Panoramic Semantic Segmentation", arXiv:2207.11860, 2022.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from datamodules.cityscapes.classes import THIRTEEN
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.labels import ClassSet, class_sets
-from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.cityscapes import THIRTEEN
+from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, published_splits
 from tangent_train.errors import DataError
 
 CLASSES: tuple[str, ...] = (
@@ -44,7 +43,7 @@ CLASSES: tuple[str, ...] = (
 )
 """The 22 classes as labels 1 to 22, which are also the numbers in the files."""
 
-WEATHERS: tuple[str, ...] = ("cloud", "fog", "rain", "sun")
+Weather = Literal["cloud", "fog", "rain", "sun"]
 """Folders of the release."""
 
 _MERGED = {"pedestrian": "person", "vehicles": "car", "road line": "road"}
@@ -58,63 +57,49 @@ _PUBLISHED = (
 )
 """Images in the description of the release, and in the lists of its code."""
 
-_POINT = re.compile(r"MAP_\d+_point\d+")
-_TABLE = number_table(range(1, 1 + len(CLASSES)), [0, 255])
+_TWENTY_TWO = LabelMap.of(CLASSES, [0, 255])
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynPASS(PanoramaDataModule):
     """SynPASS, 22 or 13 classes, with the splits of its folders.
 
     Args:
-        weather: One or several of `WEATHERS`, or `all`.
+        weather: One or several weathers, or `all`.
         time: `all`; `day` or `night` keeps the test panoramas that a list of the release names.
         test_split: Folder of the test panoramas. With `val`, validation uses points drawn from
             the training folder, so that nothing is selected on the test panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_sets = class_sets(CLASSES, {"13": ClassSet(THIRTEEN, CLASSES, _MERGED)})
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {
+        "22": _TWENTY_TWO,
+        "13": _TWENTY_TWO.regrouped(LabelMap.grouped(THIRTEEN, _MERGED)),
+    }
     no_depth = "SynPASS has no depth images"
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
-    weather: str | Sequence[str] = "all"
+    weather: Literal["all"] | Weather | Sequence[Weather] = "all"
     time: Literal["all", "day", "night"] = "all"
     test_split: Literal["val", "test"] = "test"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        given = [self.weather] if isinstance(self.weather, str) else list(self.weather)
-        self._times: dict[str, set[str]] = {}
-        self._weathers = WEATHERS if given == ["all"] else tuple(given)
-        fine = bool(self._weathers) and set(self._weathers) <= set(WEATHERS)
-        self.require("weather", fine, f"all, or some of {', '.join(WEATHERS)}")
-        self.require_one_of("time", "all", "day", "night")
-        self.require_one_of("test_split", "val", "test")
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._divided[split]
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    @cached_property
+    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
         splits: dict[Split, Sequence[ImageFiles]] = {
-            split: self._list_images(split, problems) for split in SPLITS
+            split: self._list_images(split) for split in SPLITS
         }
         if not any(splits.values()):
             expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
             raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
-        self._times = {time: self._read_list(time) for time in ("day", "night")}
-        if self._weathers == WEATHERS:
-            problems.compare_counts(splits, *_PUBLISHED)
-            known = {_point(files) for images in splits.values() for files in images}
-            for time, points in self._times.items():
-                problems.note_absent(f"all_map_{time}_val.txt", points - known)
-        given = self.test_split, self.val_fraction, self.seed
-        splits = published_splits(splits, *given)
+        if self.weather == "all":
+            self.problems.compare_counts(splits, *_PUBLISHED)
+        splits = published_splits(splits, self.test_split, self.val_fraction, self.seed)
         if self.time != "all":
-            named = self._times[self.time]
+            named = self._points_of_times.get(self.time, set())
             splits["test"] = [files for files in splits["test"] if _point(files) in named]
             if not splits["test"]:
                 raise DataError(
@@ -123,36 +108,35 @@ class SynPASS(PanoramaDataModule):
                     expected="names of test points, e.g. MAP_6_point10",
                     remedy="The lists of the release name points of val: data.test_split=val.",
                 )
-        return NumberedReader(_TABLE), splits
+        return splits
 
-    def groups(self, item: ImageFiles) -> list[str]:
-        """See `LabeledData`: weather, and day or night where a list names the point."""
-        times = (time for time, points in self._times.items() if _point(item) in points)
-        return [item.name.split("/")[1], *times]
+    def groups(self, files: ImageFiles) -> list[str]:
+        """See `DataModule`: weather, and day or night where a list names the point."""
+        times = (t for t, points in self._points_of_times.items() if _point(files) in points)
+        return [files.name.split("/")[1], *times]
 
-    def _list_images(self, split: Split, problems: Problems) -> list[ImageFiles]:
+    def _list_images(self, split: Split) -> list[ImageFiles]:
         """Return the images of a folder, each with the label image of its name."""
         found: list[ImageFiles] = []
         labels: list[Path] = []
-        for weather in self._weathers:
+        chosen = [self.weather] if isinstance(self.weather, str) else self.weather
+        for weather in ("cloud", "fog", "rain", "sun") if "all" in chosen else chosen:
             place = Path(weather, split)
             labels += (self.root / "semantic" / place).glob("*/[!.]*_trainID.png")
             for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
-        problems.note_strays(labels, found)
+        self.problems.note_strays(labels, found)
         return found
 
-    def _read_list(self, time: str) -> set[str]:
-        """Return the points in a list; none if the list is missing and no setting needs it."""
-        path = self.root / f"all_map_{time}_val.txt"
-        if self.time == "all" and not path.exists():
-            return set()
-        try:
-            return set(_POINT.findall(path.read_text("utf-8")))
-        except (OSError, UnicodeDecodeError) as error:
-            expected = "names of points, e.g. MAP_6_point10"
-            raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error
+    @cached_property
+    def _points_of_times(self) -> dict[str, set[str]]:
+        """Points in the lists of the release, which may be missing."""
+        return {
+            time: set(re.findall(r"MAP_\d+_point\d+", path.read_text("utf-8")))
+            for time in ("day", "night")
+            for path in self.root.glob(f"all_map_{time}_val.txt")
+        }
 
 
 def _point(files: ImageFiles) -> str:

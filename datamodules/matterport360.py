@@ -7,15 +7,15 @@ On disk, as released; 8-bit labels, 16-bit depth, 0 = missing::
 
     root/                            release=360fv (360FV-Matterport, of 360BEV)
       <scene>/rgb/<uuid>.png         or .jpg
-      <scene>/semantic/<uuid>.png    0 to 41, see ``classes.csv``
+      <scene>/semantic/<uuid>.png    0 to 41, see ``tables``
       <scene>/depth/<uuid>.png       1/4000 m
     root/                            release=sfss (Matterport3D-1K, of SFSS-MMSI)
       <scene>/panorama/undistorted_color_images/<uuid>.png
       <scene>/panorama/segmentation_maps_classes/<uuid>.png    0 to 41, one higher than above
       <scene>/panorama/undistorted_depth_images/<uuid>.png     taken as 1/4000 m
-      train.txt validation.txt test.txt    only compared: they are known to be incomplete
+      train.txt validation.txt test.txt    not read: they are known to be incomplete
 
-``scenes.csv`` has the scenes of each split.
+``tables/matterport360_scenes.csv`` has the scenes of each split.
 
 License: that of Matterport3D, academic use, on request: https://niessner.github.io/Matterport.
 
@@ -27,29 +27,28 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.labels import ClassSet
-from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from tangent_train.errors import DataError
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, published_splits
+from tangent_train.errors import DataError, SettingError
 
-_HERE = Path(__file__).parent
+_TABLES = Path(__file__).parent / "tables"
 
 
 def read_table(name: str) -> list[dict[str, str]]:
-    """Read ``classes.csv`` or ``scenes.csv``: rows of values by column."""
-    with (_HERE / name).open(encoding="utf-8", newline="") as file:
+    """Read the table ``classes`` or ``scenes``: rows of values by column."""
+    with (_TABLES / f"matterport360_{name}.csv").open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
 
 
-CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in read_table("classes.csv"))
+CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in read_table("classes"))
 """Categories of the numbers 0 to 41 of `360fv`; those of `sfss` are one higher, 0 is the last."""
 
 CLASSES: tuple[str, ...] = (
@@ -60,10 +59,12 @@ CLASSES: tuple[str, ...] = (
 """The 20 classes of `360fv`."""
 
 
-def _merged(column: str) -> ClassSet:
-    """Return the 20 classes by a column of ``classes.csv``."""
-    merged = {row["category"]: row[column] for row in read_table("classes.csv")}
-    return ClassSet(CLASSES, CATEGORIES, merged)
+def _merged(column: str) -> LabelMap:
+    """Return the 20 classes by a column of the table of classes."""
+    members: dict[str, list[int]] = {name: [] for name in CLASSES}
+    for number, row in enumerate(read_table("classes")):
+        members.get(row[column], []).append(number)
+    return LabelMap.of(members, set(range(42)) - {n for ns in members.values() for n in ns})
 
 
 _GET_IT = (
@@ -81,14 +82,11 @@ _FOLDERS = {
 }
 """Folders of a scene: color, classes, depth."""
 
-_TABLES = {"360fv": number_table(range(42), ()), "sfss": number_table(range(1, 42), [0])}
 _PUBLISHED = {"train": 7829, "val": 772, "test": 2014}
 """Panoramas of `360fv`."""
 
-_LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
 
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Matterport360(PanoramaDataModule):
     """Panoramas of Matterport3D, 20 classes, or 41 with ``release=sfss``.
 
@@ -96,44 +94,45 @@ class Matterport360(PanoramaDataModule):
         release: `360fv` or `sfss`, see above.
         test_split: Published split of the test panoramas. With `val`, validation uses scenes
             drawn from the training scenes, so that nothing is selected on the test panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_sets: ClassVar[Mapping[str, ClassSet]] = {
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {
         "20": _merged("corrected"),
         "360bev": _merged("360bev"),
-        "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
+        "41": LabelMap.of(CATEGORIES[:-1], [0]),
     }
+    units_per_m = 4000
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
     release: Literal["360fv", "sfss"] = "360fv"
     test_split: Literal["test", "val"] = "test"
 
-    def __post_init__(self) -> None:
-        self.require_one_of("release", "360fv", "sfss")
-        self.require_one_of("test_split", "test", "val")
-        is_sfss = self.release == "sfss"
-        if not self.has_distances:
-            self.classes = str(self.classes or (41 if is_sfss else 20))
-            self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
-        super().__post_init__()
+    def find_label_map(self) -> LabelMap:
+        """See `ImageDataModule`; each release has other numbers."""
+        possible = ("41",) if self.release == "sfss" else ("20", "360bev")
+        name = str(self.classes or possible[0])
+        if name not in possible:
+            raise SettingError("data.classes", found=name, expected=" or ".join(possible))
+        self.classes = name
+        return self.label_maps[name]
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._divided[split]
+
+    @cached_property
+    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
-        rows = read_table("scenes.csv")
         for split in SPLITS:
-            scenes = [row["scene"] for row in rows if row[self.release] == split]
-            listed = {scene: self._list_images(scene) for scene in scenes}
-            splits[split] = [files for images in listed.values() for files in images]
-            missing = [scene for scene in scenes if not listed[scene]]
+            scenes = [row["scene"] for row in read_table("scenes") if row[self.release] == split]
+            missing = []
+            for scene in scenes:
+                images = self._list_images(scene)
+                splits[split] += images
+                missing += [] if images else [scene]
             if missing:
-                problems.warnings.append(
+                self.problems.warnings.append(
                     f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "
                     f"{', '.join(missing[:3])}"
                 )
@@ -142,12 +141,8 @@ class Matterport360(PanoramaDataModule):
             found = f"no panoramas of release={self.release}"
             raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
         if self.release == "360fv":
-            problems.compare_counts(splits, _PUBLISHED)
-        else:
-            self._compare_lists(splits, problems)
-        given = self.test_split, self.val_fraction, self.seed
-        reader = NumberedReader(_TABLES[self.release], units_per_m=4000)
-        return reader, published_splits(splits, *given)
+            self.problems.compare_counts(splits, _PUBLISHED)
+        return published_splits(splits, self.test_split, self.val_fraction, self.seed)
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
@@ -159,20 +154,3 @@ class Matterport360(PanoramaDataModule):
             with_depth = depth if self.reads_depth else None
             images.append(ImageFiles(f"{scene}/{stem}", path, labels, with_depth))
         return images
-
-    def _compare_lists(self, splits: dict[Split, list[ImageFiles]], problems: Problems) -> None:
-        """Warn of lists of the release that differ from the files of their scenes."""
-        for split, name in _LISTS.items():
-            path = self.root / name
-            if not path.is_file():
-                continue
-            lines = path.read_text("utf-8", errors="replace").splitlines()
-            names = ["/".join(line.split()) for line in lines if line.strip()]
-            listed, there = set(names), {files.name for files in splits[split]}
-            if len(names) > len(there) or listed != there:
-                problems.warnings.append(
-                    f"{path}: {len(names)} names, {len(names) - len(listed)} of them repeated, "
-                    f"{len(listed - there)} without a panorama in a scene of {split}; "
-                    f"{len(there - listed)} panoramas of these scenes are not in it. "
-                    "Scenes define the splits."
-                )

@@ -26,7 +26,7 @@ from typing import Annotated
 
 from pydantic import Field
 
-from datamodules.cityscapes.classes import CLASSES, class_maps
+from datamodules.cityscapes import CLASSES, class_maps
 from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import Input
