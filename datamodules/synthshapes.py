@@ -8,17 +8,20 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from pydantic import ConfigDict, NonNegativeInt, PositiveInt
+from pydantic.dataclasses import dataclass
 from trimesh import Trimesh, creation, util
 from trimesh.convex import convex_hull
 from trimesh.exchange.off import export_off
 from trimesh.transformations import rotation_matrix
 
-from tangent_train.errors import at_least
+from datamodules.core.data_module import data_set
+from datamodules.modelnet40.shapes import ModelNet40
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
 from tangent_train.manifest import Manifest
@@ -103,26 +106,38 @@ CLASSES = tuple(sorted([*_SEATS, *_VESSELS, "airplane", "lamp"]))
 """Names of the classes, in alphabetical order."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class ShapeSettings:
     """Settings of a data set; the same settings give the same bytes.
 
     Attributes:
-        seed: Seed of everything, 0 or more.
+        seed: Seed of everything.
         train: Shapes of every class for training (and validation).
         test: Shapes of every class for the test.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    seed: int = 0
-    train: int = 80
-    test: int = 30
+    seed: NonNegativeInt = 0
+    train: PositiveInt = 80
+    test: PositiveInt = 30
 
-    def __post_init__(self) -> None:
-        for name, least in {"seed": 0, "train": 1, "test": 1}.items():
-            at_least(f"data.shapes.{name}", getattr(self, name), least)
+
+@data_set
+class SynthShapes(ModelNet40):
+    """Synthetic shapes, generated on first use and read as ModelNet40: no download.
+
+    Args:
+        shapes: Shapes to generate.
+    """
+
+    shapes: ShapeSettings = field(default_factory=ShapeSettings)
+
+    def find_classes(self) -> tuple[str, ...]:
+        """Return the names of the ten classes."""
+        return CLASSES
+
+    def make_files(self) -> None:
+        """Generate the files, unless they are there."""
+        generate_shapes(self.root, self.shapes)
 
 
 def generate_shapes(root: Path, settings: ShapeSettings) -> None:
