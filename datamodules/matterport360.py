@@ -25,10 +25,8 @@ Y. Zhang: "Matterport3D: Learning from RGB-D Data in Indoor Environments", 3DV 2
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from pathlib import Path
 from typing import ClassVar, Literal
 
 from datamodules.core.data_module import data_set
@@ -37,18 +35,13 @@ from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.splits import SPLITS, Split, published_splits
+from datamodules.tables import read_table
 from tangent_train.errors import DataError, SettingError
 
-_TABLES = Path(__file__).parent / "tables"
+_CATEGORIES = read_table("matterport360_classes")
+_SCENES = read_table("matterport360_scenes")
 
-
-def read_table(name: str) -> list[dict[str, str]]:
-    """Read the table ``classes`` or ``scenes``: rows of values by column."""
-    with (_TABLES / f"matterport360_{name}.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in read_table("classes"))
+CATEGORIES: tuple[str, ...] = tuple(row["category"] for row in _CATEGORIES)
 """Categories of the numbers 0 to 41 of `360fv`; those of `sfss` are one higher, 0 is the last."""
 
 CLASSES: tuple[str, ...] = (
@@ -62,7 +55,7 @@ CLASSES: tuple[str, ...] = (
 def _merged(column: str) -> LabelMap:
     """Return the 20 classes by a column of the table of classes."""
     members: dict[str, list[int]] = {name: [] for name in CLASSES}
-    for number, row in enumerate(read_table("classes")):
+    for number, row in enumerate(_CATEGORIES):
         members.get(row[column], []).append(number)
     return LabelMap.of(members, set(range(42)) - {n for ns in members.values() for n in ns})
 
@@ -125,7 +118,7 @@ class Matterport360(PanoramaDataModule):
     def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
         for split in SPLITS:
-            scenes = [row["scene"] for row in read_table("scenes") if row[self.release] == split]
+            scenes = [row["scene"] for row in _SCENES if row[self.release] == split]
             missing = []
             for scene in scenes:
                 images = self._list_images(scene)

@@ -7,10 +7,10 @@ in meters, stand on z = 0 and face +x.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pydantic import ConfigDict, NonNegativeInt, PositiveInt
@@ -22,86 +22,23 @@ from trimesh.transformations import rotation_matrix
 
 from datamodules.core.data_module import data_set
 from datamodules.modelnet40.shapes import ModelNet40
+from datamodules.tables import read_table
 from tangent_train.files import write_text
 from tangent_train.geometry import rotation_about
 from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
 
 _VERSION = 3  # other versions make other shapes from the same settings
-_Range = tuple[float, float]
+_SEATS = {row["class"]: row for row in read_table("synthshapes_seats")}
+"""Limits of sizes in meters; shares of round tops, pedestals, backs and arms."""
 
+_VESSELS = {row["class"]: row for row in read_table("synthshapes_vessels")}
+"""Limits of the height, of the radius relative to it, and of the points of the outline.
 
-class _Seat(NamedTuple):
-    """Ranges of sizes in meters, and shares of shapes with a round top, a pedestal and others."""
+Points have limits of height and radius, relative to those of the vessel. Shares of open vessels
+and handles.
+"""
 
-    width: _Range
-    depth: _Range
-    height: _Range
-    thick: _Range
-    round_top: float
-    pedestal: float
-    back: float = 0.0
-    back_height: _Range = (0.0, 0.0)
-    arms: float = 0.0
-
-
-class _Vessel(NamedTuple):
-    """Ranges of sizes of a surface of revolution.
-
-    Attributes:
-        height: In meters.
-        radius: Relative to the height.
-        outline: Ranges of height and radius of each point, relative to those of the vessel.
-        is_open: Share of vessels with a wall and an open top.
-        handle: Share of vessels with a handle.
-    """
-
-    height: _Range
-    radius: _Range
-    outline: Sequence[tuple[_Range, _Range]]
-    is_open: float
-    handle: float
-
-
-_SEATS = {
-    "bench": _Seat((0.8, 2), (0.3, 0.6), (0.3, 0.55), (0.03, 0.14), 0, 0, 0.5, (0.2, 0.55), 0.25),
-    "chair": _Seat(
-        (0.4, 0.65), (0.36, 0.6), (0.3, 0.55), (0.02, 0.1), 0.15, 0.25, 1, (0.2, 0.7), 0.4
-    ),
-    "stool": _Seat((0.26, 0.5), (0.24, 0.5), (0.35, 0.95), (0.02, 0.1), 0.6, 0.4, 0.2, (0.05, 0.2)),
-    "table": _Seat((0.5, 2), (0.4, 1.2), (0.35, 1), (0.02, 0.08), 0.35, 0.3),
-}
-_BOTTOM, _TOP = (0.0, 0.0), (1.0, 1.0)
-_VESSELS = {
-    "bottle": _Vessel(
-        (0.15, 0.4),
-        (0.12, 0.32),
-        [(_BOTTOM, (0.7, 1)), ((0.2, 0.3), (0.8, 1.1)), ((0.4, 0.7), _TOP), (_TOP, (0.2, 0.8))],
-        is_open=0,
-        handle=0.15,
-    ),
-    "bowl": _Vessel(
-        (0.05, 0.25),
-        (0.55, 2.8),
-        [(_BOTTOM, (0.2, 0.8)), ((0.2, 0.3), (0.6, 0.9)), ((0.6, 0.7), (0.9, 1)), (_TOP, _TOP)],
-        is_open=1,
-        handle=0.2,
-    ),
-    "cup": _Vessel(
-        (0.06, 0.15),
-        (0.28, 0.9),
-        [(_BOTTOM, (0.45, 1.05)), ((0.4, 0.6), (0.7, 1.2)), (_TOP, _TOP)],
-        is_open=1,
-        handle=0.55,
-    ),
-    "vase": _Vessel(
-        (0.12, 0.45),
-        (0.14, 0.45),
-        [(_BOTTOM, (0.4, 1)), ((0.25, 0.65), _TOP), ((0.75, 0.9), (0.25, 1)), (_TOP, (0.4, 1.5))],
-        is_open=0.5,
-        handle=0.2,
-    ),
-}
 CLASSES = tuple(sorted([*_SEATS, *_VESSELS, "airplane", "lamp"]))
 """Names of the classes, in alphabetical order."""
 
@@ -211,8 +148,8 @@ class _Shape:
         else:
             self._build_airplane()
 
-    def _chance(self, share: float) -> bool:
-        return bool(self._rng.random() < share)
+    def _chance(self, share: float | str) -> bool:
+        return bool(self._rng.random() < float(share))
 
     def box(self, center: Any, size: Any) -> None:
         """Add a box."""
@@ -225,20 +162,25 @@ class _Shape:
         """Add the surface of revolution of an outline of (radius, height)."""
         self.pieces.append(creation.revolve(outline, sections=24))
 
-    def _build_seat(self, kind: _Seat) -> None:
+    def _draw(self, limits: str) -> list[float]:
+        """Draw a number between each pair of limits."""
+        numbers = list(map(float, limits.replace(";", " ").split()))
+        return [self._between(*pair) for pair in zip(numbers[::2], numbers[1::2], strict=True)]
+
+    def _build_seat(self, row: dict[str, str]) -> None:
         """Add a top on four legs or a pedestal, perhaps with a back and arms."""
         between = self._between
-        width, depth, height = (between(*r) for r in (kind.width, kind.depth, kind.height))
-        thick = between(*kind.thick)
+        sizes = " ".join(row[name] for name in ("width", "depth", "height", "thick"))
+        width, depth, height, thick = self._draw(sizes)
         inner = 0.8
-        if self._chance(kind.round_top):
+        if self._chance(row["round_top"]):
             self._revolve(
                 [(0, height - thick), (width / 2, height - thick), (width / 2, height), (0, height)]
             )
             depth, inner = width, 0.6
         else:
             self.box((0, 0, height - thick / 2), (depth, width, thick))
-        if self._chance(kind.pedestal):
+        if self._chance(row["pedestal"]):
             self._rod((0, 0, 0), (0, 0, height), between(0.02, 0.06))
             self._revolve([(0, 0), (width * between(0.25, 0.5), 0), (0, 0.05)])
         else:
@@ -246,29 +188,28 @@ class _Shape:
             for x, y in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
                 top = np.array([x * depth, y * width, 0]) * inner / 2
                 self._rod(top * splay, np.add(top, (0, 0, height - thick / 2)), radius)
-        if self._chance(kind.back):
-            high = between(*kind.back_height)
+        if self._chance(row["back"]):
+            (high,) = self._draw(row["back_height"])
             self.box((-depth / 2, 0, height + high / 2), (between(0.02, 0.08), width, high))
-        if self._chance(kind.arms):
+        if self._chance(row["arms"]):
             for side in (-1, 1):
                 y, rise = side * width / 2, between(0.14, 0.26)
                 self.box((0, y, height + rise), (depth * between(0.6, 1), 0.05, 0.03))
                 self._rod((depth * 0.3, y, height - thick), (depth * 0.3, y, height + rise), 0.02)
 
-    def _build_vessel(self, kind: _Vessel) -> None:
+    def _build_vessel(self, row: dict[str, str]) -> None:
         """Add a surface of revolution, with a wall or closed, perhaps with a handle."""
-        height = self._between(*kind.height)
-        radius = height * self._between(*kind.radius)
-        outline = [
-            (radius * self._between(*r), height * self._between(*z)) for z, r in kind.outline
-        ]
-        if self._chance(kind.is_open):
+        height, share = self._draw(f"{row['height']} {row['radius']}")
+        radius = height * share
+        points = self._draw(row["outline"])
+        outline = [(radius * r, height * z) for z, r in zip(points[::2], points[1::2], strict=True)]
+        if self._chance(row["open"]):
             wall = radius * self._between(0.04, 0.12)
             inside = [(max(r - wall, 0.001), max(z, wall)) for r, z in reversed(outline)]
             self._revolve([(0, 0), *outline, *inside, (0, wall)])
         else:
             self._revolve([(0, 0), *outline, (0, height)])
-        if self._chance(kind.handle):
+        if self._chance(row["handle"]):
             size = height * self._between(0.15, 0.35)
             ring = creation.torus(size, size * 0.18, major_sections=20, minor_sections=8)
             ring.apply_transform(rotation_matrix(np.pi / 2, (1, 0, 0)))

@@ -1,6 +1,7 @@
 """Pairs of Stanford2D3DS's panoramas: the paper's sixty pairs of area 1, or all pairs in a room.
 
-``pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
+``tables/stanford2d3ds_pairs.csv`` holds the paper's tables of pairs and of single results as they
+are printed:
 number, split, images, overlap of the fields of view, then PMR, MS and P on the equirectangular
 image and at base levels 0, 1 and 2. Inconsistencies in print are kept: the means of
 the overlaps are 0.896 (easy) and 0.836 (hard) where the paper's text has 89.35 % and 83.35 %, and
@@ -10,7 +11,6 @@ hard although six easy pairs have the same overlap, 0.86: the split uses figures
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
 from collections.abc import Collection, Sequence
 from dataclasses import field
@@ -39,6 +39,7 @@ from datamodules.stanford2d3ds.panoramas import (
     read_depth,
     read_panorama_pose,
 )
+from datamodules.tables import read_table
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_rgb
 from tangent_train.rendering.resampling import resize
@@ -49,10 +50,9 @@ _SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
 
 def published_pairs() -> list[PublishedPair]:
     """Read the paper's pairs in the order of their numbers."""
-    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(file))[1:]
     pairs = []
-    for number, split, left, right, overlap, *printed in rows:
+    for row in read_table("stanford2d3ds_pairs"):
+        number, split, left, right, overlap, *printed = row.values()
         figures = list(map(float, printed))
         scores = {
             name: tuple(figures[3 * k : 3 * k + 3]) for k, name in enumerate(_REPRESENTATIONS)
