@@ -10,7 +10,7 @@ import pytest
 
 from datamodules import SynthRooms, SynthShapes
 from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthshapes.generate import generate_shapes
+from datamodules.synthshapes import generate_shapes
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES

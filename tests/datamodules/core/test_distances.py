@@ -37,9 +37,9 @@ from tests.conftest import fabricate
 from tests.datamodules.data_files import read_png, write_png
 from tests.datamodules.folder.folder_format import save, write_data_set
 from tests.datamodules.folder.photo_format import write_cameras, write_photos
-from tests.datamodules.matterport360.matterport_format import write_matterport
-from tests.datamodules.structured3d.structured3d_format import write_structured3d
-from tests.datamodules.synthia.synthia_format import write_views
+from tests.datamodules.matterport_format import write_matterport
+from tests.datamodules.structured3d_format import write_structured3d
+from tests.datamodules.synthia_format import write_views
 
 _AREAS = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), ("office_1",))
 UNEVEN = EquirectRepresentation(3, crop_deg=90, erp_height=16)

@@ -14,7 +14,7 @@ from datamodules.cityscapes.classes import CLASSES
 from tangent_train.results.published import facts
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
 from tests.cli.tiny_runs import Run, results
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
+from tests.datamodules.street_format import write_cityscapes, write_densepass
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
 

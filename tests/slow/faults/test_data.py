@@ -26,7 +26,7 @@ from tests.cli.tiny_runs import run_command
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import write_data_set
-from tests.datamodules.modelnet40.shapes_format import write_tree
+from tests.datamodules.shapes_format import write_tree
 
 _ERP = EquirectRepresentation(level=3)
 _BOTH: Any = ("rgb", "depth")

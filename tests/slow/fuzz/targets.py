@@ -31,7 +31,7 @@ from tangent_train.io.gpano import read_area, read_up
 from tangent_train.io.pixel_files import read_depth_m, read_pixels
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, xmp_packet
 from tests.datamodules.folder.folder_format import VALUES
-from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
+from tests.datamodules.zind_format import SQUARE, Camera, write_home
 
 _SHAPE = (8, 16)
 _RNG = np.random.default_rng(0)

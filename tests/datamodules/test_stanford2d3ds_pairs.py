@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 
 from datamodules.stanford2d3ds.pairs import StanfordPairs, published_pairs
-from datamodules.stanford2d3ds.reader import read_panorama_pose
+from datamodules.stanford2d3ds.panoramas import read_panorama_pose
 from datamodules.synthrooms.datamodule import SynthRoomsPairs
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions
-from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_panorama, write_paper_pairs
+from tests.datamodules.stanford_pairs_format import write_panorama, write_paper_pairs
 
 ROOMS = RoomSettings(rooms={"1": 3}, least_cameras=2, height=64, supersample=1)
 
@@ -88,9 +88,7 @@ def test_missing_areas_are_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"area_1.*Get Stanford2D3DS"):
         _ = StanfordPairs(tmp_path).names
     with pytest.raises(DataError, match=r"no two panoramas of one room; expected area_1"):
-        _ = StanfordPairs(tmp_path, "rooms").names
-    with pytest.raises(SettingError, match=r"data\.pairs: found all"):
-        StanfordPairs(tmp_path, "all")  # type: ignore[arg-type]
+        _ = StanfordPairs(tmp_path, selection="rooms").names
 
 
 # Depth and pose agree: what one panorama sees is where the other sees it.
@@ -108,7 +106,7 @@ def _disagreement(left: Any, right: Any) -> float:
 
 
 def test_pairs_of_synthetic_rooms_agree_in_depth_and_pose(rooms: Path) -> None:
-    pairs = SynthRoomsPairs(rooms, ROOMS)
+    pairs = SynthRoomsPairs(rooms, rooms=ROOMS)
     assert len(set(pairs.names)) == len(pairs.names) >= 3
     assert not pairs.published
     for index in range(len(pairs.names)):

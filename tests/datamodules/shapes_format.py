@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
-from datamodules.synthshapes.generate import make_shape
+from datamodules.synthshapes import make_shape
 
 COUNTS = {"chair": (6, 2), "cup": (4, 3), "night_stand": (5, 1)}
 """Shapes of every class for training and for the test."""

@@ -10,7 +10,7 @@ import pytest
 
 from datamodules.zind.layout import CLASSES, DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.geometry import equirect_directions
-from tests.datamodules.zind.zind_format import (
+from tests.datamodules.zind_format import (
     CORNERED,
     KINDS,
     SQUARE,

@@ -12,7 +12,7 @@ import pytest
 from trimesh import Trimesh, creation
 
 from datamodules.modelnet40.meshes import RADIUS, clean_mesh, mesh_spheres, read_off
-from datamodules.synthshapes.generate import make_shape
+from datamodules.synthshapes import make_shape
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions, random_rotation
 from tests.datamodules.rays import hit_distances

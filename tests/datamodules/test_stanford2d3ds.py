@@ -8,11 +8,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.core.splits import SPLITS
 from datamodules.core.images import distance_from_z_depth, steps_to_meters
-from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, FileName
-from datamodules.stanford2d3ds.reader import LabelTable
+from datamodules.core.splits import SPLITS
+from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
+from datamodules.stanford2d3ds.panoramas import (
+    Stanford2D3DS,
+    Stanford2D3DSPerspective,
+    read_instance_map,
+)
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.rendering import (
@@ -20,57 +23,20 @@ from tangent_train.rendering import (
     PerspectiveRepresentation,
     TangentRepresentation,
 )
-from tests.cli.tiny_runs import run_command
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of, read_png, write_png
 
 
-def _colors(indices: list[int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    return np.array([[[i >> 16, i >> 8 & 255, i & 255] for i in indices]], np.uint8)
-
-
-def test_pixels_of_instances_past_the_end_of_the_table_are_unknown() -> None:
+def test_pixels_of_instances_past_the_end_of_the_table_are_unknown(tmp_path: Path) -> None:
     # #0D0D0D without its red byte would be entry 3341 of the table.
-    table = LabelTable(np.full(9816, 6, np.uint8))
-    colors = _colors([0x0D0D0D, 9815, 9816, 0xFFFFFF])
-    assert table.decode(colors).tolist() == [[0, 6, 0, 0]]
-    assert table.past_end(colors).tolist() == [9816, 0xFFFFFF]
-
-
-def test_instances_past_the_end_are_counted_and_listed_by_the_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = fabricate(tmp_path, dict.fromkeys(AREAS, ("office_1",)))
-    file = next((root / "area_6/pano/semantic").iterdir())
-    colors = read_png(file)
-    known = int((colors != 13).any(-1).sum())
-    colors[20:22, 30:32] = (0xAB, 0xCD, 0xEF)
-    write_png(file, colors)
-    data = Stanford2D3DS(root, level=3, val_fraction=0)
-    data.prepare_data()
-    problems, _ = data.check()
-    (warning,) = problems.warnings
-    assert warning.startswith(f"{file}: 4 pixels of instance {0xEFCDAB} or higher, past the end")
-    assert not problems.listed()
-    place = [files.labels for files in data.index().splits["train"]].index(file)
-    assert np.count_nonzero(data.source("train").labels(place)) == known / 4 - 1
-    run_command(monkeypatch, "check", "data=stanford2d3ds", f"data.root={root}", "level=3")
-    assert f"Warning: {warning}" in capsys.readouterr().err
-
-
-# --- names -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "name",
-    [
-        "camera_0f_office_1_frame_equirectangular_domain_rgb.png",
-        f"camera_{'0f' * 16}_office_1_frame_left_domain_rgb.png",
-    ],
-)
-def test_other_file_names_are_refused(name: str) -> None:
-    with pytest.raises(DataError, match="unknown file name"):
-        FileName.parse(name)
+    path = tmp_path / "semantic_labels.json"
+    path.write_text(json.dumps(["<UNK>_0_<UNK>_0_0", *["clutter_1_office_1_1"] * 9815]))
+    colors = [[i >> 16, i >> 8 & 255, i & 255] for i in (0x0D0D0D, 9815, 9816, 0xFFFFFF, 0)]
+    labels = read_instance_map(path).decode(np.array([colors], np.uint8))
+    assert labels.tolist() == [[0, 6, 0, 0, 0]]
+    path.write_text('["beamer_1_office_1_1"]')
+    with pytest.raises(DataError, match="found class 'beamer'"):
+        read_instance_map(path)
 
 
 # --- splits ------------------------------------------------------------------------------------
@@ -101,7 +67,7 @@ def test_folds_are_disjoint_and_rooms_stay_whole(
 @pytest.mark.parametrize("erp_height", [32, 8])
 def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     module = Stanford2D3DS(stanford_root, EquirectRepresentation(3, erp_height=erp_height))
-    source = module.source("test")
+    source = module.dataset("test")
     area, room, camera = source.name(1).split("/")
     folder = stanford_root / area / "pano"
     panorama = source.read(1)
@@ -130,7 +96,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
 
 def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
     labeled, masked = (
-        Stanford2D3DS(stanford_root, erp, unknown=unknown).source("train").read(0).labels
+        Stanford2D3DS(stanford_root, erp, unknown=unknown).dataset("train").read(0).labels
         for unknown in ("labels", "any_black")
     )
     assert not masked[-2:, :4].any(), "a patch without blue"
@@ -140,16 +106,14 @@ def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
 # --- what cannot be used -----------------------------------------------------------------------
 
 
-def test_wrong_layouts_are_refused(tmp_path: Path, erp: Any) -> None:
-    broken_root = fabricate(tmp_path / "data", dict.fromkeys(AREAS, ("office_1",)), height=16)
-    with pytest.raises(DataError, match="no area_1, area_2"):
-        Stanford2D3DS(broken_root / "area_1", erp).setup()
-    (broken_root / "area_5b").rename(broken_root / "spare")
-    with pytest.raises(DataError, match=r"found no area_5b; expected all of area_1"):
-        Stanford2D3DS(broken_root, erp).setup()
-    (broken_root / "area_5b" / "data").mkdir(parents=True)
-    with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no panoramas"):
-        Stanford2D3DS(broken_root, erp).setup()
+def test_missing_areas_and_other_files_are_refused(tmp_path: Path, erp: Any) -> None:
+    root = fabricate(tmp_path / "data", dict.fromkeys(AREAS, ("office_1",)), height=16)
+    (root / "area_5b").rename(root / "spare")
+    with pytest.raises(DataError, match=r"area_5b/pano/rgb: found no images"):
+        Stanford2D3DS(root, erp).setup()
+    write_png(root / "area_1/pano/rgb/camera_0f_rgb.png", np.zeros((2, 4, 3), np.uint8))
+    with pytest.raises(DataError, match="unknown file name"):
+        Stanford2D3DS(root, erp, areas=["1", "5a"]).setup()
 
 
 # --- photos ---------------------------------------------------------------------------------------
@@ -167,7 +131,7 @@ def photo_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
-    source = Stanford2D3DSPerspective(photo_root, CROPS).source("test")
+    source = Stanford2D3DSPerspective(photo_root, CROPS).dataset("test")
     photo, name = source.read(1), source.name(1)
     area, room, camera, frame = name.split("/")
     stem = f"camera_{camera}_{room}_frame_{frame}_domain"
@@ -207,36 +171,3 @@ def test_photos_are_split_as_the_panoramas(photo_root: Path) -> None:
         shown, whole = names_of(photos, split), names_of(panoramas, split)
         assert len(shown) == 2 * len(whole) > 0
         assert {name.rpartition("/")[0] for name in shown} == set(whole)
-
-
-# --- samples -----------------------------------------------------------------------------------
-
-
-def test_samples_of_photos(photo_root: Path) -> None:
-    module = Stanford2D3DSPerspective(
-        photo_root, CROPS, batch_size=3, val_fraction=0, in_memory=True
-    )
-    batch = next(iter(module.train_dataloader()))
-    assert [part.shape for part in batch.images] == [(3, 2, 16, 16, 3), (3, 2, 16, 16)]
-    assert batch.labels.shape == (3, 2, 16, 16)
-    first, *_ = module.test_dataloader()
-    # 60° in crops of 45°: two across, two down.
-    assert first.target.shape == (1, 4, 16, 16)
-    quarter = (first.target[0] > 0).float().mean(dim=(1, 2))
-    assert (quarter < 0.75).all(), "what another crop owns does not count"
-
-
-# --- what cannot work --------------------------------------------------------------------------
-
-
-def test_a_photo_that_sees_less_than_a_crop_or_has_no_pose_is_named(tmp_path: Path) -> None:
-    broken_root = fabricate(tmp_path, photos=1)
-    module = Stanford2D3DSPerspective(broken_root, PerspectiveRepresentation(5, fov_deg=70))
-    next(broken_root.glob("area_5a/data/pose/*.json")).unlink()
-    with pytest.raises(DataError, match=r"pose\.json: found .*No such file"):
-        module.setup()
-    message = (
-        r"found 70° × 70° for an image that spans 60° × 60°, .*rgb\.png; expected all of a crop"
-    )
-    with pytest.raises(DataError, match=message):
-        module.setup()

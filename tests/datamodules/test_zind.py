@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules import Zind, ZindPairs
 from datamodules.core.splits import SPLITS
+from datamodules.zind.panoramas import Zind, ZindPairs
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import names_of
-from tests.datamodules.zind.zind_format import (
+from tests.datamodules.zind_format import (
     CORNERED,
     METERS,
     SCALE,
@@ -52,7 +52,7 @@ def _record(root: Path, room: int, name: str) -> Any:
 def test_labels_are_cast_at_the_size_of_the_run(
     root: Path, level: int, shape: tuple[int, int]
 ) -> None:
-    source = _zind(root, EquirectRepresentation(level=level), test_fraction=1).source("test")
+    source = _zind(root, EquirectRepresentation(level=level), test_fraction=1).dataset("test")
     rooms = {"pano_1": 1, "pano_2": 1, "pano_3": 2, "pano_5": 2, "pano_4": 3, "pano_6": 4}
     assert [source.name(k).rpartition("/")[2] for k in range(len(source))] == list(rooms)
     for index, (name, room) in enumerate(rooms.items()):
@@ -99,20 +99,13 @@ def test_the_partition_of_the_release_decides(root: Path) -> None:
         _zind(root).setup()
 
 
-def test_doors_may_be_unknown_and_a_store_is_of_one_choice_and_layout(
-    root: Path, tmp_path: Path
-) -> None:
-    settings: dict[str, Any] = {"test_fraction": 1, "store": tmp_path / "store"}
-    stored, ignoring = _zind(root, **settings), _zind(root, doors="ignore", **settings)
-    stored.prepare_data()
-    ignoring.prepare_data()
-    labels, ignored = (data.source("test").read(0).labels for data in (stored, ignoring))
+def test_doors_may_be_unknown(root: Path) -> None:
+    labels, ignored = (
+        _zind(root, doors=doors, test_fraction=1).dataset("test").read(0).labels
+        for doors in ("class", "ignore")
+    )
     assert (labels == 4).any()
     np.testing.assert_array_equal(ignored, np.where(labels == 4, 0, labels))
-    file = root / "000" / "zind_data.json"
-    file.write_text(file.read_text() + "\n")
-    with pytest.raises(DataError, match=r"labels made from zind_data\.json"):
-        stored.source("test").read(0)
 
 
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {
@@ -151,11 +144,6 @@ def _change(root: Path, change: dict[str, Any]) -> Path:
     content["merger"]["floor_01"]["complete_room_01"]["partial_room_01"]["pano_1"] |= change
     file.write_text(json.dumps(content))
     return file
-
-
-def test_a_folder_without_homes_is_refused(root: Path) -> None:
-    with pytest.raises(DataError, match=r"found no \*/zind_data\.json; .*github\.com/zillow"):
-        _zind(root / "000").setup()
 
 
 # --- pairs ----------------------------------------------------------------------------------------

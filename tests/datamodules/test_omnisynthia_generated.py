@@ -13,9 +13,9 @@ from datamodules.core.problems import Problems
 from datamodules.synthia.generate import make_panoramas
 from datamodules.synthia.reader import VIEWS
 from tangent_train.geometry import equirect_directions
+from tests.datamodules import synthia_format as synthia
 from tests.datamodules.data_files import contents, read_png
-from tests.datamodules.synthia import synthia_format as synthia
-from tests.datamodules.synthia.synthia_format import HEIGHT, SIZE
+from tests.datamodules.synthia_format import HEIGHT, SIZE
 
 DIRECTIONS = equirect_directions((HEIGHT, 2 * HEIGHT))
 PARTS = {"rgb": "RGB", "labels": "GT/LABELS_Correct", "depth": "Depth"}

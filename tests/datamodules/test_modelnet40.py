@@ -11,14 +11,12 @@ import torch
 import trimesh
 
 from datamodules.core.splits import SPLITS, Split
-from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
-from datamodules.modelnet40.shape_files import MODELNET40, find_shapes
-from datamodules.modelnet40.shape_samples import STEPS, ShapeViews
+from datamodules.modelnet40.shapes import MODELNET40, STEPS, ModelNet40, find_shapes
 from tangent_train.errors import DataError
 from tangent_train.rendering import TangentRepresentation, equirect_to_tangent
 from tests.datamodules.data_files import names_of
-from tests.datamodules.modelnet40.shapes_format import COUNTS, write_tree
+from tests.datamodules.shapes_format import COUNTS, write_tree
 
 PARTS = ("train", "test")
 
@@ -70,10 +68,7 @@ def make_module(root: Path) -> MakeModule:
 
 
 def _labels(module: ModelNet40, split: Split) -> list[int]:
-    return [module.class_names.index(mesh.label) for mesh in module.source(split).items]
-
-
-# --- splits ------------------------------------------------------------------------------------
+    return [module.class_names.index(mesh.label) for mesh in module.splits()[split]]
 
 
 def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> None:
@@ -90,7 +85,6 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
         assert len(names) == sum(len(_labels(module, split)) for split in SPLITS) == TRAINING + TEST
         assert all("/test/" in name for name in names_of(module, "test"))
     assert len(drawn) > 1
-    assert len(make_module(val_fraction=0).source("val")) == 0
     assert make_module(val_fraction=0).val_dataloader() == []
 
 
@@ -100,9 +94,6 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
     for use in (module.setup, module.prepare_data):
         with pytest.raises(DataError, match=r"no .*princeton"):
             use()
-
-
-# --- samples -----------------------------------------------------------------------------------
 
 
 def test_batches_have_the_documented_shapes(make_module: MakeModule) -> None:
@@ -121,7 +112,7 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
     """All six channels, against a rendering in float64 by the torch renderer."""
     module = make_module()
     batch = module.on_after_batch_transfer(next(iter(module.test_dataloader())), 0)
-    mesh = read_off(root / f"{module.source('test').name(3)}.off")
+    mesh = read_off(root / f"{module.dataset('test').name(3)}.off")
     spheres = torch.from_numpy(mesh_spheres(clean_mesh(mesh), (16, 32))).movedim(-1, 0)
     views = equirect_to_tangent(spheres, module.representation.grid)
     normalization: Any = module.normalization
@@ -143,9 +134,6 @@ def test_training_is_rotated_anew_every_time_and_evaluation_is_not(make_module: 
         assert torch.equal(one.images, other.images)
 
 
-# --- rotated test shapes ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rotation", ["so3", "yaw"])
 def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
     tmp_path: Path, rotation: Any
@@ -160,12 +148,11 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         ball.export(path)
     module = ModelNet40(root, representation, test_rotation=rotation, val_fraction=0)
     module.prepare_data()
-    samples = module.dataset("test")
-    assert isinstance(samples, ShapeViews)
+    samples: Any = module.dataset("test")
     for index in range(2):
         rotated = samples.shape_rotation(index)
         assert bool(rotated[2, 2] > 1 - 1e-12) is (rotation == "yaw")
-        mesh = clean_mesh(read_off(root / f"{module.source('test').name(index)}.off"))
+        mesh = clean_mesh(read_off(root / f"{module.dataset('test').name(index)}.off"))
         mesh.vertices = mesh.vertices @ rotated.T
         steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
         (views,) = representation.view_sets()
@@ -174,6 +161,6 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         )
         found = samples[0, index].images.numpy() / STEPS
         assert np.abs(found - expected / STEPS).mean() < 0.01  # facets have edges
-        upright = module.source("test").read(index).spheres
+        upright = module.dataset("test").read(index).spheres
         before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
         assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05

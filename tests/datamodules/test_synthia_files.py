@@ -7,11 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.synthia.reader import choose_frames, read_ids, read_view_camera
+from datamodules.synthia.reader import choose_frames, read_view_camera
 from tangent_train.errors import DataError
-from tests.datamodules.data_files import write_png
-
-# --- cameras -------------------------------------------------------------------------------------
 
 
 def _write_camera(folder: Path, text: str) -> Path:
@@ -42,20 +39,6 @@ def test_strange_cameras_are_refused(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
     with pytest.raises(DataError, match=r"intrinsics\.txt: found .* expected focal"):
         read_view_camera(tmp_path, (760, 1280))
-
-
-# --- labels --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("value", [16, 256])
-def test_there_are_no_other_labels(tmp_path: Path, value: int) -> None:
-    path = tmp_path / "labels.png"
-    write_png(path, np.full((2, 2), value, np.uint16 if value > 255 else np.uint8))
-    with pytest.raises(DataError, match=rf"labels\.png: found labels {value}; expected 0 to 15"):
-        read_ids(path)
-
-
-# --- frames --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres
-from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes, make_shape
+from datamodules.synthshapes import CLASSES, ShapeSettings, generate_shapes, make_shape
 from tests.datamodules.data_files import contents
 
 
