@@ -155,6 +155,7 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         sequences = (*self.train_sequences, *self.test_sequences)
         size = {"frames": self.frames, "height": self.panorama_height}
         make_panoramas(self.root, sequences, broken, **size)
+        vars(self).pop("_divided", None)  # listed before there were files
         if not self.skip_broken:
             broken.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 

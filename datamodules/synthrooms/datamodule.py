@@ -34,6 +34,7 @@ class SynthRoomsImages(StanfordImages):
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
         generate_rooms(self.root, self.rooms)
+        vars(self).pop("_divided", None)  # listed before there were files
 
 
 @data_set

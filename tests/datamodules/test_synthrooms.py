@@ -10,6 +10,7 @@ import pytest
 
 from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
 from datamodules.synthrooms.camera import PanoramaRays, PerspectiveRays, Pose, euler_rotation
+from datamodules.synthrooms.datamodule import SynthRooms
 from datamodules.synthrooms.furniture import build_room, draw_room_type
 from datamodules.synthrooms.generate import (
     INSTANCES,
@@ -45,14 +46,14 @@ def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
 @pytest.mark.parametrize(
     ("wrong", "message"),
     [
-        ({"rooms": {"7": 1}}, "rooms: found"),
-        ({"height": 7}, "height: found 7; expected an integer of 8 or more"),
-        ({"views": "all"}, "views: found all"),
+        ({"rooms": {"7": 1}}, "data.rooms: found"),
+        ({"height": 7}, "found 7; expected greater than or equal to 8"),
+        ({"views": "all"}, "found all; expected .stanford., .wide. or .uniform."),
     ],
 )
 def test_impossible_settings_are_named(wrong: dict[str, Any], message: str) -> None:
     with pytest.raises(SettingError, match=message):
-        RoomSettings(**wrong)
+        SynthRooms("rooms", rooms=wrong)
 
 
 SEEDS = range(60)

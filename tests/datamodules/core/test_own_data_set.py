@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 import datamodules
 from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import Split
 from datamodules.core.images import ImageFiles, PngReader
 from datamodules.core.problems import Problems
+from datamodules.core.splits import Split
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.pixel_files import read_pixels
 from tangent_train.rendering import EquirectRepresentation

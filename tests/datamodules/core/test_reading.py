@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.splits import DatasetIndex
 from datamodules.core.images import ImageFiles, Panorama
 from datamodules.core.reading import SplitReader
+from datamodules.core.splits import DatasetIndex
 from datamodules.core.transforms import EstimatedUp, PosedUp, RotatedPanoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_directions

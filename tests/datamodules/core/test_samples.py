@@ -8,8 +8,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
 from datamodules.core.images import Panorama
+from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
 from datamodules.core.samples import TrainingImages, jitter_colors, render_inputs, world_rays
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation

@@ -18,9 +18,9 @@ from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
 
 from datamodules.core.class_weights import class_weights
-from datamodules.core.splits import SPLITS
-from datamodules.core.loading import EpochSampler, sample_rng
 from datamodules.core.images import ImageFiles
+from datamodules.core.loading import EpochSampler, sample_rng
+from datamodules.core.splits import SPLITS
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from datamodules.stanford2d3ds.reader import StanfordReader
 from tangent_train.errors import SettingError
