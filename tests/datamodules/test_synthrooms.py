@@ -15,11 +15,7 @@ from datamodules.synthrooms.furniture import build_room, draw_room_type
 from datamodules.synthrooms.generate import (
     INSTANCES,
     RoomPlan,
-    RoomSettings,
     encode_picture,
-    label_indices,
-    label_strings,
-    plan_rooms,
     pose_record,
 )
 from datamodules.synthrooms.render import (
@@ -34,26 +30,9 @@ from datamodules.synthrooms.room import Room
 from tangent_train.errors import SettingError
 
 
-def test_rooms_have_as_many_cameras_as_wanted_and_are_the_same_rooms() -> None:
-    usual = plan_rooms(RoomSettings(rooms={"1": 50}))
-    more = plan_rooms(RoomSettings(rooms={"1": 50}, least_cameras=2))
-    for one, other in zip(usual, more, strict=True):
-        assert (one.name, one.area) == (other.name, other.area)
-        assert len(other.cameras) == max(2, len(one.cameras))
-        assert other.cameras[: len(one.cameras)] == one.cameras
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"rooms": {"7": 1}}, "data.rooms: found"),
-        ({"height": 7}, "found 7; expected greater than or equal to 8"),
-        ({"views": "all"}, "found all; expected .stanford., .wide. or .uniform."),
-    ],
-)
-def test_impossible_settings_are_named(wrong: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        SynthRooms("rooms", rooms=wrong)
+def test_impossible_settings_are_named() -> None:
+    with pytest.raises(SettingError, match=r"data\.rooms: found .*expected numbers of rooms"):
+        SynthRooms("rooms", rooms={"rooms": {"7": 1}})
 
 
 SEEDS = range(60)
@@ -103,21 +82,6 @@ ROOMS = [
     RoomPlan("1", "office_1", 0, [], RNG),
     RoomPlan("5b", "WC_17", 1, [CAMERA], RNG),
 ]
-
-
-def test_every_item_has_its_own_label_until_the_numbers_run_out() -> None:
-    items = ["floor", "chair", "<UNK>", "chair", "board", *["board"] * 5]
-    table = label_strings(ROOMS)
-    names = [table[k] for k in label_indices(ROOMS[1], items)]
-    tail = "WC_17_5"
-    assert names[:5] == [
-        f"floor_1_{tail}",
-        f"chair_1_{tail}",
-        "<UNK>_0_<UNK>_0_0",
-        f"chair_2_{tail}",
-        f"board_1_{tail}",
-    ]
-    assert names[-3:] == [f"board_{INSTANCES['board']}_{tail}"] * 3
 
 
 def test_pictures_survive_the_files() -> None:

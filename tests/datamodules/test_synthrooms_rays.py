@@ -76,15 +76,6 @@ def test_unscanned_surfaces_have_a_color_but_no_label_or_depth() -> None:
     np.testing.assert_array_equal(holed.rgb, whole.rgb)
 
 
-@pytest.mark.parametrize(("caps", "rows"), [((0.4, 0.0), [0]), ((0.0, 0.4), [-1]), ((0, 0), [])])
-def test_caps_are_black_and_missing(caps: tuple[float, float], rows: list[int]) -> None:
-    picture = take(PanoramaRays(Pose.looking(HERE, 0), 32), caps=caps)
-    black = (picture.rgb == 0).all(axis=(1, 2))
-    missing = (picture.items == MISSING).all(axis=1) & np.isnan(picture.depth_m).all(axis=1)
-    for row in (0, -1):
-        assert black[row] == missing[row] == (row in rows)
-
-
 # --- cameras --------------------------------------------------------------------------------------
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -76,14 +75,6 @@ def test_no_room_is_in_two_splits(root: Path) -> None:
         for seed in range(5)
     }
     assert len(drawn) > 1
-
-
-def test_homes_are_drawn_as_a_whole(root: Path) -> None:
-    write_homes(root, ["001", "002"])
-    data = _zind(root)
-    homes = [{n.partition("/")[0] for n in names_of(data, split)} for split in SPLITS]
-    assert sorted(map(len, homes)) == [1, 1, 1]
-    assert set.union(*homes) == {"000", "001", "002"}
 
 
 def test_the_partition_of_the_release_decides(root: Path) -> None:
@@ -194,17 +185,3 @@ def test_both_panoramas_see_the_same_room(tmp_path: Path) -> None:
         seen, away_m = side.pose.project([0, 6 * unit_m, unit_m])
         x, y = camera.local([(0, 6)])[0]
         np.testing.assert_allclose(seen * away_m, np.array([y, -x, 0]) * unit_m, atol=1e-9)
-
-
-def test_distant_pairs_and_floors_of_unknown_size_are_left_out(tmp_path: Path) -> None:
-    root = write_homes(tmp_path)
-    near = math.hypot(1.9, 1.2) * SCALE * METERS
-    assert len(ZindPairs(root, near + 1e-6).names) == 1
-    with pytest.raises(DataError, match=r"found no two panoramas .*data\.max_distance_m=null"):
-        _ = ZindPairs(root, near - 1e-6).names
-    file = root / "000" / "zind_data.json"
-    content = json.loads(file.read_text())
-    content["scale_meters_per_coordinate"]["floor_01"] = None
-    file.write_text(json.dumps(content))
-    with pytest.raises(DataError, match=r"found no two panoramas .*scale_meters_per_coordinate"):
-        _ = ZindPairs(root).names

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from datamodules.zind.layout import CLASSES, DOOR, OPENING, WINDOW, Fixture, Layout
-from tangent_train.geometry import equirect_directions
 from tests.datamodules.zind_format import (
     CORNERED,
     KINDS,
@@ -80,15 +79,6 @@ def test_the_frame_is_x_left_y_to_the_middle() -> None:
     assert rows.max() < 90 * (90 + 45) / 180
     assert (labels[0] == 1 + CLASSES.index("ceiling")).all()
     assert (labels[-1] == 1 + CLASSES.index("floor")).all()
-
-
-def test_rays_to_corners_meet_a_wall() -> None:
-    """The corners of the polygon are in the directions of the middles of columns."""
-    directions = equirect_directions((1, 16))[0]
-    corners = np.stack([-directions[:, 1], directions[:, 0]], axis=-1) * 2
-    for vertices in (corners, corners[::-1], corners[::4]):
-        distances = Layout(vertices, -5, 5).distances((1, 16))
-        np.testing.assert_allclose(distances[0, :: 16 // len(vertices)], 2, rtol=1e-8)
 
 
 def test_fixtures_a_little_off_their_wall_are_on_it() -> None:
