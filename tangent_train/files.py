@@ -250,6 +250,21 @@ def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
 
 
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace an existing output file, unless the user wants it.
+
+    Raises:
+        SettingError: The file exists.
+    """
+    if path.exists() and not overwrite:
+        raise SettingError(
+            "output",
+            found=f"{path}, which exists",
+            expected="a path that does not exist yet",
+            remedy="Give another output, or overwrite=true.",
+        )
+
+
 def config_folder() -> Path:
     """Return the folder of the configs: the copy inside the wheel, else that of the checkout."""
     package = Path(__file__).resolve().parent

@@ -44,7 +44,7 @@ ViewChoice = str | Mapping[str, Any] | None
 name as ``option``, with changed settings of the representation. None as trained."""
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
-_PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
 _ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
 
@@ -343,7 +343,7 @@ def panorama_settings(
     level = max(chosen)
     if views is not None:
         settings = view_settings(views)
-    elif settings["_target_"] == _PERSPECTIVE or (
+    elif settings["_target_"] == PERSPECTIVE or (
         base_level is not None and settings["_target_"] != _TANGENT
     ):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
@@ -385,7 +385,7 @@ def _photo_representation(
     trained: LoadedNetwork, level: int, base_level: int | None
 ) -> PerspectiveRepresentation:
     settings = trained.representation
-    if settings["_target_"] == _PERSPECTIVE and base_level is None:
+    if settings["_target_"] == PERSPECTIVE and base_level is None:
         half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
         half_extent /= 2.0 ** (level - trained.level)
         size = trained.image_size

@@ -82,7 +82,7 @@ def test_memory_of_another_size_or_on_a_disk_is_released(
     in_memory: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if not in_memory:
-        monkeypatch.setattr("tangent_train.rendering.accumulate._IN_MEMORY_BYTES", 0)
+        monkeypatch.setattr("tangent_train.rendering.numba_sums._IN_MEMORY_BYTES", 0)
     trained = trained_network(TANGENT)
     predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
     first = predictor.predict(InputImage(_blocks(64, 128)))

@@ -10,8 +10,8 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.loaded import METADATA_KEY, LoadedNetwork, declared_sizes
-from tangent_train.cli.run import Run, build, inputs_and_classes
+from tangent_train.checkpoints.loaded import LoadedNetwork, declared_sizes
+from tangent_train.cli.run import Run, build
 from tangent_train.config.build import build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
@@ -67,8 +67,8 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
     torch.manual_seed(2)
     data, task = build(settings)
     with_statistics(task.network)
-    run = Run(path.parent, settings, None, data, task)
-    content = {METADATA_KEY: run.loaded().plain(), "config": settings, **inputs_and_classes(data)}
+    run = Run(path.parent, settings, data, task)
+    content = run.contents()
     torch.save(content | {"state_dict": task.state_dict()}, path)
     trained: SegmentationTask = task.eval()
     return trained

@@ -26,7 +26,7 @@ ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
 DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 
 
-def _composed(*overrides: str) -> dict[str, Any]:
+def _composed(*overrides: str) -> Any:
     return composed_settings("train", "level=5", "representation.erp_height=32", *overrides)
 
 
