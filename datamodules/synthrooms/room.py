@@ -1,8 +1,8 @@
 """Rooms under construction: items composed of boxes, cylinders and balls, with materials.
 
 ``tables/synthrooms_parts.csv`` is the table of parts of all furniture. A position or size in it
-is a sum such as ``0.5wide-0.03``, in meters and in values of the piece. `mirror` repeats rows at −x (``x``), or at
-−x and −y (``xy``). ``body:0.6`` is the material `body`, shaded by 0.6.
+is a sum such as ``0.5wide-0.03``, in meters and in values of the piece. `mirror` repeats rows at
+−x (``x``), or at −x and −y (``xy``). ``body:0.6`` is the material `body`, shaded by 0.6.
 """
 
 from __future__ import annotations
