@@ -22,22 +22,23 @@ B. Schiele: "The Cityscapes Dataset for Semantic Urban Scene Understanding", CVP
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field
 
-from datamodules.cityscapes.classes import CLASS_SETS
+from datamodules.cityscapes.classes import CLASSES, class_maps
+from datamodules.core.data_module import data_set
 from datamodules.core.image_module import PhotoDataModule
-from datamodules.core.splits import Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from tangent_train.config.build import check_fields
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.splits import Split, published_splits
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
+from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.pixel_files import read_image_size
 
 _GET_IT = (
@@ -46,23 +47,48 @@ _GET_IT = (
 )
 _PUBLISHED = {"train": 2975, "val": 500}
 _IDS = (7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33)
-_TABLE = number_table(_IDS, [*range(34), 255])  # 255: license plates, id -1
+_LABELS = LabelMap.of(
+    dict(zip(CLASSES, _IDS, strict=True)),
+    [*set(range(34)).difference(_IDS), 255],  # 255: license plates, id -1
+)
 _CAMERA = '{"intrinsic": {"fx": …, "fy": …, "u0": …, "v0": …}}, in pixels'
 
 
-@dataclass(frozen=True, eq=False)
-class CityscapesReader(NumberedReader):
-    """Decoder of the files of Cityscapes.
+class _Intrinsic(BaseModel):
+    fx: Annotated[float, Field(gt=0)]
+    fy: Annotated[float, Field(gt=0)]
+    u0: float
+    v0: float
 
-    Attributes:
-        fov: Horizontal field of view of all photos in degrees; None to read the camera files.
+
+class _CameraFile(BaseModel):
+    intrinsic: _Intrinsic
+
+
+@data_set
+class Cityscapes(PhotoDataModule):
+    """Cityscapes, 19 or 13 classes.
+
+    The published validation images are the test split: whole training cities are drawn for
+    validation, at least one, so that nothing is selected on the test images.
+
+    Args:
+        fov: Horizontal field of view of all photos in degrees, instead of the camera files.
     """
 
-    fov: float | None = None
+    label_maps = class_maps(_LABELS)
+    no_depth = "disparities are not read"
 
-    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
+    inputs: Sequence[Input] = ("rgb",)
+    fov: Annotated[float, Field(gt=0, lt=180)] | None = None
+
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_cities[split]
+
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """Return the labels; refuse the dummies of the test images."""
-        labels = super().labels(files, shape)
+        labels = super().decode_labels(files)
         if not labels.any():
             raise DataError(
                 files.labels,
@@ -73,62 +99,24 @@ class CityscapesReader(NumberedReader):
             )
         return labels
 
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """Read the camera; u0 and v0 count from the center of the first pixel."""
-        size, path = read_image_size(files.rgb), files.camera
-        if path is None:
-            return camera_matrix_from_fov(self.fov or 0, size)
-        kinds = dict.fromkeys(("fx", "fy", "u0", "v0"), float)
-        content = check_fields(path, read_json(path, _CAMERA), {"intrinsic": dict}, _CAMERA)
-        fx, fy, x, y = check_fields(
-            path, content["intrinsic"], kinds, _CAMERA, "intrinsic"
-        ).values()
-        matrix = np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]])
-        if not (is_camera_matrix(matrix) and 0 <= x < size[1] and 0 <= y < size[0]):
-            found = f"fx={fx}, fy={fy}, u0={x}, v0={y}"
-            raise DataError(path, found=found, expected=f"{_CAMERA} of {files.rgb}")
-        return matrix
+        if files.camera is None:
+            return camera_matrix_from_fov(self.fov or 0, read_image_size(files.rgb))
+        camera = read_json(files.camera, _CAMERA, kind=_CameraFile).intrinsic
+        return np.array([[camera.fx, 0, camera.u0], [0, camera.fy, camera.v0], [0, 0, 1]])
 
-
-@dataclass(kw_only=True, eq=False, repr=False)
-class Cityscapes(PhotoDataModule):
-    """Cityscapes, 19 or 13 classes.
-
-    The published validation images are the test split: whole training cities are drawn for
-    validation, at least one, so that nothing is selected on the test images.
-
-    Args:
-        fov: Horizontal field of view of all photos in degrees, instead of the camera files.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
-
-    class_sets = CLASS_SETS
-    no_depth = "disparities are not read"
-
-    inputs: Sequence[Input] = ("rgb",)
-    fov: float | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        fine = self.fov is None or 0 < self.fov < 180
-        self.require("fov", fine, "degrees, more than 0 and less than 180; or null")
-
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[CityscapesReader, dict[Split, Sequence[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    @cached_property
+    def _splits_of_cities(self) -> dict[Split, Sequence[ImageFiles]]:
         published: dict[Split, list[ImageFiles]] = {
             "train": self._list_images("train"),
             "val": self._list_images("val"),
         }
-        problems.compare_counts(published, _PUBLISHED)
+        self.problems.compare_counts(published, _PUBLISHED)
         for split, images in published.items():
             labels = (self.root / "gtFine" / split).glob("*/[!.]*_labelIds.png")
-            problems.note_strays(labels, images)
-        splits = published_splits(published, "val", self.val_fraction, self.seed)
-        return CityscapesReader(_TABLE, self.fov), splits
+            self.problems.note_strays(labels, images)
+        return published_splits(published, "val", self.val_fraction, self.seed)
 
     def _list_images(self, split: str) -> list[ImageFiles]:
         """Return the images of a published split, in the order of their names."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torchvision.transforms.v2 import functional
 
-from datamodules.core.inputs import MAX_DEPTH_M, Input
 from datamodules.core.images import STEPS_PER_M, Image
+from datamodules.core.inputs import MAX_DEPTH_M, Input
 from tangent_train.geometry import equirect_elevations
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.representations.views import Views

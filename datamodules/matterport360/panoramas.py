@@ -27,18 +27,17 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.labels import ClassSet
-from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from tangent_train.errors import DataError
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, published_splits
+from tangent_train.errors import DataError, SettingError
 
 _HERE = Path(__file__).parent
 
@@ -60,10 +59,13 @@ CLASSES: tuple[str, ...] = (
 """The 20 classes of `360fv`."""
 
 
-def _merged(column: str) -> ClassSet:
+def _merged(column: str) -> LabelMap:
     """Return the 20 classes by a column of ``classes.csv``."""
-    merged = {row["category"]: row[column] for row in read_table("classes.csv")}
-    return ClassSet(CLASSES, CATEGORIES, merged)
+    values: dict[str, list[int]] = {name: [] for name in CLASSES}
+    unknown = []
+    for value, row in enumerate(read_table("classes.csv")):
+        values.get(row[column], unknown).append(value)
+    return LabelMap.of(values, unknown)
 
 
 _GET_IT = (
@@ -81,14 +83,13 @@ _FOLDERS = {
 }
 """Folders of a scene: color, classes, depth."""
 
-_TABLES = {"360fv": number_table(range(42), ()), "sfss": number_table(range(1, 42), [0])}
 _PUBLISHED = {"train": 7829, "val": 772, "test": 2014}
 """Panoramas of `360fv`."""
 
 _LISTS: Mapping[Split, str] = {"train": "train.txt", "val": "validation.txt", "test": "test.txt"}
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Matterport360(PanoramaDataModule):
     """Panoramas of Matterport3D, 20 classes, or 41 with ``release=sfss``.
 
@@ -96,16 +97,14 @@ class Matterport360(PanoramaDataModule):
         release: `360fv` or `sfss`, see above.
         test_split: Published split of the test panoramas. With `val`, validation uses scenes
             drawn from the training scenes, so that nothing is selected on the test panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_sets: ClassVar[Mapping[str, ClassSet]] = {
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {
         "20": _merged("corrected"),
         "360bev": _merged("360bev"),
-        "41": ClassSet(CATEGORIES[:-1], CATEGORIES[:-1]),
+        "41": LabelMap.of(CATEGORIES[:-1], [0]),
     }
+    units_per_m = 4000
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
@@ -113,18 +112,20 @@ class Matterport360(PanoramaDataModule):
     test_split: Literal["test", "val"] = "test"
 
     def __post_init__(self) -> None:
-        self.require_one_of("release", "360fv", "sfss")
-        self.require_one_of("test_split", "test", "val")
-        is_sfss = self.release == "sfss"
         if not self.has_distances:
-            self.classes = str(self.classes or (41 if is_sfss else 20))
-            self.require_one_of("classes", *(["41"] if is_sfss else ["20", "360bev"]))
+            of_release = ["41"] if self.release == "sfss" else ["20", "360bev"]
+            self.classes = str(self.classes or of_release[0])
+            if self.classes not in of_release:
+                expected = " or ".join(of_release)
+                raise SettingError("data.classes", found=self.classes, expected=expected)
         super().__post_init__()
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_scenes[split]
+
+    @cached_property
+    def _splits_of_scenes(self) -> dict[Split, Sequence[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
         rows = read_table("scenes.csv")
         for split in SPLITS:
@@ -133,7 +134,7 @@ class Matterport360(PanoramaDataModule):
             splits[split] = [files for images in listed.values() for files in images]
             missing = [scene for scene in scenes if not listed[scene]]
             if missing:
-                problems.warnings.append(
+                self.problems.warnings.append(
                     f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "
                     f"{', '.join(missing[:3])}"
                 )
@@ -142,12 +143,10 @@ class Matterport360(PanoramaDataModule):
             found = f"no panoramas of release={self.release}"
             raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
         if self.release == "360fv":
-            problems.compare_counts(splits, _PUBLISHED)
+            self.problems.compare_counts(splits, _PUBLISHED)
         else:
-            self._compare_lists(splits, problems)
-        given = self.test_split, self.val_fraction, self.seed
-        reader = NumberedReader(_TABLES[self.release], units_per_m=4000)
-        return reader, published_splits(splits, *given)
+            self._compare_lists(splits)
+        return published_splits(splits, self.test_split, self.val_fraction, self.seed)
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])
@@ -160,7 +159,7 @@ class Matterport360(PanoramaDataModule):
             images.append(ImageFiles(f"{scene}/{stem}", path, labels, with_depth))
         return images
 
-    def _compare_lists(self, splits: dict[Split, list[ImageFiles]], problems: Problems) -> None:
+    def _compare_lists(self, splits: dict[Split, list[ImageFiles]]) -> None:
         """Warn of lists of the release that differ from the files of their scenes."""
         for split, name in _LISTS.items():
             path = self.root / name
@@ -170,7 +169,7 @@ class Matterport360(PanoramaDataModule):
             names = ["/".join(line.split()) for line in lines if line.strip()]
             listed, there = set(names), {files.name for files in splits[split]}
             if len(names) > len(there) or listed != there:
-                problems.warnings.append(
+                self.problems.warnings.append(
                     f"{path}: {len(names)} names, {len(names) - len(listed)} of them repeated, "
                     f"{len(listed - there)} without a panorama in a scene of {split}; "
                     f"{len(there - listed)} panoramas of these scenes are not in it. "

@@ -8,29 +8,27 @@ can be used, such as ModelNet10.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Sequence
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
+import numpy as np
+from pydantic import PositiveInt
 from torch import Tensor
 
-from datamodules.core.splits import DatasetIndex, Split, draw_groups
+from datamodules.core.data_module import DataModule, data_set
+from datamodules.core.image_module import check_representation
 from datamodules.core.inputs import Normalization
 from datamodules.core.labels import IMAGE_CLASS
-from datamodules.core.problems import Problems
 from datamodules.core.processes import in_processes
-from datamodules.core.split_module import SplitDataModule
-from datamodules.core.store import Declared, Store
-from datamodules.modelnet40.meshes import CHANNELS
+from datamodules.core.splits import Split, draw_groups
+from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from datamodules.modelnet40.shape_files import MODELNET40, ShapeFile, find_shapes
 from datamodules.modelnet40.shape_samples import (
-    MOST_STEPS,
     SPHERE_NORMALIZATION,
+    STEPS,
     ShapeSample,
     ShapeViews,
     Spheres,
     TestRotation,
-    make_spheres,
     normalize_spheres,
 )
 from tangent_train.errors import DataError
@@ -39,12 +37,12 @@ from tangent_train.rendering import TangentRepresentation
 _PER_PROCESS = 40
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class ModelNet40(SplitDataModule[ShapeFile]):
+@data_set
+class ModelNet40(DataModule):
     """Shapes as spheres, for classification.
 
-    The spheres are computed once, on all cores, before the first run (`prepare_data`), into a
-    folder for their size, ``spheres_<height>x<width>``, of `store`, by default of `root`.
+    The spheres are computed once, on all cores, before the first run (`prepare_data`), into the
+    `cache`, by default the folder ``spheres`` of `root`.
     Validation takes the same share of the training shapes of every class, drawn from the seed.
 
     Args:
@@ -63,20 +61,19 @@ class ModelNet40(SplitDataModule[ShapeFile]):
     """
 
     noun: ClassVar[str] = "shapes"
+    kind = Spheres
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
-    batch_size: int = 16
+    batch_size: PositiveInt = 16
     test_rotation: TestRotation = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.require_representation("erp_height", "tangent")
-        self.require(
-            "test_rotation", self.test_rotation in (None, "yaw", "so3"), "null, yaw or so3"
-        )
+        check_representation(self, "erp_height", "tangent")
+        self.cache = self.cache or self.root / "spheres"
         self.erp_height: int = self.representation.erp_height
-        self.class_names = self.find_classes()
+        self.class_names = self.find_classes()  # type: ignore[misc]
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
 
@@ -90,31 +87,33 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             return MODELNET40
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
 
-    def find(self, problems: Problems) -> DatasetIndex[ShapeFile]:
-        """See `LabeledData`."""
-        del problems
+    def files(self, split: Split) -> list[ShapeFile]:
+        """See `DataModule`."""
         meshes = find_shapes(self.root)
         chosen = self._choose_for_validation(meshes)
-        splits: dict[Split, list[ShapeFile]] = {"train": [], "val": [], "test": []}
-        for mesh in meshes:
-            splits["val" if mesh.name in chosen else mesh.part].append(mesh)
-        for split in ("train", "test"):
-            if not splits[split]:
-                raise DataError(self.root, found=f"no {split} shape", expected="some")
-        shape = self.erp_height, 2 * self.erp_height
-        folder = (self.store or self.root) / f"spheres_{shape[0]}x{shape[1]}"
-        store = Store(folder, {"spheres": Declared("uint16", (*shape, CHANNELS), MOST_STEPS)})
-        return DatasetIndex(
-            self.noun, splits, partial(make_spheres, shape), Spheres, store, _in_processes
-        )
+        found = [m for m in meshes if split == ("val" if m.name in chosen else m.part)]
+        if not found and split != "val":
+            raise DataError(self.root, found=f"no {split} shape", expected="some")
+        return found
 
-    def dataset(self, split: Split) -> ShapeViews:
-        """See `LabeledData`: samples `ShapeSample`; the test shapes are rotated if set."""
-        source, views = self.source(split), (self.class_names, self.representation)
-        if split == "train":
-            return ShapeViews(source, *views, (self.seed, self.sampling_seed), random=True)
-        rotation = self.test_rotation if split == "test" else None
-        return ShapeViews(source, *views, self.seed, rotation=rotation)
+    def read(self, files: ShapeFile) -> Spheres:
+        """See `DataModule`: a mesh as seen from the sphere around it."""
+        values = mesh_spheres(
+            clean_mesh(read_off(files.path)), (self.erp_height, 2 * self.erp_height)
+        )
+        return Spheres(np.rint(values * STEPS).astype(np.uint16))
+
+    def decode_settings(self) -> dict[str, Any]:
+        """See `DataModule`."""
+        return {"rows": self.erp_height}
+
+    def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
+        """See `DataModule`; not in threads, because reading meshes holds the GIL."""
+        return in_processes(work, [(item,) for item in items], least=_PER_PROCESS)
+
+    def build_dataset(self, split: Split) -> ShapeViews:
+        """See `DataModule`: samples `ShapeSample`; the test shapes are rotated if set."""
+        return ShapeViews(self, split)
 
     @property
     def in_channels(self) -> int:
@@ -128,7 +127,7 @@ class ModelNet40(SplitDataModule[ShapeFile]):
 
     def evaluation_size(self) -> int:
         """Shapes per evaluation batch: as many as in training."""
-        return self.per_step
+        return self.batch_size
 
     def _choose_for_validation(self, meshes: Sequence[ShapeFile]) -> set[str]:
         """Draw the names of validation shapes: the same share of every class's training shapes.
@@ -140,8 +139,3 @@ class ModelNet40(SplitDataModule[ShapeFile]):
             names = [m.name for m in meshes if m.label == label and m.part == "train"]
             chosen |= draw_groups(names, self.val_fraction, (self.seed, number))
         return chosen
-
-
-def _in_processes(work: Callable[[ShapeFile], Any], meshes: Sequence[ShapeFile]) -> Generator[Any]:
-    # Not threads: reading meshes holds the GIL.
-    return in_processes(work, [(mesh,) for mesh in meshes], least=_PER_PROCESS)

@@ -53,9 +53,9 @@ class ShapeFile(NamedTuple):
     part: Literal["train", "test"]
 
     @property
-    def parts(self) -> dict[str, Path]:
+    def paths(self) -> tuple[Path, ...]:
         """Files that the spheres are computed from."""
-        return {"mesh": self.path}
+        return (self.path,)
 
 
 def find_shapes(root: Path) -> list[ShapeFile]:

@@ -3,25 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
 
+from datamodules.core.dataset import SplitDataset
 from datamodules.core.inputs import Normalization, normalize_channels
-from datamodules.core.loading import Seed, sample_key, sample_rng
-from datamodules.core.reading import SplitReader
-from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
-from datamodules.modelnet40.shape_files import ShapeFile
+from datamodules.core.loading import sample_key, sample_rng
 from tangent_train.geometry import random_rotation, rotation_about
-
-_Shapes = SplitReader[ShapeFile, Any]
-
 
 SPHERE_NORMALIZATION = Normalization(
     mean=(0.7139, 0.6936, 0.5851, 0.5336, 0.7626, 0.5651),
@@ -42,10 +34,6 @@ coarse around 1, and OpenCV does not sample it.
 """
 
 
-MOST_STEPS = 2 * STEPS - 1
-"""The largest prepared value."""
-
-
 class Spheres(NamedTuple):
     """A mesh as seen from the sphere around it.
 
@@ -54,12 +42,6 @@ class Spheres(NamedTuple):
     """
 
     spheres: NDArray[np.uint16]
-
-
-def make_spheres(shape: tuple[int, int], mesh: ShapeFile) -> Spheres:
-    """Make the spheres of a mesh, of a shape ``(H, W)``."""
-    values = mesh_spheres(clean_mesh(read_off(mesh.path)), shape)
-    return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
 
 class ShapeSample(NamedTuple):
@@ -77,54 +59,42 @@ class ShapeSample(NamedTuple):
     index: Tensor  # type: ignore[assignment]  # hides tuple.index
 
 
-@dataclass(frozen=True)
-class ShapeViews(Dataset[ShapeSample]):
+class ShapeViews(SplitDataset):
     """Views of shapes, by index or (epoch, index).
 
-    Attributes:
-        source: The shapes.
-        class_names: Names of the labels, in order.
-        representation: Representation of the images.
-        seed: Seed of the run, 0 or more.
-        random: True to draw views for every epoch and index; otherwise all views are returned.
-        rotation: Rotation of whole shapes in evaluation, different for each shape.
+    They are drawn for every epoch and index in training, and all in evaluation.
     """
-
-    source: _Shapes
-    class_names: Sequence[str]
-    representation: Any
-    seed: Seed
-    random: bool = False
-    rotation: TestRotation = None
-
-    def __len__(self) -> int:
-        return len(self.source)
 
     def __getitem__(self, key: int | tuple[int, int]) -> ShapeSample:
         epoch, index = sample_key(key, len(self))
-        spheres = self.source.read(index).spheres
+        spheres = self.read(index).spheres
         images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(epoch, index)])
         # torch has few operations on uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
-            torch.tensor(self.class_names.index(self.source.items[index].label)),
+            torch.tensor(self.data.class_names.index(self.files[index].label)),
             torch.tensor(index),
         )
 
     def _views(self, epoch: int, index: int) -> list[Any]:
-        if self.random:
-            return [self.representation.sample(sample_rng(self.seed, epoch, index))]
-        if self.rotation is None:
-            return self.representation.view_sets()
-        # Rotated back, it sees what a rotated shape shows.
-        return self.representation.with_rotation(self.shape_rotation(index).T).view_sets()
+        data, representation = self.data, self.data.representation
+        if self.split == "train":
+            rng = sample_rng((data.seed, data.sampling_seed), epoch, index)
+            return [representation.sample(rng)]
+        if self.split == "val" or data.test_rotation is None:
+            views: list[Any] = representation.view_sets()
+        else:  # rotated back, it sees what a rotated shape shows
+            rotation = shape_rotation(data.test_rotation, data.seed, index)
+            views = representation.with_rotation(rotation.T).view_sets()
+        return views
 
-    def shape_rotation(self, index: int) -> NDArray[np.float64]:
-        """Return the rotation R of one shape, ``(3, 3)``: point x moves to R x."""
-        rng = sample_rng(self.seed, 0, index)
-        if self.rotation == "so3":
-            return random_rotation(rng)
-        return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
+
+def shape_rotation(kind: TestRotation, seed: int, index: int) -> NDArray[np.float64]:
+    """Return the rotation R of one shape, ``(3, 3)``: point x moves to R x."""
+    rng = sample_rng(seed, 0, index)
+    if kind == "so3":
+        return random_rotation(rng)
+    return rotation_about((0, 0, 1), rng.uniform(0, 2 * math.pi))
 
 
 def normalize_spheres(images: Tensor, normalization: Normalization) -> Tensor:

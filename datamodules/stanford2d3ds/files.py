@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
-from datamodules.core.labels import ClassSet, class_sets
+from datamodules.core.label_map import LabelMap
 from datamodules.core.problems import Problems
 from tangent_train.errors import DataError
 
@@ -39,8 +39,8 @@ EIGHT: tuple[str, ...] = (
 )
 """The classes of the adaptation benchmarks SPin8, SPan8 and S3D8."""
 
-CLASS_SETS = class_sets(CLASSES, {"8": ClassSet(EIGHT, CLASSES)})
-"""Values of the setting `classes`."""
+LABEL_MAPS = {"13": LabelMap.grouped(CLASSES), "8": LabelMap.grouped(EIGHT)}
+"""Values of the setting `classes`, by names of classes."""
 
 UNKNOWN_CLASS = "<UNK>"
 """Class of unlabeled instances."""

@@ -16,20 +16,21 @@ from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+from datamodules.core.images import resize_depth, steps_to_meters
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
     PanoramaPairs,
     PublishedPair,
     paired_shape,
 )
-from datamodules.core.images import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
 from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
@@ -114,9 +115,10 @@ class StanfordPairs(PanoramaPairs):
         image = files.image
         rgb = read_rgb(image.rgb)
         shape = paired_shape(image.rgb, rgb, self._height)
-        steps = resize_depth(read_depth(image.parts["depth"]), shape)
+        depth: Any = image.depth
+        steps = resize_depth(read_depth(depth), shape)
         pose = read_panorama_pose(files.pose)
-        small = resize_area(rgb, shape)
+        small = resize(rgb, shape, "bilinear")
         return PairedPanorama(image.name, small, image.rgb, steps_to_meters(steps), pose)
 
 

@@ -11,11 +11,11 @@ On disk, as released::
         pano/
           rgb/       camera_<32 hex>_<room>_<n>_frame_equirectangular_domain_rgb.png       8 bit
           depth/     camera_…_domain_depth.png       16 bit, 1/512 m, 65535 = missing
-          semantic/  camera_…_domain_semantic.png    8 bit, see `LabelTable`
+          semantic/  camera_…_domain_semantic.png    8 bit, see `read_label_table`
         data/                         photos of 1080×1080, rendered from the same scans
           rgb/       camera_<32 hex>_<room>_<n>_frame_<j>_domain_rgb.png             8 bit
           depth/     camera_…_domain_depth.png       16 bit, z-depth in 1/512 m, 65535 = missing
-          semantic/  camera_…_domain_semantic.png    8 bit, see `LabelTable`
+          semantic/  camera_…_domain_semantic.png    8 bit, see `read_label_table`
           pose/      camera_…_domain_pose.json       `camera_k_matrix`, counted from pixel corners
 
 License: free for research, on request: http://buildingparser.stanford.edu/dataset.html
@@ -28,22 +28,32 @@ Understanding", arXiv:1702.01105, 2017.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
-from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.splits import Split, draw_groups
+from datamodules.core.data_module import data_set
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from datamodules.stanford2d3ds.files import AREAS, CLASS_SETS, CLASSES, FOLDS, GET_IT, list_pictures
-from datamodules.stanford2d3ds.reader import LabelTable, StanfordReader
-from tangent_train.errors import DataError
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import Split, draw_groups
+from datamodules.stanford2d3ds.files import AREAS, FOLDS, GET_IT, LABEL_MAPS, list_pictures
+from datamodules.stanford2d3ds.reader import (
+    read_camera_matrix,
+    read_depth,
+    read_label_table,
+    read_panorama_pose,
+    read_photo_pose,
+)
+from tangent_train.errors import DataError, SettingError
+from tangent_train.geometry import PanoramaPose
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class StanfordAreas(ImageDataModule):
     """The three folds of the authors, with rooms for validation.
 
@@ -57,40 +67,36 @@ class StanfordAreas(ImageDataModule):
 
     Attributes:
         group: Folder of the images, `pano` or `data`.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *CLASSES)
-    class_sets = CLASS_SETS
+    label_maps = LABEL_MAPS
+    folds = tuple(FOLDS)
     group: ClassVar[Literal["pano", "data"]]
 
     fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
 
-    fold: int = 1
+    fold: Literal[1, 2, 3] = 1
     areas: Sequence[str] = AREAS
     label_table: Path | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.label_table = None if self.label_table is None else Path(self.label_table)
-        fine = self.label_table is None or not self.has_distances
-        self.require("label_table", fine, "null: distances have no classes")
-        self.require("fold", self.fold in FOLDS, "1, 2 or 3")
         areas, testing = set(self.areas), set(FOLDS[self.fold])
-        self.require(
-            "areas",
-            areas <= set(AREAS) and bool(testing & areas) and bool(areas - testing),
-            f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
-            f"{', '.join(FOLDS[self.fold])}) and for training (others)",
-        )
+        if not (areas <= set(AREAS) and testing & areas and areas - testing):
+            raise SettingError(
+                "data.areas",
+                found=list(self.areas),
+                expected=f"some of {', '.join(AREAS)}: for testing (fold {self.fold}: "
+                f"{', '.join(FOLDS[self.fold])}) and for training (others)",
+            )
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[StanfordReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
-        root, areas = self.root, self.areas
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_areas[split]
+
+    @cached_property
+    def _splits_of_areas(self) -> dict[Split, list[ImageFiles]]:
+        root, areas, problems = self.root, self.areas, self.problems
         if not root.is_dir():
             raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
         there = [area for area in areas if (root / f"area_{area}").is_dir()]
@@ -107,19 +113,20 @@ class StanfordAreas(ImageDataModule):
         ]
         pictures = [picture for pictures in listed for picture in pictures]
         training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
+        if not self.has_distances:
+            _ = self._instances  # refused before anything is decoded
         rooms: set[tuple[str, str, int]] = set()
         if self.val_fraction:
             rooms = draw_groups((p.room for p in training), self.val_fraction, self.seed)
-        return self._reader(), {
+        return {
             "train": [picture.image for picture in training if picture.room not in rooms],
             "val": [picture.image for picture in training if picture.room in rooms],
             "test": [picture.image for picture in pictures if picture.area in FOLDS[self.fold]],
         }
 
-    def _reader(self) -> StanfordReader:
-        """Return the reader, with the class table if the labels are classes."""
-        if self.has_distances:
-            return StanfordReader(LabelTable(np.empty(0, np.uint8)))
+    @cached_property
+    def _instances(self) -> LabelMap:
+        """Class of every instance, by the class table of the release."""
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         if self.label_table is not None:
             places = [self.label_table]
@@ -131,28 +138,50 @@ class StanfordAreas(ImageDataModule):
                 expected=f"it there or at {places[-1]}",
                 remedy="Copy it from the release (assets), or name it in data.label_table.",
             )
-        return StanfordReader(LabelTable.from_json(table))
+        classes: Any = self.label_map
+        return read_label_table(table).regrouped(classes)
+
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Return the labels by the class table."""
+        path: Any = files.labels
+        return self._instances.read_labels(path)
+
+    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Read depth in steps of 1/512 m, as in the files."""
+        path: Any = files.depth
+        return read_depth(path)
+
+    def decode_settings(self) -> dict[str, Any]:
+        """See `DataModule`."""
+        instances = None if self.has_distances else repr(self._instances)
+        return {**super().decode_settings(), "instances": instances}
+
+    def pose(self, files: ImageFiles) -> PanoramaPose | None:
+        """Read the pose in the pose file; None without a file."""
+        pose = files.rgb.name.removesuffix("rgb.png") + "pose.json"
+        path = files.rgb.parents[1] / "pose" / pose
+        if not path.is_file():
+            return None
+        return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Stanford2D3DS(StanfordAreas, PanoramaDataModule):
-    """Stanford2D3DS, 13 classes, in the three folds of its authors.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+    """Stanford2D3DS, 13 classes, in the three folds of its authors."""
 
     group = "pano"
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Stanford2D3DSPerspective(StanfordAreas, PhotoDataModule):
     """The photos of Stanford2D3DS, 13 classes, in the three folds of its authors.
 
     The validation rooms are those of the panoramas if every room has photos and panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
     group = "data"
+
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """Read the camera matrix in the pose file."""
+        path: Any = files.camera
+        return read_camera_matrix(path)

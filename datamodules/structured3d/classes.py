@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.labels import ClassSet, class_sets
+from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
 
 CLASSES: tuple[str, ...] = (
@@ -18,26 +18,27 @@ CLASSES: tuple[str, ...] = (
 """The 40 classes of NYUv2 as labels 1 to 40, which are also the numbers in the files."""
 
 
-class PublishedS3D8(ClassSet):
-    """The 8 classes as the published readers of S3D8 compute them, to compare with their scores.
+LABEL_MAPS: dict[str, LabelMap] = {
+    "40": LabelMap.of(CLASSES, [0]),
+    "8": LabelMap.of(CLASSES, [0]).regrouped(LabelMap.grouped(EIGHT)),
+    "published_s3d8": LabelMap.of(CLASSES, [0]).regrouped(LabelMap.grouped(EIGHT)),
+}
+"""Values of the setting `classes`; for the last one, see `published_s3d8`."""
+
+
+def published_s3d8(labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the 8 classes as the published readers of S3D8 compute them, to compare with scores.
 
     They replace the numbers of an image in place, in ascending order. The new number of a class
     (from 0) may be the old number of a later one: floor (2) becomes 3, and 3 is cabinet; wall (1)
     becomes 6, and 6 is sofa. So floor is unknown in images with cabinets, and wall is sofa in
     images with sofas.
+
+    Args:
+        labels: ``(H, W)`` numbers of the 40 classes, 0 where unknown.
     """
-
-    def relabel(self, labels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """See `ClassSet`."""
-        new = self.key.astype(np.int16) - 1
-        numbers = labels.astype(np.int16)
-        for number in np.unique(labels):
-            numbers[numbers == number] = new[number]
-        return (numbers + 1).astype(np.uint8)
-
-
-CLASS_SETS = class_sets(
-    CLASSES,
-    {"8": ClassSet(EIGHT, CLASSES), "published_s3d8": PublishedS3D8(EIGHT, CLASSES)},
-)
-"""Values of the setting `classes`."""
+    new = LABEL_MAPS["8"].decode(np.arange(1 + len(CLASSES), dtype=np.uint8)).astype(np.int16) - 1
+    numbers = labels.astype(np.int16)
+    for number in np.unique(labels):
+        numbers[numbers == number] = new[number]
+    return (numbers + 1).astype(np.uint8)

@@ -29,19 +29,19 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar, Literal
+from functools import cached_property
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.data_module import data_set
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from datamodules.structured3d.classes import CLASS_SETS, CLASSES
+from datamodules.core.inputs import Input
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, published_splits
+from datamodules.structured3d.classes import LABEL_MAPS, published_s3d8
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_image_size
 
@@ -56,35 +56,8 @@ _PUBLISHED = {"train": 18362, "val": 1776, "test": 1697}
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
 
-_TABLE = number_table(range(1, 1 + len(CLASSES)), [0])
 
-
-class Structured3DReader(NumberedReader):
-    """Decoder of the files of Structured3D."""
-
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Read the camera of a photo; its center is in the middle.
-
-        Raises:
-            DataError: The file is missing or broken.
-        """
-        path = files.parts["camera"]
-        try:
-            numbers = [float(word) for word in path.read_text("utf-8").split()]
-            half_x, half_y = numbers[9:11]
-            fine = len(numbers) == 12 and 0 < min(half_x, half_y) <= max(half_x, half_y) < 1.5
-        except (OSError, ValueError):
-            fine = False
-        if not fine:
-            expected = "12 numbers, the 10th and 11th of them half angles of view in radians"
-            raise DataError(path, found="another content", expected=expected, remedy=_GET_IT)
-        height, width = read_image_size(files.rgb)
-        x, y = width / 2, height / 2
-        fx, fy = x / math.tan(half_x), y / math.tan(half_y)
-        return np.array([[fx, 0, x - 0.5], [0, fy, y - 0.5], [0, 0, 1]])
-
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Structured3DRooms(ImageDataModule):
     """Images of Structured3D in the splits of its authors.
 
@@ -97,16 +70,11 @@ class Structured3DRooms(ImageDataModule):
 
     Attributes:
         place: Pattern of the color images of a room.
-        configurations: Allowed values of `configuration`.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *CLASSES)
-    class_sets = CLASS_SETS
+    label_maps = LABEL_MAPS
+    units_per_m = 1000
     place: ClassVar[str]
-    configurations: ClassVar[tuple[str, ...]] = ("full", "simple", "empty")
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),
     )
@@ -117,17 +85,19 @@ class Structured3DRooms(ImageDataModule):
     invalid_scenes: Literal["keep", "leave_out"] = "keep"
     test_split: Literal["test", "val"] = "test"
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require_one_of("configuration", *self.configurations)
-        self.require_one_of("lighting", "rawlight", "warmlight", "coldlight")
-        self.require_one_of("invalid_scenes", "keep", "leave_out")
-        self.require_one_of("test_split", "test", "val")
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_scenes[split]
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[Structured3DReader, dict[Split, Sequence[ImageFiles]]]:
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`."""
+        if self.classes != "published_s3d8":
+            return super().decode_labels(files)
+        path: Any = files.labels
+        return published_s3d8(LABEL_MAPS["40"].read_labels(path))
+
+    @cached_property
+    def _splits_of_scenes(self) -> dict[Split, Sequence[ImageFiles]]:
         scenes = f"scene_{'[0-9]' * 5}/2D_rendering/*"
         pattern = f"{scenes}/{self.place.format(self.configuration)}/rgb_{self.lighting}.png"
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
@@ -150,34 +120,44 @@ class Structured3DRooms(ImageDataModule):
             found = f"no {self.noun} of {pattern}"
             raise DataError(self.root, found=found, expected="scene_00000 …", remedy=_GET_IT)
         if invalid:
-            problems.warnings.append(
+            self.problems.warnings.append(
                 f"{len(invalid)} {self.noun} of scenes that the errata call invalid: "
                 f"{', '.join(sorted(set(invalid)))} (data.invalid_scenes={self.invalid_scenes})"
             )
         if isinstance(self, PanoramaDataModule) and self.invalid_scenes == "keep":
-            problems.compare_counts(splits, _PUBLISHED)
-        given = self.test_split, self.val_fraction, self.seed
-        return Structured3DReader(_TABLE, units_per_m=1000), published_splits(splits, *given)
+            self.problems.compare_counts(splits, _PUBLISHED)
+        return published_splits(splits, self.test_split, self.val_fraction, self.seed)
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Structured3D(Structured3DRooms, PanoramaDataModule):
-    """The panoramas of Structured3D, 40 or 8 classes.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+    """The panoramas of Structured3D, 40 or 8 classes."""
 
     place = "panorama/{}"
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Structured3DPerspective(Structured3DRooms, PhotoDataModule):
-    """The photos of Structured3D, 40 or 8 classes.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+    """The photos of Structured3D, 40 or 8 classes."""
 
     place = "perspective/{}/*"
-    configurations = ("full", "empty")
+
+    configuration: Literal["full", "empty"] = "full"  # type: ignore[assignment]
+
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """Read the camera of a photo; its center is in the middle.
+
+        Raises:
+            DataError: The file is missing or broken.
+        """
+        path: Any = files.camera
+        try:
+            numbers = [float(word) for word in path.read_text("utf-8").split()]
+            half_x, half_y = numbers[9:11]
+        except (OSError, ValueError) as error:
+            expected = "12 numbers, the 10th and 11th of them half angles of view in radians"
+            raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error
+        height, width = read_image_size(files.rgb)
+        x, y = width / 2, height / 2
+        fx, fy = x / math.tan(half_x), y / math.tan(half_y)
+        return np.array([[fx, 0, x - 0.5], [0, fy, y - 0.5], [0, 0, 1]])

@@ -22,20 +22,19 @@ Transformers for Panoramic Semantic Segmentation", arXiv:2207.11860, 2022.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import ClassVar, Literal
 
 from datamodules.cityscapes.classes import THIRTEEN
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from datamodules.core.inputs import Input
-from datamodules.core.labels import ClassSet, class_sets
-from datamodules.core.numbered import NumberedReader, number_table
+from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from tangent_train.errors import DataError
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, published_splits
+from tangent_train.errors import DataError, SettingError
 
 CLASSES: tuple[str, ...] = (
     *("building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk"),
@@ -59,10 +58,10 @@ _PUBLISHED = (
 """Images in the description of the release, and in the lists of its code."""
 
 _POINT = re.compile(r"MAP_\d+_point\d+")
-_TABLE = number_table(range(1, 1 + len(CLASSES)), [0, 255])
+_LABELS = LabelMap.of(CLASSES, [0, 255])
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynPASS(PanoramaDataModule):
     """SynPASS, 22 or 13 classes, with the splits of its folders.
 
@@ -71,12 +70,12 @@ class SynPASS(PanoramaDataModule):
         time: `all`; `day` or `night` keeps the test panoramas that a list of the release names.
         test_split: Folder of the test panoramas. With `val`, validation uses points drawn from
             the training folder, so that nothing is selected on the test panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_sets = class_sets(CLASSES, {"13": ClassSet(THIRTEEN, CLASSES, _MERGED)})
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {
+        "22": _LABELS,
+        "13": _LABELS.regrouped(LabelMap.grouped(THIRTEEN, _MERGED)),
+    }
     no_depth = "SynPASS has no depth images"
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
@@ -90,27 +89,26 @@ class SynPASS(PanoramaDataModule):
         given = [self.weather] if isinstance(self.weather, str) else list(self.weather)
         self._times: dict[str, set[str]] = {}
         self._weathers = WEATHERS if given == ["all"] else tuple(given)
-        fine = bool(self._weathers) and set(self._weathers) <= set(WEATHERS)
-        self.require("weather", fine, f"all, or some of {', '.join(WEATHERS)}")
-        self.require_one_of("time", "all", "day", "night")
-        self.require_one_of("test_split", "val", "test")
+        if not set(self._weathers) <= set(WEATHERS):
+            expected = f"all, or some of {', '.join(WEATHERS)}"
+            raise SettingError("data.weather", found=given, expected=expected)
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[NumberedReader, dict[Split, Sequence[ImageFiles]]]:
-        """See `ImageDataModule`."""
-        splits: dict[Split, Sequence[ImageFiles]] = {
-            split: self._list_images(split, problems) for split in SPLITS
-        }
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_points[split]
+
+    @cached_property
+    def _splits_of_points(self) -> dict[Split, Sequence[ImageFiles]]:
+        splits: dict[Split, Sequence[ImageFiles]] = {s: self._list_images(s) for s in SPLITS}
         if not any(splits.values()):
             expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
             raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
         self._times = {time: self._read_list(time) for time in ("day", "night")}
         if self._weathers == WEATHERS:
-            problems.compare_counts(splits, *_PUBLISHED)
+            self.problems.compare_counts(splits, *_PUBLISHED)
             known = {_point(files) for images in splits.values() for files in images}
             for time, points in self._times.items():
-                problems.note_absent(f"all_map_{time}_val.txt", points - known)
+                self.problems.note_absent(f"all_map_{time}_val.txt", points - known)
         given = self.test_split, self.val_fraction, self.seed
         splits = published_splits(splits, *given)
         if self.time != "all":
@@ -123,14 +121,14 @@ class SynPASS(PanoramaDataModule):
                     expected="names of test points, e.g. MAP_6_point10",
                     remedy="The lists of the release name points of val: data.test_split=val.",
                 )
-        return NumberedReader(_TABLE), splits
+        return splits
 
-    def groups(self, item: ImageFiles) -> list[str]:
-        """See `LabeledData`: weather, and day or night where a list names the point."""
-        times = (time for time, points in self._times.items() if _point(item) in points)
-        return [item.name.split("/")[1], *times]
+    def groups(self, files: ImageFiles) -> list[str]:
+        """See `DataModule`: weather, and day or night where a list names the point."""
+        times = (time for time, points in self._times.items() if _point(files) in points)
+        return [files.name.split("/")[1], *times]
 
-    def _list_images(self, split: Split, problems: Problems) -> list[ImageFiles]:
+    def _list_images(self, split: Split) -> list[ImageFiles]:
         """Return the images of a folder, each with the label image of its name."""
         found: list[ImageFiles] = []
         labels: list[Path] = []
@@ -140,7 +138,7 @@ class SynPASS(PanoramaDataModule):
             for rgb in sorted((self.root / "img" / place).glob("*/[!.]*.jpg")):
                 mask = self.root / "semantic" / place / rgb.parent.name / f"{rgb.stem}_trainID.png"
                 found.append(ImageFiles(f"{rgb.parent.name}/{weather}/{rgb.stem}", rgb, mask))
-        problems.note_strays(labels, found)
+        self.problems.note_strays(labels, found)
         return found
 
     def _read_list(self, time: str) -> set[str]:

@@ -176,15 +176,15 @@ def _make(
     target = reader.panorama_files(root, sequence, frame, with_depth=True)
     views = [reader.view_files(root, sequence, frame, v, with_depth=True) for v in reader.VIEWS]
     with problems.noted(target.name):
-        depth = [reader.read_first_channel(view.parts["depth"]) for view in views]
+        depth = [reader.read_first_channel(view.paths[2]) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
-        ids = [reader.read_ids(view.parts["labels"]) for view in views]
+        ids = [reader.read_ids(view.paths[1]) for view in views]
         parts = {
             "depth": stitcher.stitch(far, "nearest"),
             "labels": stitcher.stitch(ids, "nearest", reader.INVALID),
             "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }
         for part, image in parts.items():
-            write_pixels(target.parts[part], image)
+            write_pixels(getattr(target, part), image)
         return frame
     return None

@@ -16,18 +16,25 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
-from typing import ClassVar
+from typing import Any, ClassVar
 
-from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.splits import DatasetIndex, Split
+import numpy as np
+from numpy.typing import NDArray
+
+from datamodules.core.data_module import data_set
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
+from datamodules.core.images import ImageFiles, units_to_steps
 from datamodules.core.inputs import Input
-from datamodules.core.images import ImageFiles
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.problems import Problems
+from datamodules.core.splits import Split
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
+from tangent_train.io.pixel_files import read_image_size
 
 SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
 """Available sequences; OmniSYNTHIA uses the summer versions."""
@@ -37,7 +44,7 @@ TEST: tuple[str, ...] = ("04",)
 """The split of Zhang et al. 2019."""
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthiaSequences(ImageDataModule):
     """The training and test sequences of OmniSYNTHIA's authors.
 
@@ -50,52 +57,61 @@ class SynthiaSequences(ImageDataModule):
         frames: Approximate number of frames per sequence, see `choose_frames`.
 
     Attributes:
-        formats: Formats of the files.
         remedy: Remedy if there are no images.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *reader.CLASSES)
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": reader.LABELS}
     normalizations = reader.NORMALIZATIONS
-    formats: ClassVar[reader.Formats]
     remedy: ClassVar[str] = reader.GET_IT
 
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
     inputs: Sequence[Input] = ("rgb",)
-    train_sequences: Sequence[str] = TRAIN
-    test_sequences: Sequence[str] = TEST
+    train_sequences: Sequence[str | int] = TRAIN
+    test_sequences: Sequence[str | int] = TEST
     frames: int = reader.FRAMES
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, others in (("train_sequences", ()), ("test_sequences", self.train_sequences)):
+        others: tuple[str, ...] = ()
+        for name in ("train_sequences", "test_sequences"):
             # YAML reads 01 as a number.
             some = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
             setattr(self, name, some)
-            fine = some and set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}
-            expected = f"some of {', '.join(SEQUENCES)}, none for both training and test"
-            self.require(name, bool(fine), expected)
+            if not some or set(some) & set(others) or not set(some) <= set(SEQUENCES):
+                expected = f"some of {', '.join(SEQUENCES)}, none for both training and test"
+                raise SettingError(f"data.{name}", found=list(some), expected=expected)
+            others = some
 
     @property
     def sequences(self) -> tuple[str, ...]:
         """Training sequences, then test sequences."""
-        return (*self.train_sequences, *self.test_sequences)
+        chosen: Any = (*self.train_sequences, *self.test_sequences)
+        return chosen  # texts of two digits
+
+    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """Read depth in centimeters, of which views have several equal channels."""
+        return units_to_steps(reader.read_first_channel(files.paths[2]), 100)
+
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Read the classes in the first channel; in views, the others hold instances."""
+        path = files.paths[1]
+        return reader.LABELS.decode(reader.read_first_channel(path), path)
 
     @abstractmethod
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """Return the images of every frame of a sequence, if any."""
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[reader.SynthiaReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        return self._splits_of_sequences[split]
+
+    @cached_property
+    def _splits_of_sequences(self) -> dict[Split, list[ImageFiles]]:
         found: dict[str, list[list[ImageFiles]]] = {}
         for sequence in self.sequences:
             found[sequence] = []
-            with problems.noted():
+            with self.problems.noted():
                 found[sequence] = self.list_images(sequence, with_depth=self.reads_depth)
                 if not found[sequence]:
                     raise DataError(
@@ -104,8 +120,7 @@ class SynthiaSequences(ImageDataModule):
                         expected="000000.png and others",
                         remedy=self.remedy,
                     )
-        splits = divide(found, self.test_sequences, self.val_fraction)
-        return reader.SynthiaReader(self.formats), splits
+        return divide(found, list(map(str, self.test_sequences)), self.val_fraction)
 
 
 def divide(
@@ -137,7 +152,7 @@ def divide(
     return splits
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 
@@ -147,12 +162,8 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
 
     Args:
         panorama_height: Rows of generated panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    formats = reader.PANORAMA_FORMATS
     no_distances = "published panoramas of OmniSYNTHIA have z-depth of the four views"
     remedy = f"Run tangent-prepare to generate them from the views. {reader.GET_IT}"
 
@@ -179,10 +190,11 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         if not self.skip_broken:
             self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
-    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `LabeledData`; panoramas that could not be generated are broken."""
-        problems.add_all(self._not_made)
-        return super().find(problems)
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`; panoramas that could not be generated are broken."""
+        if split == "train":
+            self.problems.add_all(self._not_made)
+        return super().files(split)
 
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
@@ -192,15 +204,13 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         ]
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
-    """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA.
+    """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA."""
 
-    Raises:
-        SettingError: A setting is invalid.
-    """
-
-    formats = reader.VIEW_FORMATS
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """Read the camera matrix of the view's sequence."""
+        return reader.read_view_camera(files.rgb.parents[3], read_image_size(files.rgb))
 
     def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""

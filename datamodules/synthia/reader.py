@@ -20,16 +20,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.images import ImageFiles, PngReader, meters_to_steps, resize_nearest
+from datamodules.core.label_map import LabelMap
 from tangent_train.errors import DataError, at_least
 from tangent_train.io.pixel_files import read_pixels
 
@@ -79,28 +78,13 @@ NORMALIZATIONS = (
 """RGB as in the released code of the paper. For depth, where
 nothing is published, the values of Stanford2D3DS are used, with the same clipping."""
 
-Formats = dict[str, tuple[int, tuple[str, ...]]]
-"""Bits and color types by part."""
-
-VIEW_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (16, ("RGB", "RGBA")),
-    "depth": (16, ("gray", "RGB", "RGBA")),
-}
-"""Pixel formats of a view."""
-
-PANORAMA_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (8, ("gray",)),
-    "depth": (16, ("gray",)),
-}
-"""Pixel formats of a panorama."""
-
 _LAST_ID = 15
-_LABELS = np.zeros(256, np.uint8)
-# Traffic lights, 15, become 13. The reserved 13 and 14 are unknown: the published panoramas were
-# averaged where views overlap, which may have made some.
-_LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
+# Traffic lights are 15. The reserved 13 and 14 are unknown: the published panoramas were averaged
+# where views overlap, which may have made some.
+LABELS = LabelMap.of(
+    dict(zip(CLASSES, (*range(1, 13), _LAST_ID), strict=True)), [0, 13, 14, INVALID]
+)
+"""Label map of views and panoramas."""
 
 
 def sequence_folder(root: Path, sequence: str) -> Path:
@@ -204,31 +188,6 @@ def read_view_camera(folder: Path, size: tuple[int, int]) -> NDArray[np.float64]
 
 def _camera_file(folder: Path) -> Path:
     return folder / "CameraParams" / "intrinsics.txt"
-
-
-@dataclass(frozen=True)
-class SynthiaReader(PngReader):
-    """Reader of views and panoramas.
-
-    Attributes:
-        formats: `VIEW_FORMATS` or `PANORAMA_FORMATS`.
-    """
-
-    formats: Formats
-
-    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return the labels by `CLASSES`, 0 where unknown."""
-        ids = read_ids(files.parts["labels"])
-        return cv2.LUT(resize_nearest(ids, shape or (ids.shape[0], ids.shape[1])), _LABELS)
-
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Read depth in steps of 1/512 m."""
-        centimeters = read_first_channel(files.parts["depth"])
-        return meters_to_steps((centimeters / 100).astype(np.float32))
-
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Read the camera matrix of the view's sequence."""
-        return read_view_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
 
 
 def read_first_channel(path: Path) -> NDArray[Any]:

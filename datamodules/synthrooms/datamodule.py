@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from datamodules.core.splits import DatasetIndex
+from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
+from datamodules.core.splits import Split
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
@@ -20,7 +19,7 @@ from datamodules.synthrooms.generate import RoomSettings, generate_rooms
 from tangent_train.errors import DataError, SettingError
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthRoomsAreas(StanfordAreas):
     """Areas of synthetic rooms, generated on first use.
 
@@ -28,8 +27,7 @@ class SynthRoomsAreas(StanfordAreas):
         rooms: Rooms to generate; their areas are the areas used.
     """
 
-    areas: Sequence[str] = field(init=False, default=())
-    rooms: RoomSettings | Mapping[str, int | str | Mapping[str, int]]
+    rooms: Any
 
     def __post_init__(self) -> None:
         self.rooms = rooms = RoomSettings.of(self.rooms)
@@ -40,30 +38,22 @@ class SynthRoomsAreas(StanfordAreas):
         """Generate the files, unless they are there."""
         generate_rooms(self.root, RoomSettings.of(self.rooms))
 
-    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `LabeledData`."""
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
         if not self.root.is_dir():
             remedy = "Run tangent-prepare with the same settings."
             raise DataError(self.root, found="no such folder", expected="rooms", remedy=remedy)
-        return super().find(problems)
+        return super().files(split)
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
-    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download."""
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
-    """Photos of synthetic rooms, read as those of Stanford2D3DS.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+    """Photos of synthetic rooms, read as those of Stanford2D3DS."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,9 +70,6 @@ class SynthRoomsPairs(StanfordPairs):
         root: Folder for the files.
         rooms: Rooms to generate, with two cameras or more.
         erp_height: See `StanfordPairs`.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
     def __init__(

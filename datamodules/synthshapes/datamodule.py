@@ -2,26 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Any
 
+from datamodules.core.data_module import data_set
 from datamodules.modelnet40.datamodule import ModelNet40
 from datamodules.synthshapes.generate import CLASSES, ShapeSettings, generate_shapes
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthShapes(ModelNet40):
     """Synthetic shapes, generated on first use and read as ModelNet40: no download.
 
     Args:
         shapes: Shapes to generate.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    shapes: ShapeSettings | Mapping[str, int] | None = None
+    shapes: Any = None
 
     def __post_init__(self) -> None:
         given = self.shapes or {}

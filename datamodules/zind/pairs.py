@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
-from datamodules.core.images import resize_area
 from datamodules.core.problems import Problems
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 
 @dataclass(eq=False)
@@ -78,4 +78,4 @@ class ZindPairs(PanoramaPairs):
         shape = paired_shape(path, rgb, self.erp_height)
         pose, unit_m = files.pose()
         distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
-        return PairedPanorama(files.name, resize_area(rgb, shape), path, distance_m, pose)
+        return PairedPanorama(files.name, resize(rgb, shape, "bilinear"), path, distance_m, pose)

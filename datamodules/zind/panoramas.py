@@ -35,62 +35,30 @@ Dataset: Annotated Floor Plans With 360º Panoramas and 3D Room Layouts", CVPR 2
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeInt
 
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, draw_groups
+from datamodules.core.data_module import data_set
+from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import Input
-from datamodules.core.images import ImageFiles, ImageReader
-from datamodules.core.problems import Problems
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import SPLITS, Split, draw_groups
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.io.pixel_files import read_image_size, read_rgb
 
 Doors = Literal["class", "ignore"]
 """Labels of doors: a class, or unknown."""
 
 
-@dataclass(frozen=True, eq=False)
-class ZindReader(ImageReader):
-    """Reads the pictures, with labels from layouts.
-
-    Attributes:
-        layouts: Layouts by name of the panorama.
-        doors: Label of doors.
-    """
-
-    layouts: Mapping[str, Layout]
-    doors: Doors
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """See `ImageReader`: label of doors."""
-        return {"doors": self.doors}
-
-    def size(self, part: str, path: Path) -> tuple[int, int] | None:
-        """See `ImageReader`; layouts have no size."""
-        return read_image_size(path) if part == "rgb" else None
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """See `ImageReader`."""
-        return read_rgb(files.rgb)
-
-    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """See `ImageReader`; labels are cast for the requested size."""
-        labels = self.layouts[files.name].labels(shape or read_image_size(files.rgb))
-        if self.doors == "ignore":
-            labels[labels == DOOR] = 0
-        return labels
-
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Zind(PanoramaDataModule):
     """ZInD, 5 classes.
 
@@ -103,28 +71,36 @@ class Zind(PanoramaDataModule):
             evaluate networks that were trained on other data.
         split_seed: Seed of the splits. Independent of the run's seed, so that runs with different
             seeds share their splits.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *CLASSES)
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {"5": LabelMap.of(CLASSES)}
     no_depth = "ZInD has no depth images"
     fact_settings = ("doors",)
 
     inputs: Sequence[Input] = ("rgb",)
     doors: Doors = "class"
-    test_fraction: float = 0.2
-    split_seed: int = 0
+    test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
+    split_seed: NonNegativeInt = 0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
-        self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
-        self.require("split_seed", self.split_seed >= 0, "0 or more")
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._found[0][split]
 
-    def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """Return the labels, cast for the size at which panoramas are read."""
+        labels = self._found[1][files.name].labels(self.read_shape)
+        if self.doors == "ignore":
+            labels[labels == DOOR] = 0
+        return labels
+
+    def decode_settings(self) -> dict[str, Any]:
+        """See `DataModule`."""
+        return {**super().decode_settings(), "doors": self.doors}
+
+    @cached_property
+    def _found(self) -> tuple[dict[Split, list[ImageFiles]], dict[str, Layout]]:
+        """Files of each split, and layouts by name of the panorama."""
+        problems = self.problems
         panoramas = [p for p in list_home_panoramas(self.root, problems) if p.record.layout_visible]
         split_of = self._divided(panoramas)
         layouts: dict[str, Layout] = {}
@@ -136,7 +112,7 @@ class Zind(PanoramaDataModule):
                 splits[split].append(files)
         if not self.val_fraction:
             splits["val"] = []
-        return ZindReader(layouts, self.doors), splits
+        return splits, layouts
 
     def _divided(self, panoramas: Sequence[HomePanorama]) -> list[Split]:
         """Return the split of every panorama."""

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder.reader import class_masks
+from datamodules.folder.labeled import class_masks
 from tangent_train.cli.command_settings import RenderSettings
 from tangent_train.cli.settings import check_new, parse_settings
 from tangent_train.config.build import build_from_config

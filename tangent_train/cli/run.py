@@ -16,10 +16,10 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
+from datamodules.core.data_module import DataModule
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import explained, gathered_order
-from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.checkpoints.content import read_checkpoint, write_settings
 from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
@@ -136,7 +136,7 @@ class Run:
         if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(NetworkJudge(self._as_trained(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        noun, total = self.data.noun, len(self.data.source("test"))
+        noun, total = self.data.noun, len(self.data.dataset("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
         record = self.task.evaluation_result(self.task.result, noun) if tested else None
         images = record.images if record else 0
@@ -153,7 +153,7 @@ class Run:
 
     def _groups(self, world_size: int) -> list[dict[str, Any]]:
         """Return the scores of each group of test images, see `LabeledData.groups`."""
-        items, places = self.data.index().splits["test"], defaultdict(list)
+        items, places = self.data.splits()["test"], defaultdict(list)
         for place, index in enumerate(gathered_order(len(items), world_size)):
             for group in self.data.groups(items[index]):
                 places[group].append(place)
@@ -262,7 +262,7 @@ def build(
 def build_data(settings: Mapping[str, Any], source: SettingsFile | None = None) -> Any:
     """Build the data module of a run and check that it has the labels of the task; see `build`."""
     data_set = resolve_target(settings["data"], "data", source)
-    if isinstance(data_set, type) and not issubclass(data_set, SplitDataModule):
+    if isinstance(data_set, type) and not issubclass(data_set, DataModule):
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=data_set.__name__, expected=expected)
     data = open_data(settings, source)

@@ -73,7 +73,7 @@ def train(settings: Mapping[str, Any], source: SettingsFile | None = None) -> fl
         # Written before the test, whose errors must not cost a sweep the score.
         score = _best_validation_score(trainer, best, run.folder)
         tested = _tested_checkpoint(trainer, best, last.path)
-        if len(run.data.source("test")):
+        if len(run.data.dataset("test")):
             run.test(trainer, tested)
         else:
             rank_zero_only(print_text)(f"No {run.data.noun} to test: no results are written.")

@@ -31,7 +31,7 @@ def try_training(task: Any, data: Any, settings: Mapping[str, Any]) -> None:
     """
     synchronized = bool(settings["trainer"].get("sync_batchnorm"))
     data.try_step = partial(_try_step, copy.deepcopy(task).to("meta"), data, synchronized)
-    data.try_step(data.per_step)
+    data.try_step(data.batch_size)
     _try_schedule(task, settings)
 
 
@@ -98,11 +98,11 @@ def _try_step(probe: Any, data: Any, synchronized: bool, samples: int) -> None:
     chunk = min(probe.chunks(step), key=len)
     shape = tuple(chunk.shape)
     if fault := find_fault(probe.network, shape, trains=True):
-        per_step = f"data.{data.noun}_per_step"
+        per_step = "data.batch_size"
         is_whole = len(chunk) == len(step)
         raise SettingError(
             per_step if is_whole else "task.view_batch_size",
-            found=f"{data.per_step if is_whole else probe.view_batch_size}, so that in a step of "
+            found=f"{data.batch_size if is_whole else probe.view_batch_size}, so that in a step of "
             f"{counted(samples, data.noun)} {type(probe.network).__name__} gets {shape}, on which "
             f"it cannot be trained ({fault})",
             expected="more images at a time, including the last step of an epoch",

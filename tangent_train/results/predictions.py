@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.core.label_map import UNKNOWN_NAME
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, parse_json, write_text
 from tangent_train.geometry import equirect_solid_angles, ray_lengths

@@ -24,7 +24,7 @@ import torch
 from torch import nn
 
 from datamodules import SynthRooms
-from datamodules.core.split_module import SplitDataModule
+from datamodules.core.data_module import DataModule
 from tangent_train.checkpoints.content import read_settings
 from tangent_train.cli import main
 from tangent_train.cli.compose import path_text
@@ -162,13 +162,8 @@ def test_without_test_images_training_ends_without_results(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    find = SynthRooms.find_images
-
-    def without_test(data: SynthRooms, problems: Any) -> Any:
-        reader, splits = find(data, problems)
-        return reader, {**splits, "test": []}
-
-    monkeypatch.setattr(SynthRooms, "find_images", without_test)
+    files = SynthRooms.files
+    monkeypatch.setattr(SynthRooms, "files", lambda s, p: [] if p == "test" else files(s, p))
     run("train", *SETTINGS, rooms, "trainer.max_epochs=1", "hydra.run.dir=run")
     assert "No panoramas to test: no results are written." in capsys.readouterr().out
     assert (tmp_path / "run" / "checkpoints" / "best.ckpt").is_file()
@@ -270,7 +265,7 @@ def test_the_last_step_of_an_epoch_is_tried_before_training(
     def begin(*_: object) -> None:
         raise BegunError
 
-    monkeypatch.setattr(SplitDataModule, "class_weights", begin)  # reads the labels
+    monkeypatch.setattr(DataModule, "class_weights", begin)  # reads the labels
     settings = [text for text in SETTINGS if not text.startswith("network.")]
     settings += ["network=deeplabv3_mobilenet", "data.inputs=[rgb]", "data.val_fraction=0"]
     settings += [f"representation.faces_per_panorama={faces}", "scheduler=constant"]

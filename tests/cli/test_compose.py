@@ -71,7 +71,7 @@ _ODD = (
     *("x\\${oc.env:S}.png", "${oc.env:S}", " lead", "trail ", "new\nline", "back\\", "\udc80"),
 )
 _WITH_PATHS = {
-    "check": "data.root data.store +data.label_table",
+    "check": "data.root data.cache +data.label_table",
     "predict": "input output checkpoint depth mask label_map",
     "render": "input output figure back poses cameras mask",
     "import": "model weights file classes output",

@@ -13,13 +13,14 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
+from datamodules.core.label_map import LabelMap
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.export import export_network
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.label_maps import LabelMap, map_classes
+from tangent_train.inference.label_maps import map_classes
 from tangent_train.inference.representations import PanoramaViews
 from tangent_train.photo_networks import PhotoNetwork, import_network
 from tangent_train.photo_networks.score_kinds import try_network
@@ -127,7 +128,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     path = write_linear(tmp_path / "net.onnx", *arrays, *nodes)
     trained = _imported(path, tuple(map(str, range(60))))
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
-    merged = LabelMap("pairs", None, {f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
+    merged = LabelMap.of({f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network, label in ((trained, 18), (map_classes(trained, merged).trained, 18)):
         views = PanoramaViews(network)
         mosaic = Predictor(network, views, min_confidence=0.5).predict(InputImage(rgb))
@@ -305,7 +306,7 @@ def test_other_values_of_label_maps_are_unknown(
     assert float(found.softmax(dim=1).amax(dim=1).min()) > 0.999
     with pytest.raises(SettingError, match="unknown_wins: found false, for label maps"):
         _imported(path, names, unknown_wins=False)
-    merged = LabelMap("two", None, {"x": ["a", "b"], "y": ["c"]})
+    merged = LabelMap.of({"x": ["a", "b"], "y": ["c"]})
     mapped = map_classes(trained, merged).trained
     labels = mapped.labels(mapped.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, np.array([1, 1, 2, 0, 0])[best])
@@ -342,7 +343,7 @@ def test_label_maps_of_a_checkpoint_and_of_its_export(suffix: str, tmp_path: Pat
     labels = again.labels(again.network(images).argmax(dim=1).byte())
     np.testing.assert_array_equal(labels, expected)
     with pytest.raises(SettingError, match="unmapped: found never, for a network that returns lab"):
-        map_classes(again, LabelMap("one", None, {"x": ["a"]}), "never")
+        map_classes(again, LabelMap.of({"x": ["a"]}), "never")
 
 
 class LabelMaps(nn.Module):

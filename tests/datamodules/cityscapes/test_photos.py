@@ -37,7 +37,7 @@ def photos(root: Path, representation: Any = CROPS, **settings: Any) -> Cityscap
 
 def test_every_id_has_its_published_class(shared: Path) -> None:
     data = photos(shared)
-    labels = data.source("test").read(0).labels
+    labels = data.dataset("test").read(0).labels
     ids = read_png(next(shared.glob("gtFine/val/lindau/*0_gtFine_labelIds.png")))
     assert set(np.unique(ids)) == set(streets.IDS)
     names = {c.id: c.name for c in Published.classes if not c.ignore_in_eval}
@@ -45,11 +45,11 @@ def test_every_id_has_its_published_class(shared: Path) -> None:
     for number in streets.IDS:
         expected = data.class_names.index(names.get(number, "unknown"))
         assert set(labels[ids == number]) == {expected}
-    np.testing.assert_array_equal(data.source("test").labels(0), labels)
+    np.testing.assert_array_equal(data.dataset("test").labels(0), labels)
 
 
 def test_cameras_count_from_pixel_centers(shared: Path) -> None:
-    photo = photos(shared).source("test").read(0)
+    photo = photos(shared).dataset("test").read(0)
     fx, fy, x, y = (value / 16 for value in streets.CAMERA.values())
     K = np.array([[fx, 0, x], [0, fy, y], [0, 0, 1]])
     np.testing.assert_allclose(photo.camera_matrix, K)
@@ -110,7 +110,7 @@ def test_without_camera_files_a_field_of_view_is_needed(root: Path) -> None:
     shutil.rmtree(root / "camera")
     with pytest.raises(DataError, match=r"camera/train: found no such folder.*data\.fov=48\.7"):
         photos(root).setup()
-    matrix = photos(root, fov=48.7).source("test").read(0).camera_matrix
+    matrix = photos(root, fov=48.7).dataset("test").read(0).camera_matrix
     np.testing.assert_allclose(np.rad2deg(2 * np.arctan(64 / matrix[0, 0])), 48.7)
 
 
@@ -150,7 +150,7 @@ def test_crops_lower_than_wide_cover_the_photo_once(shared: Path) -> None:
     assert sample.labels.shape == (1, 16, 32)
     evaluated: Any = data.dataset("test")[0]
     assert evaluated.target.shape == (len(evaluated.images[0]), 16, 32)
-    labels = data.source("test").read(0).labels
+    labels = data.dataset("test").read(0).labels
     share = (evaluated.target > 0).sum() / (labels > 0).sum()
     crop_pixel = (2 * np.tan(np.deg2rad(22.5)) * streets.CAMERA["fx"] / 16 / 32) ** 2
     assert share * crop_pixel == pytest.approx(1, abs=0.05)

@@ -29,7 +29,7 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _labels(data: Matterport360) -> list[int]:
     """Label of each number."""
     reading: Any = replace(cast("Any", data.index().read), shape=None)
-    row: list[int] = reading.labels(data.source("test").items[0])[-1].tolist()
+    row: list[int] = reading.labels(data.dataset("test").items[0])[-1].tolist()
     assert row[:22] == row[42:]
     return row[:42]
 
@@ -54,11 +54,11 @@ def test_colors_depth_and_black_pixels(root: Path, erp: Any, release: Any) -> No
     data = Matterport360(root, erp, **given)
     masked = Matterport360(root, erp, **given, unknown="all_black")
     for k in range(2):
-        panorama, reading = data.source("test").read(k), cast("Any", data.index().read)
+        panorama, reading = data.dataset("test").read(k), cast("Any", data.index().read)
         assert (panorama.rgb[-1] == 90).all()
-        steps = reading.reader.depth(data.source("test").items[k])[0]
+        steps = reading.reader.depth(data.dataset("test").items[k])[0]
         assert steps[:42].tolist() == [round(n * 1500 * 512 / 4000) for n in range(42)]
-        labels, without = data.source("test").labels(k), masked.source("test").labels(k)
+        labels, without = data.dataset("test").labels(k), masked.dataset("test").labels(k)
         assert not without[0].any()
         np.testing.assert_array_equal(without[-1], labels[-1])
         assert labels[0].any()

@@ -70,7 +70,7 @@ def make_module(root: Path) -> MakeModule:
 
 
 def _labels(module: ModelNet40, split: Split) -> list[int]:
-    return [module.class_names.index(mesh.label) for mesh in module.source(split).items]
+    return [module.class_names.index(mesh.label) for mesh in module.dataset(split).items]
 
 
 # --- splits ------------------------------------------------------------------------------------
@@ -90,7 +90,7 @@ def test_validation_is_drawn_from_every_class_alike(make_module: MakeModule) -> 
         assert len(names) == sum(len(_labels(module, split)) for split in SPLITS) == TRAINING + TEST
         assert all("/test/" in name for name in names_of(module, "test"))
     assert len(drawn) > 1
-    assert len(make_module(val_fraction=0).source("val")) == 0
+    assert len(make_module(val_fraction=0).dataset("val")) == 0
     assert make_module(val_fraction=0).val_dataloader() == []
 
 
@@ -174,6 +174,6 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
         )
         found = samples[0, index].images.numpy() / STEPS
         assert np.abs(found - expected / STEPS).mean() < 0.01  # facets have edges
-        upright = module.source("test").read(index).spheres
+        upright = module.dataset("test").read(index).spheres
         before = views.render(np.ascontiguousarray(upright[..., :3]), "bilinear") / STEPS
         assert np.abs(before - expected[..., :3] / STEPS).mean() > 0.05

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from datamodules import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.core.splits import SPLITS
 from datamodules.core.images import distance_from_z_depth, steps_to_meters
+from datamodules.core.splits import SPLITS
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS, FileName
-from datamodules.stanford2d3ds.reader import LabelTable
+from datamodules.stanford2d3ds.reader import read_label_table
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.rendering import (
@@ -20,42 +20,20 @@ from tangent_train.rendering import (
     PerspectiveRepresentation,
     TangentRepresentation,
 )
-from tests.cli.tiny_runs import run_command
 from tests.conftest import fabricate
-from tests.datamodules.data_files import names_of, read_png, write_png
+from tests.datamodules.data_files import names_of, read_png
 
 
 def _colors(indices: list[int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
     return np.array([[[i >> 16, i >> 8 & 255, i & 255] for i in indices]], np.uint8)
 
 
-def test_pixels_of_instances_past_the_end_of_the_table_are_unknown() -> None:
+def test_pixels_of_instances_past_the_end_of_the_table_are_unknown(tmp_path: Path) -> None:
     # #0D0D0D without its red byte would be entry 3341 of the table.
-    table = LabelTable(np.full(9816, 6, np.uint8))
+    (tmp_path / "table.json").write_text(json.dumps(["clutter_1_office_1_1"] * 9816))
+    table = read_label_table(tmp_path / "table.json")
     colors = _colors([0x0D0D0D, 9815, 9816, 0xFFFFFF])
     assert table.decode(colors).tolist() == [[0, 6, 0, 0]]
-    assert table.past_end(colors).tolist() == [9816, 0xFFFFFF]
-
-
-def test_instances_past_the_end_are_counted_and_listed_by_the_check(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    root = fabricate(tmp_path, dict.fromkeys(AREAS, ("office_1",)))
-    file = next((root / "area_6/pano/semantic").iterdir())
-    colors = read_png(file)
-    known = int((colors != 13).any(-1).sum())
-    colors[20:22, 30:32] = (0xAB, 0xCD, 0xEF)
-    write_png(file, colors)
-    data = Stanford2D3DS(root, level=3, val_fraction=0)
-    data.prepare_data()
-    problems, _ = data.check()
-    (warning,) = problems.warnings
-    assert warning.startswith(f"{file}: 4 pixels of instance {0xEFCDAB} or higher, past the end")
-    assert not problems.listed()
-    place = [files.labels for files in data.index().splits["train"]].index(file)
-    assert np.count_nonzero(data.source("train").labels(place)) == known / 4 - 1
-    run_command(monkeypatch, "check", "data=stanford2d3ds", f"data.root={root}", "level=3")
-    assert f"Warning: {warning}" in capsys.readouterr().err
 
 
 # --- names -------------------------------------------------------------------------------------
@@ -101,7 +79,7 @@ def test_folds_are_disjoint_and_rooms_stay_whole(
 @pytest.mark.parametrize("erp_height", [32, 8])
 def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
     module = Stanford2D3DS(stanford_root, EquirectRepresentation(3, erp_height=erp_height))
-    source = module.source("test")
+    source = module.dataset("test")
     area, room, camera = source.name(1).split("/")
     folder = stanford_root / area / "pano"
     panorama = source.read(1)
@@ -130,7 +108,7 @@ def test_reads_what_was_written(stanford_root: Path, erp_height: int) -> None:
 
 def test_masks_are_applied_on_reading(stanford_root: Path, erp: Any) -> None:
     labeled, masked = (
-        Stanford2D3DS(stanford_root, erp, unknown=unknown).source("train").read(0).labels
+        Stanford2D3DS(stanford_root, erp, unknown=unknown).dataset("train").read(0).labels
         for unknown in ("labels", "any_black")
     )
     assert not masked[-2:, :4].any(), "a patch without blue"
@@ -167,7 +145,7 @@ def photo_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
-    source = Stanford2D3DSPerspective(photo_root, CROPS).source("test")
+    source = Stanford2D3DSPerspective(photo_root, CROPS).dataset("test")
     photo, name = source.read(1), source.name(1)
     area, room, camera, frame = name.split("/")
     stem = f"camera_{camera}_{room}_frame_{frame}_domain"

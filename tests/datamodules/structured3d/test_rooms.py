@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from datamodules import Structured3D, Structured3DPerspective
-from datamodules.structured3d.classes import CLASS_SETS, CLASSES
+from datamodules.structured3d.classes import CLASSES, LABEL_MAPS, published_s3d8
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules.data_files import names_of, read_png, write_png
@@ -26,14 +26,14 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_panorama_is_what_the_files_hold(root: Path, erp: Any) -> None:
     data = Structured3D(root, erp, inputs=["rgb", "depth"], lighting="coldlight")
-    panorama = data.source("test").read(0)
+    panorama = data.dataset("test").read(0)
     reading: Any = data.index().read
-    labels = reading.reader.labels(data.source("test").items[0])
+    labels = reading.reader.labels(data.dataset("test").items[0])
     np.testing.assert_array_equal(labels[0], np.arange(64) % 41, "indices, not colors")
     assert (panorama.rgb[10:] == 102).all()
     assert data.class_names == ("unknown", *CLASSES)
     assert (CLASSES[0], CLASSES[21], CLASSES[39]) == ("wall", "ceiling", "other prop")
-    depth = reading.reader.depth(data.source("test").items[0])
+    depth = reading.reader.depth(data.dataset("test").items[0])
     for number in range(41):
         expected = round(25 * number * 512 / 1000)
         assert set(depth[:, np.arange(64) % 41 == number].flat) == {expected}
@@ -72,7 +72,7 @@ def test_invalid_scenes_and_missing_panoramas_are_reported(
 def test_a_photo_has_half_angles_and_z_depth(root: Path) -> None:
     crops = PerspectiveRepresentation(level=4, fov_deg=40)
     data = Structured3DPerspective(root, crops, inputs=["rgb", "depth"])
-    photo = data.source("test").read(1)
+    photo = data.dataset("test").read(1)
     assert names_of(data, "test")[1] == "scene_03250/3350/1"
     focal = photo.camera_matrix[0, 0], photo.camera_matrix[1, 1]
     for length, half_angle in zip(focal, HALF_ANGLES, strict=True):
@@ -92,11 +92,11 @@ KEY = {1: 6, 2: 3, 5: 1, 6: 4, 7: 5, 8: 2, 9: 7, 22: 0}
 def test_published_8_classes_depend_on_the_other_classes_of_an_image(others: list[int]) -> None:
     numbers = np.array([[0, 1, 2, 5, 7, 8, 9, 22, *others]], np.uint8)
     right = [KEY.get(number, -1) + 1 for number in numbers[0].tolist()]
-    np.testing.assert_array_equal(CLASS_SETS["8"].relabel(numbers)[0], right)
+    np.testing.assert_array_equal(LABEL_MAPS["8"].decode(numbers)[0], right)
     published = list(right)
     published[1] = 5 if 6 in others else 7  # wall becomes sofa
     published[2] = 0 if 3 in others else 4  # floor becomes unknown
-    np.testing.assert_array_equal(CLASS_SETS["published_s3d8"].relabel(numbers)[0], published)
+    np.testing.assert_array_equal(published_s3d8(numbers)[0], published)
     # The loop of the readers, number by number.
     looped = numbers[0].astype(int)
     for number in sorted(set(looped.tolist())):
@@ -106,13 +106,13 @@ def test_published_8_classes_depend_on_the_other_classes_of_an_image(others: lis
 
 def test_both_sets_are_read_and_stored(root: Path, erp: Any, tmp_path: Path) -> None:
     right, published = (
-        Structured3D(root, erp, classes=c, store=tmp_path) for c in ("8", "published_s3d8")
+        Structured3D(root, erp, classes=c, cache=tmp_path) for c in ("8", "published_s3d8")
     )
     for data in (right, published):
         data.prepare_data()
     names = ("unknown", "ceiling", "chair", "door", "floor", "sofa", "table", "wall", "window")
     assert right.class_names == published.class_names == names
-    before, after = (data.source("test").labels(0) for data in (right, published))
+    before, after = (data.dataset("test").labels(0) for data in (right, published))
     assert set(after[before == names.index("wall")]) == {names.index("sofa")}
     assert set(after[before == names.index("floor")]) == {0}
     same = (before != names.index("wall")) & (before != names.index("floor"))

@@ -34,7 +34,7 @@ def panoramas(root: Path, **settings: Any) -> SynPASS:
 @pytest.mark.parametrize("index", [0, 1], ids=["gray", "palette"])
 def test_every_number_has_its_class(shared: Path, index: int) -> None:
     stored = streets.numbers(streets.SYNPASS_NUMBERS, (32, 64), index)
-    panorama = panoramas(shared).source("test").read(index)
+    panorama = panoramas(shared).dataset("test").read(index)
     np.testing.assert_array_equal(panorama.labels, np.where(stored == 255, 0, stored))
     assert set(np.unique(stored)) == {*range(23), 255}
     error = np.abs(panorama.rgb.astype(int) - streets.colors(stored)[..., ::-1])

@@ -61,7 +61,7 @@ def test_splits_follow_the_authors(root: Path, erp: Any) -> None:
 
 def test_reads_what_was_written(root: Path) -> None:
     module = OmniSynthia(root, EquirectRepresentation(4), inputs=("rgb", "depth"))
-    source = module.source("test")
+    source = module.dataset("test")
     panorama = source.read(1)
     pano = synthia.sequence(root, "04") / "pano"
     ids = read_png(pano / "GT" / "LABELS_Correct" / "000001.png")
@@ -92,7 +92,7 @@ def test_the_photos_are_the_views_of_the_panoramas(erp: Any, tmp_path: Path) -> 
 
 def test_photos_are_what_was_written(root: Path) -> None:
     photos = SynthiaPerspective(root, CROPS, inputs=("rgb", "depth"), **SEQUENCES)
-    source = photos.source("test")
+    source = photos.dataset("test")
     for index, view in enumerate("FRBL"):
         for frame in (0, 1):
             photo = source.read(4 * frame + index)
@@ -126,7 +126,7 @@ def test_panoramas_are_made_from_views(tmp_path: Path, erp: Any) -> None:
     module.setup("fit")
     assert names_of(module, "train") == ["sequence_01/000000"]
     assert names_of(module, "val") == ["sequence_01/000002"]
-    labels = module.source("train").read(0).labels
+    labels = module.dataset("train").read(0).labels
     assert labels.shape == (16, 32)
     assert set(np.unique(labels).tolist()) == set(range(14))
     two(root, erp, panorama_height=64, frames=2).make_files()

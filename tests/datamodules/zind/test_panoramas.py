@@ -52,7 +52,7 @@ def _record(root: Path, room: int, name: str) -> Any:
 def test_labels_are_cast_at_the_size_of_the_run(
     root: Path, level: int, shape: tuple[int, int]
 ) -> None:
-    source = _zind(root, EquirectRepresentation(level=level), test_fraction=1).source("test")
+    source = _zind(root, EquirectRepresentation(level=level), test_fraction=1).dataset("test")
     rooms = {"pano_1": 1, "pano_2": 1, "pano_3": 2, "pano_5": 2, "pano_4": 3, "pano_6": 4}
     assert [source.name(k).rpartition("/")[2] for k in range(len(source))] == list(rooms)
     for index, (name, room) in enumerate(rooms.items()):
@@ -106,13 +106,13 @@ def test_doors_may_be_unknown_and_a_store_is_of_one_choice_and_layout(
     stored, ignoring = _zind(root, **settings), _zind(root, doors="ignore", **settings)
     stored.prepare_data()
     ignoring.prepare_data()
-    labels, ignored = (data.source("test").read(0).labels for data in (stored, ignoring))
+    labels, ignored = (data.dataset("test").read(0).labels for data in (stored, ignoring))
     assert (labels == 4).any()
     np.testing.assert_array_equal(ignored, np.where(labels == 4, 0, labels))
     file = root / "000" / "zind_data.json"
     file.write_text(file.read_text() + "\n")
     with pytest.raises(DataError, match=r"labels made from zind_data\.json"):
-        stored.source("test").read(0)
+        stored.dataset("test").read(0)
 
 
 BROKEN: dict[str, tuple[dict[str, Any], str]] = {

@@ -42,7 +42,7 @@ def test_a_worker_that_dies_is_reported_with_what_may_help(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     data = small_data(stanford_root, num_workers=2)
-    source: Any = data.source(split)
+    source: Any = data.dataset(split)
     read = source.read
 
     def read_or_die(index: int) -> Any:
