@@ -33,17 +33,17 @@ def area(quick: bool) -> Iterator[Table]:
         PART: InputImage(canvas.place(canvas.cut(rgb)), area=canvas),
     }
     trained = LoadedNetwork(
-        network,
-        ("unknown", *map(str, range(13))),
-        ("rgb",),
-        RGB_NORMALIZATION,
-        level,
-        {
+        module=network,
+        class_names=("unknown", *map(str, range(13))),
+        inputs=("rgb",),
+        normalization=RGB_NORMALIZATION,
+        level=level,
+        representation={
             "_target_": "tangent_train.rendering.TangentRepresentation",
             "base_level": 0,
             "level": level,
         },
-        (2**level, 2**level),
+        image_size=(2**level, 2**level),
     )
     predictor = Predictor(trained, PanoramaViews(trained))
     alternatives = [

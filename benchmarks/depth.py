@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import Normalization
+from datamodules.core.labels import DISTANCE
 from models import HuggingFaceDepthNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import equirect_directions
@@ -37,13 +38,14 @@ def depth(quick: bool) -> Iterator[Table]:
     side, rows = (70, 64) if quick else (518, 1024)
     settings = photo_network_settings(side)
     trained = LoadedNetwork(
-        RoomDepth(),
-        (),
-        ("rgb",),
-        Normalization([0.0] * 3, [1.0] * 3),
-        settings["level"],
-        settings,
-        (side, side),
+        module=RoomDepth(),
+        predicts=DISTANCE,
+        class_names=(),
+        inputs=("rgb",),
+        normalization=Normalization([0.0] * 3, [1.0] * 3),
+        level=settings["level"],
+        representation=settings,
+        image_size=(side, side),
         photo_level=settings["level"],
         depth_kind="relative_disparity",
     )

@@ -51,12 +51,16 @@ class HarmonicNetwork(nn.Module):
         super().__init__()
         with of_extra("spectral", f"network={architecture}"):
             from torch_harmonics.examples import models as library
-        self.shape = equirect_shape(level)
+        self.fixed_size = equirect_shape(level)
         arguments: dict[str, Any] = {
             name: tuple(value) if isinstance(value, list | tuple) else value
             for name, value in options.items()
         }
-        arguments |= {"img_size": self.shape, "in_chans": in_channels, "out_chans": num_classes}
+        arguments |= {
+            "img_size": self.fixed_size,
+            "in_chans": in_channels,
+            "out_chans": num_classes,
+        }
         with warnings.catch_warnings():  # about the library's own default
             warnings.filterwarnings("ignore", "The 'morlet' basis type is deprecated")
             self.network = getattr(library, architecture)(grid=_GRID, **arguments)
@@ -75,7 +79,7 @@ class HarmonicNetwork(nn.Module):
         Raises:
             SettingError: The images are not whole equirectangular images of the level.
         """
-        check_shape(images, self.shape)
+        check_shape(images, self.fixed_size)
         with torch.autocast(images.device.type, enabled=False):  # transforms need float32
             scores: Tensor = self.network(images.float())
         return scores

@@ -52,7 +52,7 @@ class HexUNet(nn.Module):
         7248718
     """
 
-    stride = 2 ** len(_ENCODERS)
+    size_multiple = 2 ** len(_ENCODERS)
 
     def __init__(self, in_channels: int, num_classes: int) -> None:
         super().__init__()
@@ -79,7 +79,7 @@ class HexUNet(nn.Module):
         Raises:
             SettingError: A side is not a multiple of the network's stride, 16.
         """
-        check_sides(images, self.stride, "HexUNet")
+        check_sides(images, self.size_multiple, "HexUNet")
         skips = []
         x = images
         for encoder in self.encoders:

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from models.unet import check_sides
 from tangent_train.config.setting_rules import flat_settings
-from tangent_train.errors import SettingError, of_extra, width_height
+from tangent_train.errors import SettingError, of_extra
 
 _Value = bool | int | float | str | None
 _Values = _Value | Sequence[_Value | Sequence[_Value | Sequence[_Value]]]
@@ -26,6 +26,9 @@ SEGMENTATION = "SEMANTIC_SEGMENTATION", "UNIVERSAL_SEGMENTATION"
 
 DEPTH = "DEPTH_ESTIMATION"
 """Task of networks that return depth."""
+
+_ONE_SIZE = "beit", "data2vec-vision", "eomt"
+"""Networks with a learned position of each patch, which are not interpolated."""
 
 _MASK2FORMER = (384, 384)
 """Rows and columns to which Mask2Former's masks are resized before they are added
@@ -126,7 +129,9 @@ class _TransformersNetwork(nn.Module):
         auto: Any = getattr(hf, f"AutoModelFor{fitting[0].title().replace('_', '')}")
         self.network: Any = auto.from_config(made, trust_remote_code=False)
         self._bgr = bgr
-        self._patch = _patch_size(made)
+        self.size_multiple = _patch_size(made)
+        if kind in _ONE_SIZE:
+            self.fixed_size = (made.image_size, made.image_size)
 
     def _prepared(self, images: Tensor) -> Tensor:
         """Return images with the network's order of channels.
@@ -136,7 +141,7 @@ class _TransformersNetwork(nn.Module):
         """
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
-        check_sides(images, self._patch, type(self.network).__name__)
+        check_sides(images, self.size_multiple, type(self.network).__name__)
         return images
 
 
@@ -240,7 +245,8 @@ class HuggingFaceDepthNetwork(_TransformersNetwork):
         made = self.network.config
         self._voting = len(getattr(made, "bin_configurations", ())) > 1
         ratios = getattr(made, "scaled_images_ratios", None)
-        self._side = None if ratios is None else round(made.patch_size / min(ratios))
+        if ratios is not None:  # Depth Pro
+            self.fixed_size = (round(made.patch_size / min(ratios)),) * 2
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -252,12 +258,6 @@ class HuggingFaceDepthNetwork(_TransformersNetwork):
         """
         images = self._prepared(images)
         size = height, width = images.shape[-2], images.shape[-1]
-        if self._side is not None and size != (self._side, self._side):  # Depth Pro
-            raise SettingError(
-                f"image size for {type(self.network).__name__}",
-                found=width_height(size),
-                expected=width_height((self._side, self._side)),
-            )
         # Reflected pixels at each border (``ZoeDepthImageProcessor._pad_images``).
         down, right = (int(3 * math.sqrt(n / 2)) if self._padded else 0 for n in size)
         if self._padded:

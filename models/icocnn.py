@@ -284,7 +284,7 @@ class IcoCNN(ResidualUNet):
             ups=[partial(_unpool, level=r) for r in levels[:-1]],
             block=_Block,
         )
-        self.level = level
+        self.fixed_size = (1, icosphere_count(level))
         self.stem = nn.Sequential(
             GaugeConv(in_channels, widths[0], level, given=1),
             nn.BatchNorm2d(widths[0]),
@@ -300,5 +300,5 @@ class IcoCNN(ResidualUNet):
         Raises:
             SettingError: The images are not signals on the vertices of the network's level.
         """
-        check_signal(images.shape, icosphere_count(self.level))
+        check_signal(images.shape, self.fixed_size[1])
         return super().forward(images)

@@ -180,6 +180,7 @@ class MappedConv(nn.Module):
     ) -> None:
         super().__init__()
         self.table = table
+        self.fixed_size = (1, table.inputs)
         self.weight = nn.Parameter(torch.empty(out_channels, in_channels, table.taps))
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
         bound = (in_channels * table.taps) ** -0.5

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from tangent_train.errors import DataError, SettingError, of_extra
-from tangent_train.files import crc32_of
 
 _TYPES = {"tensor(float)": torch.float32, "tensor(float16)": torch.float16}
 _COLORS = 3
@@ -36,8 +35,7 @@ class OnnxNetwork(nn.Module):
     Attributes:
         path: ONNX file.
         metadata: Metadata of the file, text by key.
-        checksum: Checksum of the tensors.
-        image_size: Fixed rows and columns of images; None for a side of any length.
+        fixed_size: Fixed rows and columns of images; None for a side of any length.
 
     Raises:
         DataError: The file is missing, has other inputs or outputs, or needs other files.
@@ -63,7 +61,6 @@ class OnnxNetwork(nn.Module):
             # Both read the file equally, regardless of its name and first bytes.
             graph = onnx.load(path, format="protobuf", load_external_data=False)
             options.add_session_config_entry("session.load_model_format", "ONNX")
-            self.checksum = graph_checksum(graph)
             if not any(tensor.data_location for tensor in _tensors(graph)):
                 self._session = onnxruntime.InferenceSession(path, options, providers=providers)
         except Exception as error:  # the parser of protocol buffers raises many kinds of errors
@@ -91,7 +88,7 @@ class OnnxNetwork(nn.Module):
         self._batch = shape[0] if isinstance(shape[0], int) else None
         rows, columns = shape[1:3] if self._channels_last else shape[2:]
         known = isinstance(rows, int) and isinstance(columns, int)
-        self.image_size: tuple[int, int] | None = (rows, columns) if known else None
+        self.fixed_size: tuple[int, int] | None = (rows, columns) if known else None
         self.metadata: dict[str, str] = dict(self._session.get_modelmeta().custom_metadata_map)
 
     def forward(self, images: Float[Tensor, "batch channels height width"]) -> Tensor:
@@ -143,11 +140,6 @@ class OnnxNetwork(nn.Module):
         if scores.shape[1] == 1 and bool(((scores == scores.round()) | scores.isnan()).all()):
             return functional.interpolate(scores, size)  # whole numbers: labels
         return functional.interpolate(scores, size, mode="bilinear")
-
-
-def graph_checksum(graph: Any) -> str:
-    """Return the CRC-32 of all tensors in an ONNX graph, in order."""
-    return crc32_of(tensor.SerializeToString(deterministic=True) for tensor in _tensors(graph))
 
 
 def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tensor | None:

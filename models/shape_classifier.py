@@ -33,7 +33,7 @@ class ShapeClassifier(nn.Module):
         1309976
     """
 
-    stride = 2 ** len(_WIDTHS)
+    size_multiple = 2 ** len(_WIDTHS)
 
     def __init__(
         self, in_channels: int, num_classes: int, width: int = 16, dropout: float = 0.5
@@ -57,7 +57,7 @@ class ShapeClassifier(nn.Module):
         Raises:
             SettingError: A side is not a multiple of the network's stride, 16.
         """
-        check_sides(images, self.stride, "ShapeClassifier")
+        check_sides(images, self.size_multiple, "ShapeClassifier")
         features = self.features(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         scores: Tensor = self.head(self.dropout(features.mean(dim=(1, 3, 4))))
         return scores

@@ -172,7 +172,7 @@ class UNet(ResidualUNet):
             pools=[nn.AvgPool2d(2) for _ in range(fewer)],
             ups=[_transposed] * fewer,
         )
-        self.stride = 2**fewer
+        self.size_multiple = 2**fewer
 
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
@@ -182,7 +182,7 @@ class UNet(ResidualUNet):
         Raises:
             SettingError: A side is not a multiple of the network's stride (32 by default).
         """
-        check_sides(images, self.stride, "UNet")
+        check_sides(images, self.size_multiple, "UNet")
         return super().forward(images)
 
 

@@ -3,54 +3,17 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import os
 import re
-import shutil
 import tempfile
-import zlib
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import reduce
 from pathlib import Path
 from typing import IO, Any
-from zipfile import ZipFile, is_zipfile
 
-from tangent_train.errors import DataError, SettingError
-from tangent_train.imports import elsewhere
-
-_PREFIX = ".partial-"
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_PROBE = bytes(1 << 16)
-
-
-class NoRoomError(SettingError):
-    """A full disk, an exhausted quota, or a file above the size limit."""
-
-
-def no_room(path: Path, error: BaseException) -> NoRoomError | None:
-    """Return an error with a remedy if a file did not fit on the disk.
-
-    Args:
-        path: File that was written.
-        error: Raised error.
-
-    Returns:
-        Error with a remedy; None if `error` has another reason.
-    """
-    if not isinstance(error, OSError) or error.errno not in _FULL:
-        return None
-    folder = next((parent for parent in path.absolute().parents if parent.exists()), Path("/"))
-    return NoRoomError(
-        path,
-        found=f"{os.strerror(error.errno).lower()} ({shutil.disk_usage(folder).free / 1e9:.1f} GB "
-        "free)",
-        expected="room for the file",
-        remedy="Existing files are unchanged. Free some space, or write to another disk.",
-    )
+from tangent_train.errors import DataError
 
 
 @contextmanager
@@ -66,15 +29,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Yields:
         Path in the same folder with the same suffix, to be written by the block.
-
-    Raises:
-        NoRoomError: The disk is full.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
-    except OSError as error:
-        raise no_room(path, error) or OSError(error.errno, error.strerror, str(path)) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -83,12 +40,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _sync(temporary)
         temporary.replace(path)
         _sync(path.parent)
-    except Exception as error:
-        known = isinstance(error, OSError) and error.errno is not None
-        full = no_room(path, error if known else _refused(temporary))
-        if full is None:
-            raise
-        raise full from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -133,41 +84,23 @@ def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
-def _refused(path: Path) -> OSError:
-    """Return the error that keeps a file from growing, which libraries do not report."""
-    try:
-        with path.open("ab") as file:
-            file.write(_PROBE)
-            file.flush()
-    except OSError as error:
-        return error
-    return OSError()
-
-
-def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = True) -> Any:
+def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     """Load tensors and plain values from a file of `torch.save`; nothing else is unpickled.
 
     Args:
         path: File to load.
         expected: Expected file, for the message.
         mmap: True to map the tensors into memory instead of reading them.
-        whole: True to compare the whole file with its checksums, which torch does not do. Files of
-            torch before version 1.6 lack checksums.
 
     Raises:
         DataError: The file is missing, damaged, or contains other objects.
     """
     if not path.exists():
         raise DataError(path, found="no such file", expected=expected)
-    with elsewhere():
-        import torch
+    import torch
 
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
-        damaged = None
-        if whole and is_zipfile(path):
-            with ZipFile(path) as archive:
-                damaged = archive.testzip()
     except Exception as error:
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
@@ -176,55 +109,6 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False, whole: bool = T
             found = "a damaged file, or not a file of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    check_sum(path, damaged is None)
-    return content
-
-
-def check_sum(path: Path, is_right: bool) -> None:
-    """Refuse a file whose content has changed since it was written.
-
-    Args:
-        path: File, for the message.
-        is_right: True if the checksum is right.
-
-    Raises:
-        DataError: The checksum is wrong.
-    """
-    if not is_right:
-        raise DataError(
-            path,
-            found="a damaged file, whose checksum is wrong",
-            expected="the file as it was written",
-            remedy="Copy the original file again.",
-        )
-
-
-def crc32_of(parts: Iterable[bytes | memoryview]) -> str:
-    """Return the CRC-32 of consecutive bytes as eight hexadecimal digits."""
-    return f"{reduce(lambda crc, part: zlib.crc32(part, crc), parts, 0):08x}"
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; refuse text that is nested too deeply, or repeats a name in a mapping.
-
-    Args:
-        text: Text, or its bytes in UTF-8, UTF-16 or UTF-32.
-
-    Raises:
-        ValueError: The text is not JSON, or is refused.
-    """
-    try:
-        return json.loads(text, object_pairs_hook=_unique)
-    except RecursionError as error:
-        raise ValueError("its brackets are nested too deeply") from error
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a mapping; refuse repeated names, of which programs read different values."""
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
-        raise ValueError(f"{name!r} is repeated")
     return content
 
 
@@ -243,13 +127,13 @@ def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> 
     from pydantic import TypeAdapter, ValidationError  # slow to import
 
     try:
-        content = parse_json(path.read_bytes())
+        content = json.loads(path.read_bytes())
         return content if kind is None else TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(path, found=error, expected=expected, remedy=remedy) from error
 
 
@@ -282,6 +166,21 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence
 
 def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace an existing output file, unless the user wants it.
+
+    Raises:
+        SettingError: The file exists.
+    """
+    if path.exists() and not overwrite:
+        raise SettingError(
+            "output",
+            found=f"{path}, which exists",
+            expected="a path that does not exist yet",
+            remedy="Give another output, or overwrite=true.",
+        )
 
 
 def config_folder() -> Path:

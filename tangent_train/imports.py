@@ -90,13 +90,3 @@ def hide_output() -> Iterator[None]:
             yield
     finally:
         logging.disable(disabled)
-
-
-def is_private(folder: Path) -> bool:
-    """Return True if a folder belongs to this user, and other users have no access to it.
-
-    Args:
-        folder: Existing folder. On Windows, folders of a user are private.
-    """
-    status = folder.stat()
-    return os.name == "nt" or (status.st_uid == os.geteuid() and not status.st_mode & 0o077)

@@ -12,8 +12,9 @@ from typing import Any
 
 import pytest
 from hydra import compose, initialize_config_dir
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
+from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
 
 Capture = pytest.CaptureFixture[str]
@@ -23,14 +24,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def composed(command: str, *overrides: str, **more: Any) -> DictConfig:
     """The config of a command line; `more` for Hydra's `compose`."""
+    config_name(command, ())
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
         return compose(command, list(overrides), **more)
 
 
-def composed_settings(command: str, *overrides: str) -> dict[str, Any]:
-    """The config of a command line as plain values."""
-    settings: Any = OmegaConf.to_container(composed(command, *overrides), resolve=True)
-    return dict(settings)
+def composed_settings(command: str, *overrides: str) -> Any:
+    """The settings of a command line."""
+    return validate(command, composed(command, *overrides))
 
 
 def run_python(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:

@@ -45,16 +45,3 @@ def test_an_error_of_the_work_takes_the_place_of_its_result() -> None:
     assert [next(done), next(done)] == [0, 1]
     with pytest.raises(ZeroDivisionError):
         next(done)
-
-
-def test_work_that_has_not_begun_is_dropped_when_the_results_are_closed() -> None:
-    begun = []
-
-    def work(number: int) -> None:
-        begun.append(number)
-        time.sleep(0.01)
-
-    results = in_threads(work, range(100), workers=1, ahead=50)
-    next(results)
-    results.close()
-    assert len(begun) <= 3

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from tangent_train.cli.help import Setting, bases, description, read_settings
+from tangent_train.config.help import Setting, bases, description, read_settings
 from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols, published_lines
 

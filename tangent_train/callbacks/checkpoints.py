@@ -17,7 +17,6 @@ from lightning.pytorch.callbacks import Callback, Checkpoint, ModelCheckpoint, T
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.console import print_text
-from tangent_train.errors import at_least
 from tangent_train.files import atomic_path
 
 
@@ -107,16 +106,11 @@ class LastCheckpoint(Checkpoint):
 
     Attributes:
         has_begun: True if training has begun, with everything restored.
-
-    Raises:
-        SettingError: `every_n_steps` is less than 1.
     """
 
     def __init__(
         self, folder: Path | str, every_n_steps: int | None = None, overrides: Sequence[str] = ()
     ) -> None:
-        if every_n_steps is not None:
-            at_least("checkpoint_every_n_steps", every_n_steps, 1)
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
         self.overrides = overrides
@@ -152,7 +146,7 @@ class LastCheckpoint(Checkpoint):
         is_last = batch_idx + 1 == trainer.num_training_batches  # saved at the end of the epoch
         if not is_step or is_last:
             return
-        is_due = bool(self.every_n_steps) and trainer.global_step % (self.every_n_steps or 1) == 0
+        is_due = self.every_n_steps and trainer.global_step % self.every_n_steps == 0
         is_ending = self._is_any_ended(trainer)
         if is_due or is_ending:
             trainer.save_checkpoint(self.path, weights_only=False)

@@ -42,19 +42,18 @@ class ProgressBar(RichProgressBar):
     def on_train_batch_end(self, *args: Any) -> None:
         """Print a line per minute."""
         super().on_train_batch_end(*args)
-        self._print_steps(
-            f"Epoch {args[0].current_epoch + 1}", args[4], args[0].num_training_batches
-        )
+        trainer, step = args[0], args[4]
+        self._print(f"Epoch {trainer.current_epoch + 1}", step, trainer.num_training_batches)
 
     def on_validation_batch_end(self, *args: Any) -> None:
         """Print a line per minute."""
         super().on_validation_batch_end(*args)
-        self._print_steps("Validation", args[4], args[0].num_val_batches[0])
+        self._print("Validation", args[4], args[0].num_val_batches[0])
 
     def on_test_batch_end(self, *args: Any) -> None:
         """Print a line per minute."""
         super().on_test_batch_end(*args)
-        self._print_steps("Test", args[4], args[0].num_test_batches[0])
+        self._print("Test", args[4], args[0].num_test_batches[0])
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print a line with the metrics and the time left."""
@@ -64,11 +63,12 @@ class ProgressBar(RichProgressBar):
         parts = [f"Epoch {done} of {last}" if last > 0 else f"Epoch {done}"]
         metrics = self.get_metrics(trainer, pl_module)
         parts += [f"{name} {value:.3f}" for name, value in metrics.items()]
-        seconds = (time.monotonic() - self._begun) / self._epochs * (last - done)
-        parts += [f"{timedelta(seconds=round(seconds))} left"] * (last > done)
+        if last > done:
+            seconds = (time.monotonic() - self._begun) / self._epochs * (last - done)
+            parts.append(f"{timedelta(seconds=round(seconds))} left")
         if trainer.is_global_zero:
             self._lines.print(", ".join(parts), at_once=True)
 
-    def _print_steps(self, stage: str, index: int, total: float) -> None:
+    def _print(self, stage: str, index: int, total: float) -> None:
         if self.trainer.is_global_zero:
             self._lines.print(f"{stage}: {index + 1} of {total} steps")

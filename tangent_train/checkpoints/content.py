@@ -8,7 +8,6 @@ from typing import Any, Literal
 
 import yaml  # type: ignore[import-untyped]
 
-from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.config.build import Text, check_fields, check_plain
 from tangent_train.errors import DataError, first_line
 from tangent_train.files import load_plain, write_text
@@ -19,21 +18,12 @@ INPUTS = list[Literal["rgb", "depth", "elevation"]]
 NORMALIZATION = dict[str, list[float]]
 """The ``mean`` and ``std`` of a network's inputs."""
 
-GROUPS = list[list[int]] | None
-"""Scores of a photo network that are combined for each class, see `Groups`."""
-
 _FIELDS = {
     "config": dict,
     "class_names": list[Text],  # empty for depth networks
-    "depth_kind": DepthKind | None,  # for imported depth networks; None for log_distance
-    "fixed_size": list[int] | None,  # for imported networks
-    "epoch": int | None,  # for runs: the last epoch that has begun, from 0
-    "groups": GROUPS,
+    "epoch": int | None,  # the last epoch that has begun, from 0
     "inputs": INPUTS | None,  # None for shapes, which have six fixed channels
     "normalization": NORMALIZATION,
-    "photo_level": int | None,  # for imported networks
-    "predicts": Text,  # kind of labels, see `datamodules.core.labels`
-    "score_kind": ScoreKind | None,  # for imported networks; None for logits
     "state_dict": dict,
 }
 _EXPECTED = "a checkpoint written by tangent-train"
@@ -43,10 +33,9 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     """Read fields of a checkpoint; only tensors and plain values are unpickled.
 
     Args:
-        path: Checkpoint. Tensors are memory-mapped; checksums are compared if they are needed.
+        path: Checkpoint. Tensors are memory-mapped.
         needed: Names of the fields: ``config`` (the resolved settings of the run, plain values),
-            ``class_names``, ``depth_kind``, ``epoch``, ``fixed_size``, ``groups``, ``inputs``,
-            ``normalization``, ``photo_level``, ``predicts``, ``score_kind``, ``state_dict``.
+            ``class_names``, ``epoch``, ``inputs``, ``normalization``, ``state_dict``.
 
     Raises:
         DataError: The file is missing, damaged, or not a checkpoint of this program.
@@ -54,7 +43,7 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
     if path.is_dir():
         remedy = "Use its checkpoints/best.ckpt."
         raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
-    content = load_plain(path, _EXPECTED, mmap=True, whole="state_dict" in needed)
+    content = load_plain(path, _EXPECTED, mmap=True)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
     checked = check_fields(path, content, kinds, _EXPECTED)
     if "config" in checked:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from typing import Literal
 
-ScoreKind = Literal["logits", "probabilities", "sigmoid_logits", "sigmoid", "labels"]
+ScoreKind = Literal["logits", "probabilities", "labels"]
 """Output of a network.
 
 * `logits`: scores before a softmax over the K classes.
 * `probabilities`: scores after that softmax.
-* `sigmoid_logits`: scores before a sigmoid of each class. A score of 0 is appended at index K,
-  "none of the classes", which wins where no class has a probability above ½.
-* `sigmoid`: probabilities after that sigmoid, with the same index K.
 * `labels`: label maps ``(B, h, w)`` or ``(B, 1, h, w)``. NaN and values outside 0 … K − 1 belong to
   index K.
+
+A single score is that of a sigmoid. A score of 0 is appended at index 1, "not of the class", which
+wins where the probability is below ½.
 """
 
 Align = Literal["none", "scale", "affine", "grid"]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Any
 
 import torch
@@ -130,20 +128,21 @@ def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
         num_labels: Number K of labels in label maps.
 
     Returns:
-        Scores ``(B, K, h, w)``, or ``(B, K + 1, h, w)`` for kinds with an index K.
+        Scores ``(B, K, h, w)``; ``(B, K + 1, h, w)`` for label maps and for a single score, see
+        `ScoreKind`.
     """
     if kind == "labels":
         values = scores if scores.ndim == _LABEL_MAP else scores[:, 0]
         known = (values >= 0) & (values < num_labels)  # False for NaN
         labels = torch.where(known, values.long(), num_labels)
         return functional.one_hot(labels, num_labels + 1).movedim(-1, 1) * _CERTAIN
+    if scores.shape[1] == 1:
+        limit = torch.finfo(scores.dtype).eps
+        logits = scores.logit(limit) if kind == "probabilities" else scores
+        return torch.cat([logits, torch.zeros_like(logits)], dim=1)
     if kind == "probabilities":
         return scores.clamp_min(torch.finfo(scores.dtype).tiny).log()
-    if kind == "logits":
-        return scores
-    if kind == "sigmoid":
-        scores = scores.logit(torch.finfo(scores.dtype).eps)
-    return torch.cat([scores, torch.zeros_like(scores[:, :1])], dim=1)
+    return scores
 
 
 def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:
@@ -174,38 +173,3 @@ def _tiled_scores(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor
             count[area] += 1
     result: Tensor = total / count
     return result
-
-
-_PROBED = {1: 127, 2: 67, 4: 37, 8: 17, 14: 11, 16: 11} | dict.fromkeys((32, 64, 128), 5)
-"""Candidate multiples, and the factor of the height to try each with, a prime: the height has no
-other divisors. The width is twice the height, for networks of equirectangular images; 14 is for
-transformers with patches of 14 pixels."""
-
-
-def size_multiple_of(network: nn.Module, in_channels: int) -> int | None:
-    """Find by trial the number that height and width must be multiples of.
-
-    Args:
-        network: Network in evaluation mode on the CPU that returns a tensor.
-        in_channels: Number of input channels.
-
-    Returns:
-        1, 2, 4, 8, 14, 16, 32, 64 or 128; None if the network takes no multiple of these.
-    """
-    multiple = None
-    if any(True for _ in network.parameters()):  # False for an ONNX file
-        shapes_only: nn.Module = copy.deepcopy(network).to("meta")
-        multiple = _least_multiple(shapes_only, in_channels, "meta")
-    # Some networks depend on values, which tensors on the device meta do not have.
-    return multiple or _least_multiple(network, in_channels, "cpu")
-
-
-@torch.no_grad()
-def _least_multiple(network: nn.Module, in_channels: int, device: str) -> int | None:
-    for multiple, count in _PROBED.items():
-        size = torch.Size((multiple * count, 2 * multiple * count))
-        with suppress(Exception):  # networks refuse sizes with different errors
-            scores = network(torch.zeros(1, in_channels, *size, device=device))
-            if scores.shape[-2:] == size:
-                return multiple
-    return None

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from contextlib import redirect_stdout
-from typing import Any
 
 import numpy as np
 
 from datamodules.core.class_weights import label_doubts
 from tangent_train.cli.run import open_data
+from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table, percent
 
 
-def check(settings: Mapping[str, Any]) -> None:
+def check(settings: RunSettings) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding
     and remedy, separated by tabs; everything else then goes to standard error.
 
     Args:
-        settings: Composed ``check.yaml``.
+        settings: Settings of the command.
     """
     data = open_data(settings)
     terminal = sys.stdout.isatty()

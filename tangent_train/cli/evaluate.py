@@ -1,40 +1,66 @@
-"""``tangent-evaluate``: evaluate a checkpoint on the test fold of its data."""
+"""``tangent-evaluate``: evaluate a network from a file on the test fold of a data set."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+import lightning
+from hydra.core.hydra_config import HydraConfig
+from hydra.utils import get_class
+
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.cli.command_settings import EvaluateSettings
-from tangent_train.cli.run import Run, machine_faults
-from tangent_train.cli.settings import parse_settings
-from tangent_train.cli.stored import run_settings
-from tangent_train.config.build import SettingsFile
+from tangent_train.cli.run import (
+    Run,
+    build_data,
+    build_task,
+    check_fits,
+    inputs_and_classes,
+    write_settings,
+)
+from tangent_train.config.settings import EvaluateSettings
+from tangent_train.inference.label_maps import load_label_map, map_classes
+from tangent_train.inference.representations import check_size, panorama_settings
 
 
-def evaluate(
-    settings: Mapping[str, Any],
-    source: SettingsFile | None = None,
-    trained: LoadedNetwork | None = None,
-) -> None:
-    """Evaluate a checkpoint on the test fold of its data.
-
-    Args:
-        settings: Settings of the run, and ``checkpoint``, ``label_map`` and ``unmapped``. A stage
-            of a transfer may lack the last two.
-        source: File that settings come from, see `build_from_config`.
-        trained: Network of a file without settings of a run, if it has been loaded.
+def evaluate(settings: EvaluateSettings) -> None:
+    """Evaluate a network on the test fold of the data, and write the results.
 
     Raises:
-        SettingError: The checkpoint does not fit the data.
+        SettingError: The network does not fit the data.
     """
-    checkpoint = parse_settings(EvaluateSettings, settings).checkpoint
-    mapped = settings.get("label_map") is not None
-    if not mapped:
-        settings = {name: value for name, value in settings.items() if name != "unmapped"}
-    if trained is None and (mapped or run_settings(checkpoint) is None):
-        trained = load_network(checkpoint, settings.get("trust", ()))
-    run = Run.create(settings, source, trained, trains=False)
-    with machine_faults(run.folder, run.data):
-        run.test(run.trainer([]), checkpoint)
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    lightning.seed_everything(settings.seed, workers=True, verbose=False)
+    loaded = load_network(settings.checkpoint, settings.trust)
+    remedy = "Choose the task of the network: task=segmentation, depth or classification."
+    loaded.check_predicts(get_class(settings.task["_target_"]).predicts, remedy)
+    settings = settings.model_copy(update=_of_network(settings, loaded))
+    data, notes = build_data(settings), []
+    if settings.label_map is not None:
+        label_map = load_label_map(settings.label_map)
+        mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
+        loaded, notes = mapped.trained, [f"Label map {label_map.name}: {mapped}."]
+    check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
+    if loaded.inputs:  # images, not shapes
+        check_size(loaded, data.representation.image_size)
+    task = build_task(settings, data, loaded.network)
+    run = Run(folder, settings, data, task, loaded, notes)
+    write_settings(folder, settings)
+    run.test(run.trainer(), settings.checkpoint)
+
+
+def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, Any]:
+    """Return the settings that come from the file: views, level, inputs and normalization."""
+    level, section = settings.level or loaded.level, settings.representation or {}
+    if "_target_" not in section:  # changes of the views of the file
+        stored = panorama_settings(loaded, level) if level != loaded.level else {}
+        section = {**loaded.representation, **stored, **section}
+    if section.get("level", 0) is None:
+        section = {**section, "level": level}
+    data = settings.data
+    if loaded.inputs:
+        mean, std = list(loaded.normalization.mean), list(loaded.normalization.std)
+        normalization = {"mean": mean, "std": std}
+        data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
+    network = loaded.settings
+    return {"level": level, "representation": section, "data": data, "network": network}

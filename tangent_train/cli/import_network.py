@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from hydra import compose
-from hydra.errors import MissingConfigException
-from omegaconf import OmegaConf
 from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.cli.command_settings import ImportSettings
-from tangent_train.cli.settings import check_new, check_unread, parse_settings
+from tangent_train.cli.settings import check_unread
+from tangent_train.config.settings import ImportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
-from tangent_train.imports import elsewhere
+from tangent_train.files import check_new
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
@@ -30,15 +27,10 @@ if TYPE_CHECKING:
 _OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
 """Settings that only some of the functions `load` take."""
 
-_LIBRARIES = ("torchvision", "huggingface", "smp")
-"""Each a file of `tangent_train.photo_networks` with a function `load`."""
-
 
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "logits": "scores before a softmax",
     "probabilities": "probabilities after a softmax",
-    "sigmoid_logits": "scores before a sigmoid, with ½ as the threshold",
-    "sigmoid": "probabilities after a sigmoid, with ½ as the threshold",
     "labels": "label maps, of which other values are unknown",
     "log_distance": "the logarithm of the distance in meters",
     "metric_distance": "the distance along each ray in meters",
@@ -52,32 +44,29 @@ _OF_CLASSES = {"classes": None, "unknown_classes": (), "unknown_wins": True, "sc
 """Settings that depth networks do not have, and their defaults."""
 
 
-def import_network(config: Mapping[str, Any]) -> None:
+def import_network(settings: ImportSettings) -> None:
     """Write a photo network as a checkpoint and print what was understood.
 
     Args:
-        config: The composed ``import.yaml``.
+        settings: Settings of the command.
 
     Raises:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    settings = parse_settings(ImportSettings, config)
     output = settings.output
-    with elsewhere():
-        from tangent_train import photo_networks
+    from tangent_train import photo_networks
 
-    suffix = ".onnx" if settings.network == "onnx" else ".ckpt"
+    suffix = ".onnx" if settings.library == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
-    check_new(settings, output)
+    check_new(output, overwrite=settings.overwrite)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
-        network = _load(settings, config["normalization"])
+        network = _load(settings)
         if network.depth_kind is None:
             check_unread(settings, "for networks of classes", depth=None)
         else:
             check_unread(settings, "for depth networks", **_OF_CLASSES)
-        remarks = list(network.remarks)
         trained = photo_networks.import_network(
             network,
             output,
@@ -89,11 +78,8 @@ def import_network(config: Mapping[str, Any]) -> None:
             unknown_wins=settings.unknown_wins,
             image_size=_rows_and_columns(settings.image_size),
             score_kind=settings.scores,
-            remark=remarks.append,
         )
     print_text(_understood(output, trained, settings))
-    for remark in remarks:
-        print_text(remark)
 
 
 def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
@@ -107,28 +93,24 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
     return given[0], given[-1]
 
 
-def _load(settings: ImportSettings, normalization: Any) -> PhotoNetwork:
-    """The network, from the library that the settings name."""
-    with elsewhere():
-        from tangent_train.photo_networks import own_files
+def _load(settings: ImportSettings) -> PhotoNetwork:
+    """Return the network, from the library or the option that the settings name."""
+    from tangent_train.photo_networks import own_files
 
-        name = settings.network
-        load: Callable[..., PhotoNetwork] = own_files.load_onnx
-        if name in _LIBRARIES:
-            load = import_module(f"tangent_train.photo_networks.{name}").load
-    if name not in (*_LIBRARIES, "onnx"):
-        try:
-            config: Any = compose("import", [f"+network@section={name}"])
-        except MissingConfigException as error:
-            known = ", ".join((*_LIBRARIES, "onnx", *(error.options or ())))
-            raise SettingError("network", found=name, expected=f"of {known}") from error
-        section: Any = OmegaConf.to_container(config.section)
-        load = partial(own_files.load_config, section)
+    load: Callable[..., PhotoNetwork]
+    if settings.library == "onnx":
+        load = own_files.load_onnx
+    elif settings.library is not None:
+        load = import_module(f"tangent_train.photo_networks.{settings.library}").load
+    elif settings.network is not None:
+        load = partial(own_files.load_config, settings.network)
+    else:
+        raise SettingError("library", found="null", expected="a library, or network=<option>")
     read = signature(load).parameters
     unread = dict.fromkeys(name for name in _OF_LIBRARIES if name not in read)
-    check_unread(settings, f"for network={name}", **unread)
+    check_unread(settings, f"for library={settings.library}", **unread)
     given = {name: getattr(settings, name) for name in _OF_LIBRARIES if name in read}
-    return load(**given, normalization=normalization)
+    return load(**given, normalization=settings.normalization)
 
 
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
@@ -149,8 +131,8 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
         f"image size: {size}{multiple}",
         f"panoramas: {PanoramaViews(trained).description()}",
     ]
-    if trained.source is not None and trained.source.trust:
-        trust = ",".join(trained.source.trust)
+    if trained.trust:
+        trust = ",".join(trained.trust)
         lines.append(f"your own network: every command that reads it needs trust=[{trust}]")
     if settings.unknown_classes:
         effect = "written as unknown" if settings.unknown_wins else "never win"

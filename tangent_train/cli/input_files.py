@@ -6,8 +6,8 @@ from collections.abc import Callable, Container, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tangent_train.cli.command_settings import InputSettings
 from tangent_train.cli.jobs import Job, Shard
+from tangent_train.config.settings import ImageSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, at_least
 from tangent_train.io.image_files import IMAGE_SUFFIXES, image_paths, short_names
@@ -27,7 +27,7 @@ class Inputs:
     Attributes:
         files: Files of all images and videos, sorted.
         videos: Jobs of the videos; their value is the number of frames, rows and columns.
-        every: Step between frames, see `InputSettings`.
+        every: Step between frames, see `ImageSettings`.
     """
 
     files: dict[str, Path]
@@ -37,7 +37,7 @@ class Inputs:
     @classmethod
     def find(
         cls,
-        settings: InputSettings,
+        settings: ImageSettings,
         is_result: Callable[[Path], bool],
         check_size: Callable[[Path, tuple[int, int]], object],
     ) -> Inputs:

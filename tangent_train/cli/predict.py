@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
 from tangent_train.cli.predict_kinds import PREDICTIONS, Prediction
 from tangent_train.cli.predict_shards import PredictionShard
-from tangent_train.cli.settings import check_unread, parse_settings
+from tangent_train.cli.settings import check_unread
+from tangent_train.config.settings import PredictSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
@@ -50,19 +50,18 @@ _SAVED_EVERY_S = 10.0
 """Time between summaries: work that may be lost when a process is killed."""
 
 
-def predict(config: Mapping[str, Any]) -> None:
+def predict(settings: PredictSettings) -> None:
     """Predict the labels of images and write them.
 
     Args:
-        config: Composed ``predict.yaml``.
+        settings: Settings of the command.
 
     Raises:
         SettingError: A setting is missing or invalid.
         DataError: The checkpoint cannot be read, or no images are found.
     """
-    settings = parse_settings(PredictSettings, config)
     _check_unread(settings)
-    decisive = {name: config[name] for name in _DECISIVE}
+    decisive = settings.model_dump(mode="json", include=set(_DECISIVE))
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_network(settings.checkpoint, settings.trust)
     views = _views(settings, trained)

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from tangent_train.checkpoints.distances import is_metric
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.cli.command_settings import PredictSettings
 from tangent_train.cli.settings import check_unread
+from tangent_train.config.settings import PredictSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.confidences import class_thresholds, count_confidences

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 from tangent_train.cli.jobs import Shard
 from tangent_train.cli.run import open_data
+from tangent_train.config.settings import PrepareSettings
 from tangent_train.console import print_text
 
 
-def prepare(settings: Mapping[str, Any]) -> None:
+def prepare(settings: PrepareSettings) -> None:
     """Generate or check the data set of a run, and write its prepared store if it has one.
 
     Args:
-        settings: Composed ``prepare.yaml``.
+        settings: Settings of the command.
     """
-    shard = Shard.parse(settings["shard"])
+    shard = Shard.parse(settings.shard)
     data = open_data(settings)
     if shard is not None:
         count = data.fill_cache(shard.part)

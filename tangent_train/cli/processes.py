@@ -1,32 +1,52 @@
-"""Start runs as processes and wait for them."""
+"""Run commands as processes of their own: the jobs of a sweep, the stages of a transfer."""
 
 from __future__ import annotations
 
+import json
 import os
-import signal
 import subprocess
-import sys
-import threading
-import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
 
-from tangent_train.cli.compose import quoted
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 
-_NOTICE_S = 3.0
-"""Time after Ctrl-C, which a terminal sends to all processes, for a process to end by itself."""
+from tangent_train.errors import DataError
 
-_CHECKPOINT_S = 30.0
-"""Time after SIGTERM for a process to save a last checkpoint."""
-
-_WATCHED_EVERY_S = 1.0
-_FIRST = "TANGENT_TRAIN_FIRST_PROCESS"
+OBJECTIVE_FILE = "validation.json"
+"""File in a run's folder with the validation score of its best epoch."""
 
 
-class SigtermError(KeyboardInterrupt):
-    """SIGTERM, which ends a command in the same way as Ctrl-C."""
+def in_sweep() -> bool:
+    """Return True in a job of a sweep, which `run_job` runs."""
+    return HydraConfig.get().mode == RunMode.MULTIRUN
+
+
+def run_job(command: str) -> float | None:
+    """Run one job of a sweep as a process, which may start one process per device.
+
+    Args:
+        command: Name of the command.
+
+    Returns:
+        Best validation score of the run, which sweepers compare; None without one.
+
+    Raises:
+        DataError: The run failed.
+    """
+    hydra = HydraConfig.get()
+    folder = Path(hydra.runtime.output_dir)
+    arguments = list(hydra.overrides.task)
+    if (folder / "checkpoints" / "last.ckpt").exists():  # SLURM has started the job again
+        arguments = [f"resume={quoted(folder)}"]
+    sources = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]
+    arguments += [f"--config-dir={path}" for path in sources]
+    if status := run_process(command_line(command, arguments, folder)):
+        found = f"a run that ended with status {status}"
+        raise DataError(folder, found=found, expected="a finished run")
+    file = folder / OBJECTIVE_FILE
+    return float(json.loads(file.read_bytes())["best"]) if file.is_file() else None
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:
@@ -37,68 +57,16 @@ def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[s
         arguments: Options and overrides.
         folder: Run folder.
     """
-    program = [sys.executable, "-m", "tangent_train.cli.main"]
-    return [*program, command, *arguments, f"hydra.run.dir={quoted(str(folder))}"]
+    program = Path(sysconfig.get_path("scripts"), f"tangent-{command}")
+    return [str(program), *arguments, f"hydra.run.dir={quoted(folder)}"]
 
 
-def run_process(line: Sequence[str], changes: Mapping[str, str | None] | None = None) -> int:
-    """Run a command and wait for it; Ctrl-C and SIGTERM of this process end it too.
-
-    Args:
-        line: Program and arguments.
-        changes: Environment variables to set, or to remove (None).
-
-    Returns:
-        Exit status of the command.
-    """
-    environment = {**os.environ, **(changes or {})}
-    known = {name: value for name, value in environment.items() if value is not None}
-    with ended_by_sigterm(), subprocess.Popen(line, env=known) as process:
-        try:
-            return process.wait()
-        except BaseException as error:
-            try:
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(_NOTICE_S if type(error) is KeyboardInterrupt else 0)
-                process.terminate()
-                with suppress(subprocess.TimeoutExpired):
-                    process.wait(_CHECKPOINT_S)
-            finally:
-                process.kill()
-                process.wait()
-            raise
+def run_process(line: Sequence[str]) -> int:
+    """Run a command, wait for it also after an interrupt, and return its status."""
+    with subprocess.Popen(line, env=os.environ) as process:
+        return process.wait()
 
 
-def end_with_first_process() -> None:
-    """End this process when the first process of its run, which has started it, has ended.
-
-    On several devices, Lightning's first process starts the others, and ends when one of them
-    fails. If the first process is killed, the others would wait for it for up to an hour.
-    """
-    first = os.environ.get(_FIRST)
-    if first is None or int(os.environ.get("LOCAL_RANK", "0")) == 0:
-        os.environ[_FIRST] = str(os.getpid())
-        return
-
-    def watch() -> NoReturn:
-        while os.getppid() == int(first):
-            time.sleep(_WATCHED_EVERY_S)
-        sys.stderr.write("tangent-train: ended, because the first process of the run has ended\n")
-        sys.stderr.flush()
-        os._exit(1)  # immediately, even if another thread waits in a library
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-@contextmanager
-def ended_by_sigterm() -> Iterator[None]:
-    """Raise `SigtermError` on SIGTERM instead of ending the process immediately."""
-
-    def leave(number: int, frame: object) -> NoReturn:
-        raise SigtermError
-
-    before = signal.signal(signal.SIGTERM, leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+def quoted(path: Path) -> str:
+    """Return a path as Hydra reads it literally."""
+    return "'" + str(path).replace("'", "\\'") + "'"

@@ -1,178 +1,312 @@
-"""``tangent-transfer``: train on photos, evaluate on panoramas, fine-tune on both, compare."""
+"""``tangent-transfer``: train on photos, evaluate on panoramas, fine-tune on both, compare.
+
+Its stages are runs of ``tangent-train`` and ``tangent-evaluate`` (paper, "Network transfer"):
+
+===========  ===============================================================================
+P            trained on photos, tested on photos
+S            P, tested on panoramas
+S-<view>     P, tested on panoramas through another view
+S-…-<name>   the same in another condition, e.g. tilted
+P-FT-n       P, fine-tuned for n epochs on photos, tested on photos
+S-FT-n       P, fine-tuned for n epochs on panoramas, tested on panoramas
+S-level-n    P, tested on panoramas of level n (study of the angular resolution)
+===========  ===============================================================================
+
+The folder of the transfer has a manifest of finished stages, and the settings of each stage as a
+config of its command in ``stages/``.
+"""
 
 from __future__ import annotations
 
-import re
 import shlex
+import shutil
 import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
+from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
-from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.cli.stored import StoredNetwork, run_settings
-from tangent_train.cli.transfer_stages import Stage, plan, run_stage, stage_command, stage_state
-from tangent_train.cli.transfer_views import views_of
-from tangent_train.config.build import check_fields, without_interpolation
+from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.checkpoints.scores import network_for_views
+from tangent_train.cli.processes import command_line, quoted, run_process
+from tangent_train.cli.run import build_data
+from tangent_train.config.settings import SETTINGS, validate
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError
-from tangent_train.imports import elsewhere
+from tangent_train.errors import SettingError
+from tangent_train.files import write_text
+from tangent_train.inference.engine import views_per_forward
+from tangent_train.inference.representations import PERSPECTIVE, panorama_settings
+from tangent_train.manifest import Manifest
+from tangent_train.results.evaluation_result import load_result
+from tangent_train.results.report import levels_report, transfer_report
 
-_ONLY_FOR_TRAINING = ("ema", "fine_tuning", "network", "optimizer", "scheduler")
+_HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}
+_SLOWER = 10  # in fine-tuning: from 1e-4 to 1e-5 (paper, supplement, "Transfer learning")
+_NOT_CONTENT = (
+    "seeds", "folds", "compare", "conditions", "study_levels", "panels", "logger",
+    "validation_images", "checkpoint_every_n_steps",
+)  # fmt: skip
+"""Settings that may differ when a transfer is continued: they add stages, or only show them."""
 
 
-def transfer(config: DictConfig) -> None:
+@dataclass(frozen=True)
+class Stage:
+    """One run of a transfer.
+
+    Attributes:
+        name: Name of the stage, see the table above.
+        command: Command that runs the stage.
+        changes: Settings in which the stage differs from the transfer.
+        view: Name of the view that panoramas are evaluated in; "" for the view of the transfer.
+        condition: Condition that panoramas are evaluated in; "" in other stages.
+        path: Run folder, below that of the transfer.
+    """
+
+    name: str
+    command: str
+    changes: Mapping[str, Any]
+    view: str = ""
+    condition: str = ""
+    path: Path = Path()
+
+
+def transfer(_: object) -> None:
     """Run all stages that are not finished, then write and print the tables.
 
-    Args:
-        config: Composed ``transfer.yaml``.
-
     Raises:
-        SettingError: A setting is invalid, or a stage's folder has other content.
-        DataError: The checkpoint of the settings, or a file of a stage, cannot be used.
+        SettingError: A setting is invalid, or the transfer was begun with other settings.
     """
+    # Composed again, because the stages need the settings with their references.
+    config = compose("transfer", [*_search_path(), *_typed()])
     folder = Path(HydraConfig.get().runtime.output_dir)
-    stored = trained = None
+    loaded = None
     if config.checkpoint is not None:
-        config.checkpoint = without_interpolation(str(Path(config.checkpoint).absolute()))
-        stored = run_settings(Path(config.checkpoint))
-        if stored is None:
-            config, trained = _with_network(config)
-    stages = plan(config, folder, views_of(config, trained))
-    if stored is not None:
-        _check_fold(Path(config.checkpoint), stored, stages)
-    missing = [stage for stage in stages if stage_state(stage) != "finished"]
-    first = stages[0].fold, stages[0].seed
-    _check_data([stage for stage in missing if (stage.fold, stage.seed) == first], trained)
-    try:
-        for number, stage in enumerate(stages, start=1):
-            _run(stage, f"Stage {number} of {len(stages)}, {stage.name} in {stage.folder}")
-    except (KeyboardInterrupt, SystemExit):
-        print_text("Finished stages are kept; the same command continues.", error=True)
-        raise
-    _report(config, folder, stages, trained)
+        loaded = load_network(Path(config.checkpoint), config.trust)
+        _take_settings(config, loaded)
+    content: Any = OmegaConf.to_container(config)
+    content["fine_tuning"].pop("epochs")
+    content = {name: value for name, value in content.items() if name not in _NOT_CONTENT}
+    plan, stages = list(_plan(config, loaded)), []
+    for fold in config.folds or [config.data.get("fold")]:
+        for seed in config.seeds or [config.seed]:
+            stages += [_of_group(config, stage, fold, seed) for stage in plan]
+    manifest = Manifest.open(folder, content)
+    settings = {stage.path: stage_settings(config, folder, stage) for stage in stages}
+    _check_data([settings[s.path] for s in stages if str(s.path) not in manifest.finished])
+    for number, stage in enumerate(stages, start=1):
+        heading = f"Stage {number} of {len(stages)}, {stage.name} in {folder / stage.path}"
+        _run(stage, settings[stage.path], manifest, heading)
+    _report(config, folder, stages)
 
 
-def _with_network(config: DictConfig) -> tuple[DictConfig, LoadedNetwork]:
-    """Load a network without settings of a run; return the config for its evaluation, and it."""
-    overrides = list(HydraConfig.get().overrides.task)
-    for text in overrides:
-        name = text.lstrip("+~").partition("=")[0]
-        if re.split("[.@]", name)[0] in _ONLY_FOR_TRAINING:
-            raise SettingError(
-                text,
-                found=f"a setting of training with checkpoint={config.checkpoint}",
-                expected="none: a network without settings of a run is only evaluated",
-                remedy="Fine-tune it with tangent-train init_from=….",
-            )
-    plain: Any = OmegaConf.to_container(config)
-    settings, _, trained = StoredNetwork(Path(config.checkpoint), overrides).settings(plain)
-    if "${" in str(trained.representation):
-        raise DataError(
-            Path(config.checkpoint),
-            found=f"representation={trained.representation}",
-            expected="no ${…}: settings of the stages are interpolated",
+def _typed() -> list[str]:
+    """Return the overrides of the command line, with their references."""
+    overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    return list(overrides)
+
+
+def _search_path() -> list[str]:
+    return [o for o in HydraConfig.get().overrides.hydra if o.startswith("hydra.searchpath")]
+
+
+def _take_settings(config: Any, loaded: LoadedNetwork) -> None:
+    """Set inputs and level to those of a network from a file, and the views of an imported one."""
+    typed = {text.lstrip("+~").partition("=")[0] for text in _typed()}
+    config.checkpoint = str(Path(config.checkpoint).absolute())
+    if "level" not in typed:
+        config.level = loaded.level
+    if _has_panorama_views(loaded) and "representation" not in typed:
+        rows = config.representation.get("erp_height")
+        level = config.level if "level" in typed else None
+        config.representation = panorama_settings(loaded, level) | (
+            {} if rows is None else {"erp_height": rows}
         )
-    rows = config.representation.get("erp_height")
-    if rows is not None:  # of all views
-        settings["representation"] |= {"erp_height": rows}
-    settings["network"] = None  # stages load it from its file
-    settings["fine_tuning"] |= {"epochs": []}
-    return OmegaConf.create(settings), trained
+    mean, std = map(list, (loaded.normalization.mean, loaded.normalization.std))
+    of_network = {"inputs": list(loaded.inputs), "normalization": {"mean": mean, "std": std}}
+    config.data = {**config.data, **of_network}
+    if "task.eval_view_batch_size" not in typed:  # photo networks have many classes, large images
+        config.task.eval_view_batch_size = views_per_forward(loaded.image_size)
 
 
-def _check_fold(path: Path, stored: Mapping[str, Any], stages: Sequence[Stage]) -> None:
-    """Refuse a checkpoint that was trained on test rooms of the stages."""
-    data = check_fields(path, stored, {"data": dict}, "the settings of a run")["data"]
-    fold = data.get("fold")
-    if fold is not None and any(stage.fold != fold for stage in stages):
-        raise SettingError(
-            f"checkpoint={path}",
-            found=f"a network that was trained on all folds but fold {fold}",
-            expected=f"folds=[{fold}]",
-        )
+def _has_panorama_views(loaded: LoadedNetwork | None) -> TypeGuard[LoadedNetwork]:
+    """Return True for a network from a file that names views of panoramas."""
+    return loaded is not None and loaded.representation["_target_"] != PERSPECTIVE
 
 
-def _check_data(stages: Sequence[Stage], trained: LoadedNetwork | None) -> None:
-    """Build the data and networks of all stages, to find errors before hours of training."""
-    from tangent_train.cli.run import build, build_trained, check_fits, inputs_and_classes
-
-    first: Any = None
-    built: dict[Any, tuple[Stage, Any]] = {}
-    tried: list[Any] = []
-    for stage in stages:
-        names = ["data", "representation", "level", "task"]
-        names += ["optimizer", "scheduler"] if stage.command == "train" else []
-        parts = [stage.config.get(name) for name in names]
-        if parts in tried:
-            continue
-        tried.append(parts)
-        with _naming_stage(stage):
-            # With a checkpoint, no pretrained weights are fetched.
-            settings = {**stage.config, "checkpoint": str(stage.weights)}
-            data = (build_trained(settings, trained) if trained else build(settings))[0]
-            first = first or data
-            check_fits(data, inputs_and_classes(first), f"the network of stage {stages[0].name}")
-            # Rotations, and views of the same number of rows, have the same files.
-            built.setdefault((stage.name[0], getattr(data, "erp_height", 0)), (stage, data))
-    for stage, data in built.values():  # after all settings are checked: this writes files
-        with _naming_stage(stage):
-            data.make_files()
-            data.setup()
-            data.test_dataloader()  # refuses an empty split: every stage is tested
+def _plan(config: Any, loaded: LoadedNetwork | None) -> Iterator[Stage]:
+    """Yield the stages of one fold and seed."""
+    has_photos = "_target_" in config.photos.data
+    if loaded is None and not has_photos:
+        expected = "the photos to train P on, or checkpoint=<a network trained on photos>"
+        raise SettingError("data@photos.data", found="none", expected=expected)
+    if has_photos and not (config.study_levels and loaded):
+        yield Stage("P", "evaluate" if loaded else "train", {})
+    views = dict(_views(config, loaded))
+    for view, of_view in (views if config.study_levels else {"": {}, **views}).items():
+        for condition, changes in _named(config.conditions):
+            of_data = {f"data.{name}": value for name, value in changes.items()}
+            name = "-".join(filter(None, ("S", view, condition if of_data else "")))
+            yield Stage(name, "evaluate", {**of_view, **of_data}, view, condition)
+    for epochs in () if config.study_levels else config.fine_tuning.epochs:
+        for name in "PS":
+            yield Stage(f"{name}-FT-{epochs}", "train", _fine_tuning(config, epochs))
 
 
-@contextmanager
-def _naming_stage(stage: Stage) -> Iterator[None]:
-    """Name the stage in an error; settings of the photos are in the section ``photos``."""
-    try:
-        yield
-    except (DataError, SettingError) as error:
-        is_photos = stage.name[0] == "P" and re.match(r"(data|representation)\b", str(error))
-        section = "photos." if is_photos and isinstance(error, SettingError) else ""
-        raise SettingError(f"stage {stage.name}: {section}{error}") from error
+def _of_group(config: Any, stage: Stage, fold: int | None, seed: int) -> Stage:
+    """Return a stage for a fold and a seed."""
+    changes, path = {**stage.changes, "seed": seed}, Path(f"seed_{seed}", stage.name)
+    if fold is not None:
+        changes["data.fold"], path = fold, f"fold_{fold}" / path
+        if "fold" in config.photos.data:
+            changes["photos.data.fold"] = fold
+    return replace(stage, changes=changes, path=path)
 
 
-def _run(stage: Stage, heading: str) -> None:
+def stage_settings(config: Any, folder: Path, stage: Stage) -> dict[str, Any]:
+    """Return the settings of a stage, resolved after its changes."""
+    config = OmegaConf.create(OmegaConf.to_container(config))
+    for key, value in stage.changes.items():
+        OmegaConf.update(config, key, value, merge=False, force_add=True)
+    settings: Any = OmegaConf.to_container(config, resolve=True)
+    trained = folder / stage.path.parent / "P" / "checkpoints" / "best.ckpt"
+    weights = settings.pop("checkpoint") or (None if stage.name == "P" else str(trained))
+    settings["init_from" if stage.command == "train" else "checkpoint"] = weights
+    settings["name"] = f"{settings['name']}/{stage.name}"
+    if stage.name[0] == "P":
+        settings |= {key: settings["photos"][key] for key in ("data", "representation")}
+    if stage.command == "evaluate" and config.checkpoint:
+        settings["network"] = None  # in the checkpoint
+    declared = SETTINGS[stage.command].model_fields
+    return {key: value for key, value in settings.items() if key in declared}
+
+
+def _fine_tuning(config: Any, epochs: int) -> dict[str, Any]:
+    """Return the changes of settings in fine-tuning."""
+    tuning: Any = OmegaConf.to_container(config.fine_tuning)
+    before: Any = OmegaConf.to_container(config.optimizer)
+    optimizer = (
+        tuning["optimizer"] if "_target_" in tuning["optimizer"] else before | tuning["optimizer"]
+    )
+    if optimizer["lr"] is None:  # rounded: 3e-3 / 10 is 3.0000000000000003e-4
+        optimizer["lr"] = float(f"{config.optimizer.lr / _SLOWER:.12g}")
+    return {
+        "optimizer": optimizer,
+        "scheduler": tuning["scheduler"],
+        "trainer.max_epochs": epochs,
+        "photos.data.sampling_seed": 1,  # not the crops of P's first epochs again
+    }
+
+
+def _named(entries: Sequence[Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the entries of a list, names or named settings, as settings by name."""
+    for entry in entries:
+        settings = {"name": entry} if isinstance(entry, str) else OmegaConf.to_container(entry)
+        yield settings.pop("name"), settings
+
+
+def _views(config: Any, loaded: LoadedNetwork | None) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Yield the views of ``compare`` or of the study by name, each as changes of settings.
+
+    A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
+    without an option, it is the transfer's own representation with changed settings. ``level`` also
+    sets the level of the stage; names such as ``task.align`` change the task. Distortion-aware
+    views of a network that does not allow them are left out.
+    """
+    if config.study_levels:
+        for level in config.study_levels:
+            rows = min(2 ** (level + 1), config.study_max_rows or 2 ** (level + 1))
+            yield f"level-{level}", _view(config, loaded, level=level, erp_height=rows)
+        return
+    for name, changes in _named(config.compare):
+        view = _view(config, loaded, **(changes or {"option": name}))
+        try:
+            if loaded is not None:
+                is_aware = view["representation"].get("distortion_aware")
+                network_for_views(loaded.network, is_aware)
+        except SettingError as error:
+            print_text(f"View {name} is left out: {error}")
+        else:
+            yield name, view
+
+
+def _view(
+    config: Any, loaded: LoadedNetwork | None, option: str | None = None, **changes: Any
+) -> dict[str, Any]:
+    """Return a view as changes of settings, see `_views`."""
+    of_task = {name: changes.pop(name) for name in [*changes] if name.startswith("task.")}
+    level, rows = changes.get("level"), config.representation.get("erp_height")
+    section: Any = OmegaConf.to_container(config.representation)
+    if option is not None:
+        chosen = compose(f"representation/{option}", _search_path())
+        section = OmegaConf.to_container(chosen.representation)
+    elif _has_panorama_views(loaded) and {"level", "base_level"} & changes.keys():
+        of_level = panorama_settings(loaded, level, changes.get("base_level"))
+        section = (section if section["_target_"] == of_level["_target_"] else {}) | of_level
+    elif level is not None and section.get("dim") is not None:  # a side in pixels
+        section["dim"] = max(1, round(section["dim"] * 2.0 ** (level - config.level)))
+    if rows is None and level is not None:
+        rows = 2 ** (config.level + 1)
+    section |= ({} if rows is None else {"erp_height": rows}) | changes
+    return {"representation": section, **of_task} | ({} if level is None else {"level": level})
+
+
+def _check_data(stages: Sequence[Mapping[str, Any]]) -> None:
+    """Build the data of the photos and of the panoramas, before hours of training."""
+    built: dict[str, Any] = {}
+    for settings in stages:
+        target = settings["data"]["_target_"]
+        if target not in built:
+            of_run = {n: settings[n] for n in SETTINGS["check"].model_fields if n in settings}
+            built[target] = build_data(validate("check", of_run))
+            built[target].make_files()
+            built[target].setup()
+    names = {target: data.class_names for target, data in built.items()}
+    if len({tuple(classes) for classes in names.values()}) > 1:
+        raise SettingError("data", found=f"classes {names}", expected="the same of both data sets")
+
+
+def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading: str) -> None:
     """Run a stage that is not finished, printing its command after a heading."""
-    state = stage_state(stage)
-    if state == "finished":
+    run, arguments = manifest.folder / stage.path, []
+    before = manifest.finished.get(str(stage.path))
+    if before is not None and (run / "results.json").is_file():
+        if before["changes"] != stage.changes:
+            raise SettingError(stage.name, found=stage.changes, expected=before["changes"])
         print_text(f"{heading}: finished before.")
         return
-    _, _, _, command, *arguments = stage_command(stage)
-    print_text(f"{heading}: tangent-{command} {shlex.join(arguments)}")
-    status = run_stage(stage, state)
-    if status:
-        name = f"stage {stage.name} in {stage.folder}"
-        print_text(f"tangent-transfer: {name} ended with status {status}.", error=True)
-        sys.exit(status)
+    if (run / "checkpoints" / "last.ckpt").is_file():
+        arguments = [f"resume={quoted(run)}"]
+    else:
+        shutil.rmtree(run, ignore_errors=True)
+        file = manifest.folder / "stages" / f"{'-'.join(stage.path.parts)}.yaml"
+        write_text(file, OmegaConf.to_yaml(OmegaConf.create({**_HEAD, **settings})))
+        arguments = [f"--config-dir={file.parent}", f"--config-name={file.stem}"]
+    line = command_line(stage.command, arguments, run)
+    print_text(f"{heading}: tangent-{stage.command} {shlex.join(line[1:])}")
+    if status := run_process(line):
+        message = f"Stage {stage.name} ended with status {status}; the same command continues."
+        print_text(message, error=True)
+        sys.exit(status if status > 0 else 128 - status)
+    manifest.finish(str(stage.path), changes=stage.changes)
 
 
-def _report(
-    config: DictConfig, folder: Path, stages: Sequence[Stage], trained: LoadedNetwork | None
-) -> None:
+def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
     """Write and print the tables and the chart."""
-    with elsewhere():  # imports matplotlib
-        from tangent_train.results.report import levels_report, transfer_report
-    from tangent_train.results.evaluation_result import load_result
-
-    records: dict[Any, list[Any]] = defaultdict(list)
-    study = bool(config.study_levels)
+    results: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
-        if not study or stage.view:
-            key = stage.config["level"] if study else stage.name
-            records[key].append(load_result(stage.folder))
-    if study:
-        level = config.level if trained is None else trained.level
-        name, report = "angular_resolution", levels_report(records, level)
+        if not config.study_levels or stage.view:
+            key = stage.changes["level"] if config.study_levels else stage.name
+            results[key].append(load_result(folder / stage.path))
+    if config.study_levels:
+        name, report = "angular_resolution", levels_report(results, config.level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}
-        name, report = "transfer", transfer_report(records, cells)
+        name, report = "transfer", transfer_report(results, cells)
     report.write(folder, name)
     report.tables()[0].print()
     for note in report.notes:

@@ -51,7 +51,7 @@ def build_from_file(section: Any, place: str, path: Path, trust: Collection[str]
     """
     try:
         with offline():
-            return _build(section, place, tuple(trust))
+            return _build(without_weights(section), place, tuple(trust))
     except DataError as error:
         raise DataError(
             path, found=error.found, expected=error.expected, remedy=error.remedy
@@ -61,6 +61,16 @@ def build_from_file(section: Any, place: str, path: Path, trust: Collection[str]
         raise DataError(path, found=found, expected="arguments that its class accepts") from error
 
 
+def without_weights(section: Any) -> Any:
+    """Return settings in which arguments that name weights or checkpoints are null."""
+    if not isinstance(section, Mapping):
+        return section
+    return {
+        name: None if _WEIGHTS.search(str(name)) else without_weights(value)
+        for name, value in section.items()
+    }
+
+
 def _build(section: Any, place: str, trust: tuple[str, ...]) -> Any:
     target = section.get("_target_") if isinstance(section, Mapping) else None
     if not isinstance(target, str):
@@ -68,7 +78,7 @@ def _build(section: Any, place: str, trust: tuple[str, ...]) -> Any:
     is_trusted = _is_inside(target, trust)
     function = resolve_name(target) if is_trusted else _allowed(target, place)
     arguments = {
-        name: _argument(name, value, f"{place}.{name}", trust, is_trusted=is_trusted)
+        name: _argument(value, f"{place}.{name}", trust, is_trusted=is_trusted)
         for name, value in section.items()
         if name not in ("_target_", "_partial_", "_convert_", "_recursive_")
     }
@@ -110,20 +120,16 @@ def _is_inside(name: str, packages: Collection[str]) -> bool:
     return any(name == package or name.startswith(f"{package}.") for package in packages)
 
 
-def _argument(
-    name: str, value: Any, place: str, trust: tuple[str, ...], *, is_trusted: bool
-) -> Any:
-    if _WEIGHTS.search(name):
-        return None
+def _argument(value: Any, place: str, trust: tuple[str, ...], *, is_trusted: bool) -> Any:
     if isinstance(value, Mapping) and "_target_" in value:
         return _build(value, place, trust)
     if isinstance(value, Mapping):
         return {
-            n: _argument(str(n), v, f"{place}.{n}", trust, is_trusted=is_trusted)
-            for n, v in value.items()
+            name: _argument(inner, f"{place}.{name}", trust, is_trusted=is_trusted)
+            for name, inner in value.items()
         }
     if isinstance(value, list | tuple):
-        return [_argument("", v, place, trust, is_trusted=is_trusted) for v in value]
+        return [_argument(one, place, trust, is_trusted=is_trusted) for one in value]
     is_plain = value is None or isinstance(value, bool | int | float)
     if is_plain or (isinstance(value, str) and (is_trusted or _WORD.fullmatch(value))):
         return value

@@ -1,22 +1,24 @@
 """Settings of the commands: name, type, default and comment, once.
 
-A command's class gives Hydra the defaults (`register`), validates what Hydra composed (`validate`),
+A class gives Hydra the defaults (`config_name`), validates the composed settings (`validate`),
 and feeds ``--help`` and the reference page with its comments. Options of groups (``data=…``) are
 YAML files; their types are those of the class that they build.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
 from pydantic.fields import FieldInfo
 
 from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.files import config_folder
 
 
@@ -146,7 +148,7 @@ class RenderSettings(ImageSettings):
     output: Path | None = None
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace earlier results"""
+    """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
     views: Views = None
     """views: tangent | horizontal | horizontal_economy | cubemap, or 'views={option: horizontal,
     fov: 110}'; null = tangent"""
@@ -339,10 +341,10 @@ class RunSettings(Settings):
 class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
-    init_from: ExistingPath | None = None
+    init_from: Path | None = None
     """fine-tuning: checkpoint, state dict or safetensors that the network starts from; null = new
     weights"""
-    resume: ExistingPath | None = None
+    resume: Path | None = None
     """folder of an interrupted run, which is continued with its settings"""
     trust: OneOrMore[str] = ()
     """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
@@ -353,6 +355,10 @@ class EvaluateSettings(RunSettings):
 
     checkpoint: ExistingPath
     """network, written by tangent-train, tangent-import or tangent-export"""
+    representation: Section | None = None  # type: ignore[assignment]
+    """views of a panorama that the network is given; null = those of the checkpoint"""
+    level: int | None = None  # type: ignore[assignment]
+    """level s, the angular resolution; null = that of the checkpoint"""
     label_map: str | Path | None = None
     """maps the classes of the network to those of the data: ade20k_to_stanford2d3ds, …, or a JSON
     file; null = same classes"""
@@ -449,14 +455,37 @@ SETTINGS: Mapping[str, type[Settings]] = {
 """Settings by the name of the command."""
 
 
-def comment(field: FieldInfo) -> str:
+def comment_of(field: FieldInfo) -> str:
     """Return the comment of a setting in one line."""
     return " ".join((field.description or "").split())
 
 
-def register(command: str) -> None:
-    """Give Hydra the default settings of a command, as the config ``settings``."""
-    ConfigStore.instance().store("settings", _defaults(SETTINGS[command]))
+def config_name(command: str, arguments: Sequence[str]) -> str:
+    """Return the name of the config that Hydra composes, after storing what it builds on.
+
+    That is the config of the command, or with ``resume=<run>`` the stored config of the run.
+
+    Args:
+        command: Name of the command, e.g. train.
+        arguments: Command line after the program's name.
+
+    Raises:
+        DataError: The folder to resume is not that of a run.
+    """
+    store = ConfigStore.instance().store
+    store("settings", _defaults(SETTINGS[command]))
+    typed = [text for text in arguments if text.startswith("resume=") and command == "train"]
+    run = OverridesParser.create().parse_override(typed[-1]).value() if typed else None
+    if run is None:
+        return command
+    file = Path(str(run), "config.yaml")
+    if not file.is_file():
+        expected = "the folder of a run, which tangent-train printed"
+        raise DataError(file.parent, found="no config.yaml", expected=expected)
+    config = OmegaConf.to_container(OmegaConf.load(file))
+    defaults = ["_self_", {"override hydra/job_logging": "none"}]
+    store("resumed", {**config, "defaults": defaults, "hydra": {"run": {"dir": str(run)}}})
+    return "resumed"
 
 
 def _defaults(kind: type[Settings]) -> dict[str, Any]:
@@ -469,20 +498,35 @@ def _defaults(kind: type[Settings]) -> dict[str, Any]:
         if isinstance(field.annotation, type) and issubclass(field.annotation, Settings):
             values[name] = _defaults(field.annotation)
         elif not (config_folder() / name).is_dir():
-            values[name] = "???" if field.is_required() else field.default
+            values[name] = "???" if field.is_required() else plain(field.default)
     return values
 
 
-def validate(command: str, values: Mapping[str, Any]) -> Any:
+def plain(value: Any) -> Any:
+    """Return the default of a setting as YAML holds it."""
+    return [plain(one) for one in value] if isinstance(value, tuple) else value
+
+
+def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Return the settings of nested sections by their names, ``section.setting``."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        inner = isinstance(value, Mapping)
+        flat |= flat_settings(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
+    return flat
+
+
+def validate(command: str, config: Any) -> Any:
     """Return the settings of a command as an object of its class.
 
     Args:
         command: Name of the command, e.g. predict.
-        values: Composed settings, resolved.
+        config: Settings that Hydra has composed, or a mapping of them.
 
     Raises:
         SettingError: A setting is missing, unknown, or of another type.
     """
+    values: Any = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
     try:
         return SETTINGS[command].model_validate({n: v for n, v in values.items() if v != "???"})
     except ValidationError as error:
@@ -493,7 +537,7 @@ def validate(command: str, values: Mapping[str, Any]) -> Any:
             break
         name, value = f"{name}.{part}".lstrip("."), value.get(str(part))
     if first["type"] == "missing":
-        raise SettingError(name, found="nothing", expected=comment(fields[name]))
+        raise SettingError(name, found="nothing", expected=comment_of(fields[name]))
     of_setting = [e for e in errors if e["loc"][: name.count(".") + 1] == tuple(name.split("."))]
     expected = dict.fromkeys(str(e.get("ctx", {}).get("error") or e["msg"]) for e in of_setting)
     kinds = [text.removeprefix("Input should be ") for text in expected]

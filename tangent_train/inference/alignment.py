@@ -37,10 +37,8 @@ from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_dispa
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
-from tangent_train.rendering.accumulate import NO_OWNERS
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.views import Views
-from tangent_train.rendering.sampling import image_taps, sample
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -126,9 +124,11 @@ def sample_views(
         shape: ``(H, W)`` of the canvas: the panorama or photo.
         points: ``(P, 2)`` rows and columns of the canvas.
     """
-    placed, images = views.placed(torch.from_numpy(np.ascontiguousarray(outputs))[:, None], shape)
+    placed, images = views.on_canvas(
+        torch.from_numpy(np.ascontiguousarray(outputs))[:, None], shape
+    )
     height, width = placed.shape[-2:]
-    geometry = images.geometry(shape, slice(0, shape[0]), NO_OWNERS)
+    geometry = images.geometry(shape, None)
     rows, columns = geometry.rows[points[:, 0]].T, geometry.columns[:, points[:, 1]]
     rays = np.stack([rows[0] * columns[0], rows[0] * columns[1], rows[1]])
     u, v, w = np.moveaxis(geometry.matrices @ rays, 1, 0)
@@ -148,10 +148,16 @@ def sample_views(
 def _interpolated(images: Tensor, image: Indices, position: Floats) -> Floats:
     """Return bilinear values ``(n,)`` at positions ``(n, 2)``; NaN where one is not finite."""
     height, width = images.shape[1:]
-    u, v = torch.from_numpy(((position + 1) * (width, height) - 1) / 2).T[:, None]
-    number, ones = torch.from_numpy(image)[None], torch.ones_like(u)
-    taps = image_taps(number, u, v, (height, width), ones, height * width)
-    values = sample(images.reshape(1, -1), taps)[0].double().numpy()
+    u, v = (((position + 1) * (width, height) - 1) / 2).T
+    left, top = (
+        np.floor(line).clip(0, side - 2).astype(np.int64)
+        for line, side in ((u, width), (v, height))
+    )
+    right, below = (u - left).clip(0, 1), (v - top).clip(0, 1)
+    array = images.double().numpy()
+    upper = (1 - right) * array[image, top, left] + right * array[image, top, left + 1]
+    lower = (1 - right) * array[image, top + 1, left] + right * array[image, top + 1, left + 1]
+    values = (1 - below) * upper + below * lower
     return np.where(np.isfinite(values), values, np.nan)
 
 

@@ -16,7 +16,7 @@ from tangent_train.inference.depth import combine_depth
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_choice, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
-from tangent_train.rendering.mosaic import Mosaic
+from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def apply(
 
     The images are rendered a few at a time with `equirect_to_tangent`, and their results are
     rendered back as with `tangent_to_equirect`. Besides the result, only the images of one call are
-    held in memory. Sums of more than 2 GiB are kept in a temporary file. There are no gradients.
+    held in memory. There are no gradients.
 
     With `align`, the results are depth. They are converted to distances along the rays and brought
     to one scale: views are compared, and blended, in the logarithm of distance, or for disparity in
@@ -149,23 +149,16 @@ def _mean(
     blend: Blend,
     channels: tuple[int, ...],
 ) -> NDArray[np.float32]:
-    """Return the blended results ``(H, W, *channels)``, written over their sums."""
-    (height, width), count, feather = shape, math.prod(channels), blend == "feather"
-    # With feathering, the last channel sums the weights.
-    mosaic = Mosaic(shape, count + feather, blend, averaged=True, softmax=False)
-    views, sums = PinholeViews(grid), mosaic.sums
+    """Return the blended results ``(H, W, *channels)``."""
+    mosaic, views = (
+        MeanMosaic(shape, blend, math.prod(channels), skips_unknown=False),
+        PinholeViews(grid),
+    )
     for faces, results in parts:
         flat = results.reshape(*results.shape[:3], -1)
         images = np.moveaxis(flat, -1, 1).astype(np.float32)
-        if feather:
-            images = np.concatenate([images, np.ones_like(images[:, :1])], axis=1)
         mosaic.add(torch.from_numpy(images), views[faces[0] : faces[-1] + 1])
-    means, size = np.asarray(sums).reshape(-1), width * count
-    for i in range(height):
-        row = sums[i, :, : count + feather]
-        row = row[..., :count] / (row[..., count:] if feather else 1)
-        means[i * size : (i + 1) * size] = row.ravel()
-    return means[: height * size].reshape(*shape, *channels)
+    return mosaic.values().movedim(0, -1).reshape(*shape, *channels).numpy()
 
 
 def _distance(

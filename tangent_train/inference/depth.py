@@ -16,7 +16,7 @@ from tangent_train.inference.alignment import align as align_views
 from tangent_train.inference.alignment import lattice, sample_views, sphere_points
 from tangent_train.inference.engine import ViewPredictor
 from tangent_train.rendering.checks import check_choice
-from tangent_train.rendering.mosaic import DepthMosaic
+from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Representation
 
 if TYPE_CHECKING:
@@ -102,10 +102,10 @@ def combine_depth(
         parts.append((views, depth, slice(count, count + len(views)), lengths))
         count += len(views)
     alignment = align_views(samples, depth_kind, align)
-    mosaic = DepthMosaic(shape, blend, device=outputs[0][1].device)
+    mosaic = MeanMosaic(shape, blend, device=outputs[0][1].device)
     for views, depth, numbers, lengths in parts:
         mosaic.add(alignment.applied(depth, numbers, lengths), views)
-    distance = distance_of(mosaic.values(), depth_kind)
+    distance = distance_of(mosaic.values()[0], depth_kind)
     if not is_metric(kind):
         distance = distance / _median(distance, points, camera_matrix)
         distance = distance.where(distance <= _FARTHEST, torch.nan)

@@ -12,7 +12,7 @@ import numpy as np
 from omegaconf import OmegaConf
 
 from datamodules.core.images import distance_from_z_depth, resize_depth
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
 from tangent_train.geometry import PinholeGrid, TangentGrid
@@ -45,7 +45,7 @@ ViewChoice = str | Mapping[str, Any] | None
 name as ``option``, with changed settings of the representation. None as trained."""
 
 _TANGENT = "tangent_train.rendering.TangentRepresentation"
-_PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
 _EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
 _ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
 
@@ -123,8 +123,7 @@ class PanoramaViews:
         settings["rotations"] = rotations
         if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
             settings["blend"] = blend
-        # Views that the user chooses may name any setting.
-        self.representation = _built(trained, settings, None if views else trained.source)
+        self.representation = _built(trained, settings)
         self.image_size = self.representation.image_size
         self.distortion_aware = getattr(self.representation, "distortion_aware", False)
         self.blend = self.representation.blend
@@ -345,7 +344,7 @@ def panorama_settings(
     level = max(chosen)
     if views is not None:
         settings = view_settings(views)
-    elif settings["_target_"] == _PERSPECTIVE or (
+    elif settings["_target_"] == PERSPECTIVE or (
         base_level is not None and settings["_target_"] != _TANGENT
     ):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
@@ -371,14 +370,14 @@ def panorama_settings(
 
 
 def _built(
-    trained: LoadedNetwork, settings: dict[str, Any], source: SettingsFile | None
+    trained: LoadedNetwork, settings: dict[str, Any]
 ) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
     """Build the representation from settings.
 
     Raises:
         SettingError: The network does not support its image size.
     """
-    built: Any = build_from_config(settings, "representation", source)
+    built: Any = build_from_config(settings, "representation")
     check_size(trained, built.image_size)
     return built
 
@@ -387,13 +386,13 @@ def _photo_representation(
     trained: LoadedNetwork, level: int, base_level: int | None
 ) -> PerspectiveRepresentation:
     settings = trained.representation
-    if settings["_target_"] == _PERSPECTIVE and base_level is None:
+    if settings["_target_"] == PERSPECTIVE and base_level is None:
         half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
         half_extent /= 2.0 ** (level - trained.level)
         size = trained.image_size
     else:
         views = "tangent" if trained.photo_level is not None else None
-        seen = _built(trained, panorama_settings(trained, level, base_level, views), trained.source)
+        seen = _built(trained, panorama_settings(trained, level, base_level, views))
         if not isinstance(seen, PinholeRepresentation):
             return _photo_representation(trained, level, _BASE_LEVEL)
         size = seen.image_size

@@ -1,7 +1,7 @@
 """Reading and writing images: colors, depth, labels, arrays.
 
-Pillow opens and identifies every image; OpenCV writes, and decodes what Pillow would cut to 8 bits
-or read in the wrong byte order: 16-bit colors, and TIFF files of more than 8 bits.
+Pillow decodes images of 8 bits and 16-bit gray PNG files, tifffile TIFF files of more than 8 bits,
+OpenCV 16-bit colors in PNG and LZW; OpenCV writes.
 """
 
 from __future__ import annotations
@@ -14,21 +14,17 @@ from typing import Any
 
 import cv2
 import numpy as np
+import tifffile
 from numpy.lib.format import open_memmap
 from numpy.typing import DTypeLike, NDArray
-from PIL import ExifTags, Image, TiffImagePlugin, UnidentifiedImageError
+from PIL import ExifTags, Image
 from PIL.ExifTags import Base as Tag
 
-from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.errors import DataError, SettingError, first_line, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
 from tangent_train.io.exr import read_exr, read_exr_size, write_exr
 from tangent_train.io.image_files import IMAGE_FORMATS
-from tangent_train.io.png import (
-    MOST_PIXELS,
-    check_pixels,
-    read_png_header,
-    read_png_metadata,
-)
+from tangent_train.io.png import MOST_PIXELS, check_pixels, read_png_header
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels slightly: not for labels and depth."""
@@ -48,17 +44,8 @@ READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
 
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
-_LAYOUT = (
-    *(Tag.BitsPerSample, Tag.SampleFormat, Tag.SamplesPerPixel, Tag.PhotometricInterpretation),
-    *(Tag.Compression, Tag.PlanarConfiguration, Tag.ExtraSamples, Tag.FillOrder),
-)
-_ASSOCIATED_ALPHA = 1
-_EXACT_TYPES = {
-    (number, 8 * size): np.dtype(f"{kind}{size}")
-    for number, kind, sizes in ((1, "u", (2, 4, 8)), (2, "i", (1, 2, 4)), (3, "f", (4, 8)))
-    for size in sizes
-}
-"""Types of TIFF channels beyond 8 bits, by SampleFormat and BitsPerSample."""
+_BYTE_BITS = 8
+_UNSIGNED = 1  # SampleFormat of TIFF
 _MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
 _MISSING_UNITS = 65535
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
@@ -72,19 +59,12 @@ def _opened(path: Path) -> Iterator[Image.Image]:
     try:
         # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
         with path.open("rb") as file, Image.open(file, formats=IMAGE_FORMATS) as image:
-            if isinstance(image, TiffImagePlugin.TiffImageFile):
-                _seek_full_size(image)
             check_pixels(path, image.height, image.width)
-            if image.format == "PNG":
-                read_png_header(path)
-                image.info |= read_png_metadata(path)
             yield image
     except (DataError, MemoryError):
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
-        if isinstance(error, UnidentifiedImageError) and (tags := _complete_tiff_tags(path)):
-            raise _unknown_layout(path, tags) from error
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
         raise DataError(
             path,
@@ -94,69 +74,22 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         ) from error
 
 
-def _seek_full_size(image: TiffImagePlugin.TiffImageFile) -> None:
-    """Go to the first page that is not a thumbnail; stay at the first page if all are."""
-    for page in range(image.n_frames if image.tag_v2.get(Tag.NewSubfileType, 0) & 1 else 0):
-        image.seek(page)
-        if not image.tag_v2.get(Tag.NewSubfileType, 0) & 1:
-            return
-    image.seek(0)
-
-
-def _complete_tiff_tags(path: Path) -> dict[int, Any]:
-    """Return the tags of the first page of a complete TIFF file; of other files nothing."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(8)
-            head += file.read(8) if head[2] == 43 else b""  # BigTIFF
-            tags: Any = TiffImagePlugin.ImageFileDirectory_v2(head)
-            file.seek(tags.next)
-            tags.load(file)
-        in_tiles = Tag.StripOffsets not in tags or Tag.StripByteCounts not in tags
-        starts = tags[Tag.TileOffsets if in_tiles else Tag.StripOffsets]
-        sizes = tags[Tag.TileByteCounts if in_tiles else Tag.StripByteCounts]
-        return dict(tags) if np.add(starts, sizes).max() <= path.stat().st_size else {}
-    except Exception:  # the parser raises many kinds of errors
-        return {}
-
-
-def _unknown_layout(path: Path, tags: Any) -> DataError:
-    known = [f"{tag.name} {tags[tag]}" for tag in _LAYOUT if tag in tags]
-    return DataError(
-        path,
-        found=f"a TIFF layout that cannot be decoded: {', '.join(known)}",
-        expected="gray or RGB of 8 or 16 bits or depth of 32-bit float, all channels of one type, "
-        "interleaved (PlanarConfiguration 1), without premultiplied alpha",
-        remedy="Convert the image to PNG, or to TIFF of 8 or 16 bits; depth, to 32-bit float.",
-    )
-
-
-def _exif(image: Image.Image) -> Image.Exif:
-    """Return the EXIF data; none if they are broken."""
-    try:
-        # Pillow would decode the pixels of a PNG file to look for more.
-        return Image.Image.getexif(image)
-    except Exception:  # the parser raises many kinds of errors
-        return Image.Exif()
-
-
-def read_metadata(path: Path) -> tuple[dict[Any, Any], list[bytes]]:
-    """Read the metadata of an image file.
+def read_xmp(path: Path) -> bytes:
+    """Read the XMP packet of an image file, empty without one.
 
     Args:
-        path: See `read_pixels`; arrays and OpenEXR images have no metadata.
-
-    Returns:
-        Texts and data by Pillow's names; the APP1 segments of a JPEG file.
+        path: See `read_pixels`; arrays and OpenEXR images have no packet.
 
     Raises:
         DataError: It cannot be read, or is not an image.
     """
     if path.suffix.lower() in (".npy", ".exr"):
-        return {}, []
+        return b""
     with _opened(path) as image:
-        segments = getattr(image, "applist", [])
-        return image.info, [content for name, content in segments if name == "APP1"]
+        if image.format == "PNG":
+            image.load()  # programs write the packet behind the pixels too
+        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return packet.encode() if isinstance(packet, str) else bytes(packet)
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
@@ -171,14 +104,23 @@ def read_image_size(path: Path) -> tuple[int, int]:
     if suffix == ".npy":
         height, width = read_array(path).shape[:2]
         return height, width
+    if page := _deep_tiff(path):
+        rows, columns = page.imagelength, page.imagewidth
+        check_pixels(path, rows, columns)
+        return (columns, rows) if _tiff_orientation(page) >= _FIRST_TRANSPOSED else (rows, columns)
     with _opened(path) as image:
         return _upright_size(image)
 
 
 def _orientation(image: Image.Image) -> int:
     """Return the EXIF orientation of the pixels that Pillow decodes, 1 to 8."""
-    # Pillow rotates TIFF files itself.
-    found: Any = 1 if image.format == "TIFF" else _exif(image).get(Tag.Orientation)
+    if image.format == "TIFF":  # Pillow rotates these files itself
+        return 1
+    try:
+        # Pillow's own method would decode the pixels of a PNG file to look for more.
+        found: Any = Image.Image.getexif(image).get(Tag.Orientation)
+    except Exception:  # the parser raises many kinds of errors
+        return 1
     return found if found in range(1, 9) else 1
 
 
@@ -215,18 +157,18 @@ def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
         return read_array(path)
     if suffix == ".exr":
         return read_exr(path)
+    if page := _deep_tiff(path):
+        return _displayed(_decode_tiff(path, page), _tiff_orientation(page))
     with _opened(path) as image:
-        size, orientation = _upright_size(image), _orientation(image)
-        exact = _exact_type(path, image)
-        pixels = (
-            _decode(image, indices=indices)
-            if exact is None
-            else _decode_exactly(path, image.tell(), *exact)
-        )
-        pixels = _displayed(pixels, orientation)
-        if pixels.shape[:2] != size:
-            raise ValueError(f"{width_height(pixels.shape)}, in its header {width_height(size)}")
-        return pixels
+        orientation = _orientation(image)
+        header = read_png_header(path) if image.format == "PNG" else None
+        if header and header.bits > _BYTE_BITS:  # Pillow would cut colors to 8 bits
+            image.load()  # refuses truncated files
+            pixels = _decode_deep(path)
+            pixels = pixels[..., 0] if pixels.ndim > 2 and "gray" in header.color else pixels
+        else:
+            pixels = _decode(image, indices=indices)
+        return _displayed(pixels, orientation)
 
 
 def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
@@ -236,52 +178,74 @@ def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
         return stored.astype(stored.dtype.newbyteorder("="), copy=False)
     if image.mode == "LA":
         return np.array(image.getchannel(0))
+    if image.mode == "YCbCr":
+        raise ValueError("subsampled colors")
     image.info.pop("transparency", None)  # Pillow warns that RGB loses it
     return np.array(image if image.mode == "RGB" else image.convert("RGB"))
 
 
-def _exact_type(path: Path, image: Image.Image) -> tuple[np.dtype[Any], bool] | None:
-    """Return the channel type of a file for OpenCV, and True for gray; None for Pillow.
-
-    Raises:
-        DataError: Neither of them decodes it correctly.
-    """
-    if image.format == "PNG":
-        header = read_png_header(path)
-        return (np.dtype(np.uint16), "gray" in header.color) if header.bits == 16 else None
-    if not isinstance(image, TiffImagePlugin.TiffImageFile):
-        return None
-    tags: Any = image.tag_v2
-    channels = tags.get(Tag.SamplesPerPixel, 1)
-    bits, kinds = set(tags.get(Tag.BitsPerSample, (1,))), set(tags.get(Tag.SampleFormat, (1,)))
-    if kinds == {1} and max(bits) <= 8:
-        exact = None
-        right = image.mode != "YCbCr" or tags.get(Tag.YCbCrSubSampling) == (1, 1)
-        right &= (tags.get(Tag.PlanarConfiguration), tags.get(Tag.FillOrder)) != (2, 2)
-    else:
-        exact = _EXACT_TYPES.get((*kinds, *bits))
-        is_plain = tags.get(Tag.PhotometricInterpretation) == {1: 1, 3: 2, 4: 2}.get(channels)
-        is_interleaved = channels == 1 or tags.get(Tag.PlanarConfiguration, 1) == 1
-        is_straight = _ASSOCIATED_ALPHA not in tags.get(Tag.ExtraSamples, ())
-        right = exact is not None and is_plain and is_interleaved and is_straight
-    if not right:
-        raise _unknown_layout(path, tags)
-    return None if exact is None else (exact, channels == 1)
-
-
-def _decode_exactly(path: Path, page: int, dtype: np.dtype[Any], gray: bool) -> NDArray[Any]:
+def _decode_deep(path: Path) -> NDArray[Any]:
     # From memory: `cv2.imread` cannot open paths beyond the system's code page.
-    content = np.fromfile(path, np.uint8)
-    if page:
-        _, pages = cv2.imdecodemulti(content, cv2.IMREAD_UNCHANGED, range=(page, page + 1))
+    pixels: Any = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.dtype == np.uint8:
+        raise ValueError("pixels that OpenCV does not decode")
+    return pixels if pixels.ndim == 2 else pixels[..., 2::-1]
+
+
+def _deep_tiff(path: Path) -> Any:
+    """Return the page that tifffile decodes, the first of full size; None to use Pillow."""
+    if path.suffix.lower() not in (".tif", ".tiff"):
+        return None
+    try:
+        with tifffile.TiffFile(path) as file:
+            pages: Any = file.pages
+            page = next((one for one in pages if not one.is_reduced), pages[0])
+    except Exception:  # the parser raises many kinds of errors; Pillow names them
+        return None
+    is_unsigned = page.sampleformat == _UNSIGNED
+    is_shallow = is_unsigned and np.max(page.bitspersample) <= _BYTE_BITS
+    is_shallow &= page.fillorder == tifffile.FILLORDER.MSB2LSB
+    return None if is_shallow and page.index == 0 else page
+
+
+def _tiff_orientation(page: Any) -> int:
+    found = page.tags.valueof(Tag.Orientation)
+    return found if found in range(1, 9) else 1
+
+
+def _decode_tiff(path: Path, page: Any) -> NDArray[Any]:
+    """Decode the gray or RGB pixels of a page, without alpha."""
+    channels = page.samplesperpixel
+    colors = tifffile.PHOTOMETRIC.MINISBLACK if channels == 1 else tifffile.PHOTOMETRIC.RGB
+    is_plain = channels in (1, 3, 4) and page.photometric == colors
+    is_plain &= tifffile.EXTRASAMPLE.ASSOCALPHA not in page.extrasamples
+    is_planar = channels > 1 and page.planarconfig == tifffile.PLANARCONFIG.SEPARATE
+    try:
+        check_pixels(path, page.imagelength, page.imagewidth)
+        if page.compression != tifffile.COMPRESSION.LZW:
+            with tifffile.TiffFile(path) as file:
+                pixels = file.asarray(key=page.index)
+        elif is_planar or page.index:
+            raise ValueError("LZW")  # noqa: TRY301
+        else:  # tifffile needs another package for LZW
+            pixels = _decode_deep(path)
+    except DataError:
+        raise
+    except Exception as error:  # codecs raise many kinds of errors
+        is_plain, reason = False, first_line(error)
     else:
-        pages = [cv2.imdecode(content, cv2.IMREAD_UNCHANGED)]
-    pixels: Any = pages[0]
-    if pixels is None or pixels.dtype != dtype or pixels.shape[2:] not in ((), (3,), (4,)):
-        raise ValueError("broken pixels")
-    if gray:
-        return np.ascontiguousarray(pixels.reshape(*pixels.shape[:2], -1)[..., 0])
-    return pixels[..., 2::-1]
+        reason = f"{page.bitspersample} bits, {channels} channels, {page.photometric!r}"
+    if not is_plain:
+        raise DataError(
+            path,
+            found=f"a TIFF layout that cannot be decoded ({reason})",
+            expected="gray or RGB of 8 or 16 bits or depth of 32-bit float, without premultiplied "
+            "alpha",
+            remedy="Convert the image to PNG, or to TIFF of 8 or 16 bits; depth, to 32-bit float.",
+        )
+    pixels = np.moveaxis(pixels, 0, -1) if is_planar else pixels
+    pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
+    return pixels if channels == 1 else pixels[..., :3]
 
 
 def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
@@ -411,7 +375,7 @@ def photo_fov_deg(path: Path) -> float | None:
     with _opened(path) as image:
         height, width = _upright_size(image)
         try:
-            exif = _exif(image).get_ifd(ExifTags.IFD.Exif)
+            exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
             film_mm = float(exif.get(Tag.FocalLengthIn35mmFilm, 0))
         except Exception:  # broken EXIF data
             return None

@@ -79,12 +79,12 @@ class Comparison(NamedTuple):
 
     Attributes:
         rows: Scores by condition and representation.
-        found: Keypoints and matches by condition and representation.
+        matched: Keypoints and matches by condition and representation.
         images: Left and right panorama in which keypoints were detected, by condition.
     """
 
     rows: list[Row]
-    found: dict[str, dict[str, MatchedPair]]
+    matched: dict[str, dict[str, MatchedPair]]
     images: dict[str, tuple[NDArray[np.uint8], NDArray[np.uint8]]]
 
 
@@ -101,9 +101,6 @@ class Comparer:
         max_error_deg: Largest error of an inlier, see `estimate_two_view`; at most 20.
         seed: Seed of random samples and random rotations.
         controls: True to compare the downsampled panorama, a cube and the rotated panorama too.
-
-    Raises:
-        SettingError: A number is out of range.
     """
 
     base_level: tuple[int, ...]
@@ -116,11 +113,6 @@ class Comparer:
     controls: bool = True
 
     def __post_init__(self) -> None:
-        ranges = {"margin": (0, math.inf), "ratio": (1e-9, 1), "max_error_deg": (1e-9, 20)}
-        for name, (least, most) in ranges.items():
-            value = getattr(self, name)
-            if not least <= value <= most:
-                raise SettingError(name, found=value, expected=f"{least:g} to {most:g}")
         self._cache: _Keypoints = {}
 
     @property
@@ -139,7 +131,7 @@ class Comparer:
             Comparison whose rows have n_L and n_R as ``visible_left`` and ``visible_right`` (all
             keypoints if depth and pose are unknown), and PMR, MS and P as shares of 1. With depth
             and pose, they have the errors of the estimated motion, the area under the recall curve
-            of the pair, and the number of ``correct`` matches among the ``judged`` ones.
+            of the pair, and the number of ``correct`` matches among the ``verifiable`` ones.
             Undefined scores are None.
 
         Raises:
@@ -157,32 +149,35 @@ class Comparer:
         left, right = (self._cache[side.name, level] for side in sides)
         conditions = {AS_GIVEN: (np.eye(3), images[1], right)}
         if self.controls:
-            rotation = random_rotation(
-                np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
-            )
-            image = rotate_equirect(images[1], rotation)
-            valid = pair.right.valid
+            rng = np.random.default_rng([self.seed, zlib.crc32(pair.name.encode())])
+            rotation, valid = random_rotation(rng), pair.right.valid
             if valid is not None:
                 valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
+            image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level, valid)
-        views = _depth_views(pair)
-        overlap = None if views is None else _defined(fov_overlap(*views))
-        known = {
+        has_truth = all(side.distance_m is not None and side.pose is not None for side in sides)
+        views: Any = (
+            [DepthView(side.distance_m, side.pose) for side in sides] if has_truth else None
+        )  # type: ignore[arg-type]
+        common = {
             "pair": pair.name,
             "split": pair.split,
             "left": pair.left.name,
             "right": pair.right.name,
             "level": level,
-            "fov_overlap": overlap,
-            "visible_by": "all keypoints" if overlap is None else "depth",
+            "fov_overlap": None if views is None else _defined(fov_overlap(*views)),
+            "visible_by": "all keypoints" if views is None else "depth",
         }
         comparison = Comparison([], {}, {})
         for condition, (rotation, image, right) in conditions.items():
-            found = {name: self._matched(left[name], right[name]) for name in left}
-            comparison.images[condition], comparison.found[condition] = (images[0], image), found
-            for name, matched in found.items():
-                row = known | {"condition": condition, "representation": name}
-                comparison.rows.append(row | self._figures(matched, rotation, views))
+            matched = {name: self._match(left[name], right[name]) for name in left}
+            comparison.images[condition], comparison.matched[condition] = (
+                (images[0], image),
+                matched,
+            )
+            for name, one in matched.items():
+                row = {**common, "condition": condition, "representation": name}
+                comparison.rows.append(row | self._scores(one, rotation, views))
         return comparison
 
     def _level(self, pair: PanoramaPair) -> int:
@@ -211,18 +206,18 @@ class Comparer:
             return found
         return {name: k.select(is_valid(valid, k.directions_xyz)) for name, k in found.items()}
 
-    def _matched(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
+    def _match(self, left: SphericalKeypoints, right: SphericalKeypoints) -> MatchedPair:
         matches = match(left.descriptors, right.descriptors, self.ratio, mutual=self.mutual)
         rays = left.directions_xyz[matches[:, 0]], right.directions_xyz[matches[:, 1]]
         geometry = estimate_two_view(*rays, self.max_error_deg, seed=self.seed)
         return MatchedPair(left, right, matches, geometry)
 
-    def _figures(self, found: MatchedPair, rotation: Floats, views: _Views | None) -> Row:
-        visible = keypoints = len(found.left), len(found.right)
+    def _scores(self, pair: MatchedPair, rotation: Floats, views: _Views | None) -> Row:
+        keypoints = visible = len(pair.left), len(pair.right)
         truth: Row = dict.fromkeys(_TRUTH)
         if views is not None:
-            visible, truth = _truth(found, rotation, views, self.max_error_deg)
-        putative, inliers = len(found.matches), int(found.geometry.inliers.sum())
+            visible, truth = _truth(pair, rotation, views, self.max_error_deg)
+        putative, inliers = len(pair.matches), int(pair.geometry.inliers.sum())
         share = sum(1 / n for n in visible) / 2 if all(visible) else None
         return {
             "keypoints_left": keypoints[0],
@@ -234,46 +229,37 @@ class Comparer:
             "pmr": share and putative * share,
             "ms": share and inliers * share,
             "p": inliers / putative if putative else None,
-            "geometry": found.geometry.kind,
+            "geometry": pair.geometry.kind,
             **truth,
         }
 
 
 _TRUTH = (
     *("rotation_error_deg", "translation_error_deg", *(f"pose_auc_{d}" for d in AUC_DEG)),
-    *("judged", "correct", "correct_share"),
+    *("verifiable", "correct", "correct_share"),
 )
 
 
 def _truth(
-    found: MatchedPair, rotation: Floats, views: _Views, max_error_deg: float
+    pair: MatchedPair, rotation: Floats, views: _Views, max_error_deg: float
 ) -> tuple[tuple[int, int], Row]:
-    """Visible keypoints on either side, and the scores that need depth and pose."""
-    (left, right), left_xyz = views, found.left.directions_xyz
-    # In the right panorama as it is, whose depth needs no resampling.
-    right_xyz = found.right.directions_xyz @ rotation
+    """Return the numbers of visible keypoints, and the scores that need depth and pose."""
+    (left, right), left_xyz = views, pair.left.directions_xyz
+    # In the unrotated right panorama, whose depth needs no resampling.
+    right_xyz = pair.right.directions_xyz @ rotation
     visible = visible_from(left_xyz, left, right), visible_from(right_xyz, right, left)
-    first, second = found.matches.T
-    judged = correct_matches(left_xyz[first], right_xyz[second], left, right, max_error_deg)
+    first, second = pair.matches.T
+    truth = correct_matches(left_xyz[first], right_xyz[second], left, right, max_error_deg)
     rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
-    errors = found.geometry.pose_error_deg(left.pose, rotated)
-    known, correct = int(judged.known.sum()), int(judged.correct.sum())
+    errors = pair.geometry.pose_error_deg(left.pose, rotated)
+    known, correct = int(truth.known.sum()), int(truth.correct.sum())
     # The recall of one pair is a step from 0 to 1 at its error; without an estimate it stays 0.
     worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
     moved = not np.array_equal(left.pose.location_m, right.pose.location_m)
     areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)
-    shares = known, correct, correct / known if known else None
-    figures = (*map(_defined, errors), *areas, *shares)
+    scores = (*map(_defined, errors), *areas, known, correct, correct / known if known else None)
     counts = int(visible[0].sum()), int(visible[1].sum())
-    return counts, dict(zip(_TRUTH, figures, strict=True))
-
-
-def _depth_views(pair: PanoramaPair) -> _Views | None:
-    left, right = (
-        None if side.distance_m is None or side.pose is None else (side.distance_m, side.pose)
-        for side in (pair.left, pair.right)
-    )
-    return None if left is None or right is None else (DepthView(*left), DepthView(*right))
+    return counts, dict(zip(_TRUTH, scores, strict=True))
 
 
 def _defined(value: float) -> float | None:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from tangent_train.geometry import (
@@ -18,7 +17,6 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.keypoints.spherical import Floats, angles_between
-from tangent_train.rendering.sampling import bilinear_equirect_taps
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
 """Occlusion tolerance behind a surface: share of the distance, and meters."""
@@ -59,10 +57,8 @@ class DepthView:
         """
         height, width = self.distance_m.shape
         pixels = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width))
-        u, v = torch.from_numpy(pixels).unbind(-1)
-        taps = bilinear_equirect_taps(u, v, (height, width))
-        weight = taps.weight.numpy()
-        four = self.distance_m.reshape(-1)[taps.source.numpy()].astype(np.float64)
+        index, weight = _four_pixels(pixels, (height, width))
+        four = self.distance_m.reshape(-1)[index].astype(np.float64)
         touched = weight > 1e-6  # rounding may include pixels without weight
         there = touched & ~np.isnan(four)
         farthest = np.where(there, four, -np.inf).max(axis=0)
@@ -73,6 +69,23 @@ class DepthView:
         distance[smooth] = 1 / np.where(there, weight / four, 0.0).sum(axis=0)[smooth]
         distance[~there.any(axis=0)] = np.nan
         return distance, distance * np.where(smooth, 1.0, _SMOOTH)
+
+
+def _four_pixels(pixels_xy: Floats, shape: tuple[int, int]) -> tuple[NDArray[np.int64], Floats]:
+    """Return flat indices and bilinear weights ``(4, n)`` of the pixels around positions."""
+    (u, v), (height, width) = pixels_xy.T, shape
+    indices, weights = [], []
+    for row, row_weight in ((np.floor(v), 1 - v % 1), (np.floor(v) + 1, v % 1)):
+        inside = row.clip(0, height - 1)
+        # Beyond a pole the row reflects, rotated by half a revolution.
+        column = np.where(inside == row, u, u + width / 2)
+        for nearest, weight in (
+            (np.floor(column), 1 - column % 1),
+            (np.floor(column) + 1, column % 1),
+        ):
+            indices.append((inside * width + nearest % width).astype(np.int64))
+            weights.append(row_weight * weight)
+    return np.stack(indices), np.stack(weights)
 
 
 def visible_from(directions_xyz: Floats, source: DepthView, target: DepthView) -> NDArray[np.bool_]:

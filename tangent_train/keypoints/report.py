@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tangent_train.files import csv_text, write_text
-from tangent_train.imports import elsewhere
 from tangent_train.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparison, Row
 from tangent_train.results.tables import Table, percent
 
@@ -91,23 +90,27 @@ class KeypointReport:
     def _conditions(self) -> list[str]:
         return [c for c in _CONDITIONS if any(row["condition"] == c for row in self.rows)]
 
+    def _groups(self, condition: str, key: str) -> dict[Any, list[list[Row]]]:
+        """Return the rows of a condition by split or pair, and by representation."""
+        groups: dict[Any, list[list[Row]]] = {}
+        for row in with_splits(self.rows):
+            if row["condition"] == condition:
+                columns = groups.setdefault(row[key], [[] for _ in self.representations])
+                columns[self.representations.index(row["representation"])].append(row)
+        return groups
+
     def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
         """Yield means over the pairs with a defined score, and the paper's means below them."""
-        groups = _grouped(with_splits(self.rows), "split")
+        groups = self._groups(condition, "split")
         for split in sorted(groups, key=lambda name: (name != "hard", name != "easy")):
-            rows = groups[split]
             printed = _paper().get(split, {}) if self.published and condition == AS_GIVEN else {}
-            title = f"{split or 'all'} ({len({row['pair'] for row in rows})})"
-            of = _grouped([row for row in rows if row["condition"] == condition], "representation")
+            title = f"{split or 'all'} ({max(map(len, groups[split]))})"
             for metric, key in _METRICS.items():
-                known = [
-                    [row[key] for row in of.get(name, ()) if row[key] is not None]
-                    for name in self.representations
-                ]
+                known = [[r[key] for r in rows if r[key] is not None] for rows in groups[split]]
                 if not any(known) and key not in _SCORES.values():
                     continue
                 average = np.median if metric.endswith("median") else np.mean
-                means = (float(average(column)) if column else None for column in known)
+                means = (float(average(values)) if values else None for values in known)
                 yield (title, metric, *(_text(mean, metric) for mean in means))
                 title = ""
                 if key in printed:
@@ -117,20 +120,18 @@ class KeypointReport:
 
     def _per_pair(self, condition: str) -> Table:
         header = ("pair", "split", "overlap %", *self.representations)
-        rows: list[Sequence[str]] = []
-        for name, found in _grouped(with_splits(self.rows), "pair").items():
-            of = {r["representation"]: r for r in found if r["condition"] == condition}
-            one = found[0]
-            cells = [
-                _triple([of[n][key] for key in _SCORES.values()]) for n in self.representations
-            ]
-            rows.append((name, one["split"] or "–", percent(one["fov_overlap"]), *cells))
+        cells: list[Sequence[str]] = []
+        for name, columns in self._groups(condition, "pair").items():
+            rows = [row for (row,) in columns]
+            scores = (_triple([row[key] for key in _SCORES.values()]) for row in rows)
+            one = rows[0]
+            cells.append((name, one["split"] or "–", percent(one["fov_overlap"]), *scores))
             printed = self.published.get(name)
             if printed is not None and condition == AS_GIVEN:
-                cells = [_triple(printed.scores.get(n, (None,) * 3)) for n in self.representations]
-                rows.append(("paper", "", percent(printed.fov_overlap), *cells))
+                scores = (_triple(printed.scores.get(n, (None,) * 3)) for n in self.representations)
+                cells.append(("paper", "", percent(printed.fov_overlap), *scores))
         title = f"Per pair: {_CONDITIONS[condition].lower()}"
-        return Table(title, header, rows, note="PMR / MS / P in percent.", text_columns=(0, 1))
+        return Table(title, header, cells, note="PMR / MS / P in percent.", text_columns=(0, 1))
 
 
 def with_splits(rows: Sequence[Row]) -> list[Row]:
@@ -150,13 +151,6 @@ def with_splits(rows: Sequence[Row]) -> list[Row]:
     ordered = sorted(overlaps, key=lambda name: overlaps[name])
     hard = set(ordered[: len(ordered) // 2])
     return [{**row, "split": "hard" if row["pair"] in hard else "easy"} for row in rows]
-
-
-def _grouped(rows: Sequence[Row], key: str) -> dict[Any, list[Row]]:
-    groups: dict[Any, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(row[key], []).append(row)
-    return groups
 
 
 def _paper() -> dict[str, dict[str, dict[str, str]]]:
@@ -191,12 +185,11 @@ def matches_png(comparison: Comparison, condition: str) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    with elsewhere():
-        from matplotlib.collections import LineCollection
-        from matplotlib.figure import Figure
+    from matplotlib.collections import LineCollection
+    from matplotlib.figure import Figure
 
     left, right = comparison.images[condition]
-    (rows, width), found = left.shape[:2], comparison.found[condition]
+    (rows, width), found = left.shape[:2], comparison.matched[condition]
     figure = Figure((8 * len(found), 8), layout="constrained")
     panels = figure.subplots(1, len(found), squeeze=False)[0]
     for axes, (name, one) in zip(panels, found.items(), strict=True):

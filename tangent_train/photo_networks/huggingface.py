@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +13,9 @@ from torch import Tensor
 from datamodules.core.inputs import Normalization
 from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
 from tangent_train.checkpoints.kinds import DepthKind
-from tangent_train.config.build import SettingsFile, build_from_config
-from tangent_train.errors import DataError, first_line
+from tangent_train.config.from_file import build_from_file
+from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.imports import hide_output, offline
-from tangent_train.photo_networks.depth_kinds import declared_kind
 from tangent_train.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
@@ -33,6 +32,28 @@ which is known here."""
 
 _PADDED = "zoedepth"
 """Network whose images are padded before they are resized, see `HuggingFaceDepthNetwork`."""
+
+_METRIC: Sequence[DepthKind] = "metric_z", "metric_distance"
+_RELATIVE: Sequence[DepthKind] = "relative_disparity", "relative_depth"
+_FAMILIES: dict[str, Sequence[DepthKind]] = {
+    "depth_pro": ("canonical_inverse",),
+    "metric": _METRIC,  # Depth Anything: its depth_estimation_type
+    "relative": _RELATIVE,
+    "glpn": _METRIC,
+    "tipsv2_dpt": _METRIC,
+    "zoedepth": _METRIC,
+}
+"""Possible kinds of networks in transformers, the usual one first."""
+
+_REFUSED = {
+    "chmv2": "heights of trees in aerial images, which are not distances from the camera",
+    "prompt_depth_anything": "depth that continues the depth image of a sensor, a second input",
+}
+
+_DEPTH_NAMES = (
+    "Set depth=, e.g. relative_disparity for MiDaS and its DPT (Intel/dpt-large), metric_z for "
+    "networks trained on the meters of NYU or KITTI."
+)
 
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _BYTE = 255
@@ -91,23 +112,21 @@ def _from_folder(
         settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
     if described["model_type"] == "oneformer":
         settings["task"] = _task(folder, config)
-    network = build_from_config(settings, "network", SettingsFile(path))
+    network = build_from_file(settings, "network", path)
     if len(names) == 1 and network.is_universal:
         expected = "at least two classes: with one, masks contain it in every pixel"
         raise DataError(path, found="masks of one class", expected=expected)
-    tensors, remarks = tensors_in(folder)
-    _load_tensors(network, tensors, folder)
+    _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
     given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
-        network=network,
+        module=network,
         settings=settings,
         score_names=names if classes is None else class_names_in(classes),
         normalization=given or Normalization(processor["mean"], processor["std"]),
         image_size=_image_size(processor, folder),
         score_kind="logits",
         depth_kind=kind,
-        remarks=remarks,
     )
 
 
@@ -285,3 +304,30 @@ def _load_tensors(network: Any, tensors: dict[str, Tensor], folder: Path) -> Non
             + ", for the classes in its id2label" * hasattr(network, "is_universal"),
         )
     inner.load_state_dict(loaded.state_dict())
+
+
+def declared_kind(config: Mapping[str, Any], path: Path, given: DepthKind | None) -> DepthKind:
+    """Return the kind of depth of a network of transformers.
+
+    Args:
+        config: Content of its ``config.json``.
+        path: That file, for messages.
+        given: The user's setting ``depth``, which must not contradict the config.
+
+    Raises:
+        DataError: The network returns something else, or needs another input.
+        SettingError: The config does not determine the kind, or contradicts `given`.
+    """
+    name = str(config.get("model_type"))
+    if name == "depth_anything":
+        name = str(config.get("depth_estimation_type", "relative"))
+    if name in _REFUSED:
+        raise DataError(path, found=f"{name}: {_REFUSED[name]}", expected="depth of photos")
+    kinds = _FAMILIES.get(name, ())
+    if given is None and not kinds:
+        expected = f"one of {', '.join(get_args(DepthKind))}, which {path} does not contain"
+        raise SettingError("depth", found="none", expected=expected, remedy=_DEPTH_NAMES)
+    if given is not None and kinds and given not in kinds:
+        expected = f"{' or '.join(kinds)}, because {path} has {name}"
+        raise SettingError("depth", found=given, expected=expected)
+    return given or kinds[0]

@@ -1,32 +1,28 @@
-"""Write a photo network as a checkpoint of this package."""
+"""Write a photo network as a file that all commands take."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Sequence
-from dataclasses import replace
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.loaded import (
+    METADATA_KEY,
     LoadedNetwork,
+    declared_sizes,
     load_network,
-    metadata_of,
-    write_metadata,
+    write_onnx_description,
 )
-from tangent_train.checkpoints.scores import (
-    ClassScoreNetwork,
-    Groups,
-    network_for_views,
-    size_multiple_of,
-)
+from tangent_train.checkpoints.scores import Groups, network_for_views, plain_scores
 from tangent_train.config.build import build_from_config, unregistered
-from tangent_train.errors import SettingError, width_height
+from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import camera_matrix_from_fov, vertex_resolution
 from tangent_train.inference.representations import (
@@ -36,11 +32,15 @@ from tangent_train.inference.representations import (
     photo_network_settings,
 )
 from tangent_train.io.image_files import composed
-from tangent_train.photo_networks.depth_kinds import try_depth
 from tangent_train.photo_networks.network import PhotoNetwork
-from tangent_train.photo_networks.score_kinds import try_network
 
 _PHOTO_LEVELS = (5, 13)
+
+_MASK_NAMES = 2
+"""Largest number of names for a single score: the class, or its background and the class."""
+
+_ROUNDED = 2e-3
+"""Largest error of a sum of probabilities in float16."""
 
 
 def import_network(
@@ -55,9 +55,8 @@ def import_network(
     unknown_wins: bool = True,
     image_size: tuple[int, int] | None = None,
     score_kind: ScoreKind | None = None,
-    remark: Callable[[str], object] = lambda sentence: None,
 ) -> LoadedNetwork:
-    """Try a photo network, write it as a checkpoint and read it again.
+    """Run a photo network on one image, write it to a file and read it again.
 
     Args:
         network: The network; it is set to evaluation mode.
@@ -70,65 +69,108 @@ def import_network(
         unknown_wins: True if these scores may win; such pixels are unknown (label 0).
         image_size: Fixed rows and columns of the network's images; None for the size of its
             training, and for other sizes if it supports them.
-        score_kind: Kind of the network's output; None for the kind that its library declares, or to
-            find it by trial.
-        remark: Called with each sentence about something that looks wrong.
+        score_kind: Kind of the network's output; None for the kind that its library declares, or
+            `usual_kind` of an ONNX file.
 
     Returns:
         The network, read from the file.
 
     Raises:
         SettingError: A setting is invalid, or the names do not fit the scores.
-        NoRoomError: The disk is full.
+        OSError: The disk is full.
     """
-    if image_size not in (None, network.image_size) and network.fixed_size:
+    multiple, only_size = declared_sizes(network.module)
+    if image_size is not None and only_size not in (None, image_size):
         raise SettingError(
             "image_size",
             found=width_height(image_size),
-            expected=f"{width_height(network.image_size)}, the only size that the file takes",
+            expected=f"{width_height(only_size)}, the only size that the network takes",
         )
-    if image_size is not None:
-        network = replace(network, image_size=image_size, fixed_size=True)
-    tried: DistanceNetwork | ClassScoreNetwork
-    if network.depth_kind is not None:
-        outputs: dict[str, Any] = {"class_names": (), "depth_kind": network.depth_kind}
-        tried = DistanceNetwork(network.network, network.depth_kind)
-        for sentence in try_depth(network):
-            remark(sentence)
-    else:
-        kind, count = try_network(replace(network, score_kind=score_kind or network.score_kind))
+    fixed = image_size or only_size
+    size = fixed or network.image_size
+    output = _output(network, size)
+    described: dict[str, Any] = {
+        "class_names": (),
+        "predicts": DISTANCE,
+        "depth_kind": network.depth_kind,
+    }
+    if network.depth_kind is None:
+        kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
+        count = output.shape[1]
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
-        outputs = {"class_names": tuple(names), "groups": groups, "score_kind": kind}
-        tried = ClassScoreNetwork(network.network, len(names) - 1, groups, kind=kind)
-    multiple = None if network.fixed_size else size_multiple_of(tried, 3)
-    # A network of a fixed size gets square images of its longer side, see `LoadedNetwork`.
-    side = min(network.image_size) if multiple else max(network.image_size)
-    seen = photo_network_settings(side, levels, base_level, views)
-    size = build_from_config(seen, "representation").image_size
-    described = LoadedNetwork(
-        module=network.network,
-        **outputs,
+        described = {"class_names": names, "groups": groups, "score_kind": kind}
+        described["predicts"] = PIXEL_CLASSES
+    # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
+    seen = photo_network_settings(max(size) if fixed else min(size), levels, base_level, views)
+    loaded = LoadedNetwork(
+        module=network.module,
+        **described,
         inputs=("rgb",),
         normalization=network.normalization,
         level=seen["level"],
         representation=seen,
-        image_size=size,
-        size_multiple=multiple or 1,
-        fixed_size=None if multiple else network.image_size,
-        photo_level=_photo_level(network.image_size[1], fov_deg),
+        image_size=build_from_config(seen, "representation").image_size,
+        size_multiple=multiple,
+        fixed_size=fixed,
+        photo_level=_photo_level(size[1], fov_deg),
         settings=network.settings,
     )
-    check_size(described, described.image_size)
-    network_for_views(described.network, seen.get("distortion_aware"))  # refused before it is used
+    check_size(loaded, loaded.image_size)
+    network_for_views(loaded.network, seen.get("distortion_aware"))  # refused before it is used
     with atomic_path(path) as temporary:
-        if isinstance(network.network, OnnxNetwork):
-            write_metadata(network.network.path, temporary, described)
+        if isinstance(network.module, OnnxNetwork):
+            write_onnx_description(network.module.path, temporary, loaded)
         else:
-            _write_checkpoint(described, temporary)
+            _write_checkpoint(loaded, temporary)
         # The classes are from the user.
-        trained = load_network(temporary, unregistered(network.settings))
-    source = None if trained.source is None else replace(trained.source, path=path)
-    return replace(trained, source=source)
+        loaded = load_network(temporary, unregistered(network.settings))
+    return loaded
+
+
+@torch.no_grad()
+def _output(network: PhotoNetwork, size: tuple[int, int]) -> Tensor:
+    """Return the output ``(1, K, h, w)`` for an image of noise; label maps and depth have K = 1."""
+    image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
+    mean, std = (
+        torch.tensor(values, dtype=torch.float32)[:, None, None]
+        for values in (network.normalization.mean, network.normalization.std)
+    )
+    try:
+        output = plain_scores(network.module.eval()((image - mean) / std)).float()
+    except Exception as error:  # networks raise many kinds about images that they do not take
+        raise SettingError(
+            "network",
+            found=f"{type(error).__name__} ({first_line(error)}) for an RGB image of "
+            f"{width_height(size)}",
+            expected="scores, labels or depth",
+            remedy="If it needs another size, set image_size=[rows,columns].",
+        ) from error
+    output = output if output.ndim == image.ndim else output[:, None]
+    fits = output.shape[2:] == size and (network.depth_kind is None or output.shape[1] == 1)
+    if not fits or not output.isfinite().any():
+        raise SettingError(
+            "output of the network",
+            found=f"{tuple(output.shape)}, {int(output.isfinite().sum())} numbers are finite",
+            expected=f"scores (1, K, {size[0]}, {size[1]}); labels or depth with K = 1",
+        )
+    return output
+
+
+def usual_kind(output: Tensor, named: int) -> ScoreKind:
+    """Return the kind of output of an ONNX file if the user does not state it.
+
+    Values between 0 and 1 that sum to one over the classes are probabilities. One whole number per
+    pixel is a label, if there are more than two names.
+
+    Args:
+        output: Output for one image, ``(1, K, h, w)``.
+        named: Number of class names.
+    """
+    if output.shape[1] == 1 and named > _MASK_NAMES:
+        return "labels"
+    is_share = bool((output >= 0).all() and (output <= 1).all())
+    has_unit_sums = bool(((output.sum(dim=1) - 1).abs() < _ROUNDED).all())
+    return "probabilities" if is_share and (has_unit_sums or output.shape[1] == 1) else "logits"
 
 
 def _photo_level(columns: int, fov_deg: float) -> int:
@@ -153,67 +195,52 @@ def _groups(
     kind: ScoreKind,
     count: int,
     unknown_classes: Collection[str],
-    wins: bool,
+    unknown_wins: bool,
 ) -> tuple[list[str], Groups | None]:
-    """Return the names of the labels, and the scores of each, see `LoadedNetwork.groups`."""
-    score_names = list(map(composed, score_names))
-    unknown_classes = set(map(composed, unknown_classes))
-    if missing := unknown_classes - set(score_names):
+    """Return names of the labels, and the scores of each, see `NetworkDescription.groups`."""
+    score_names, unknown = list(map(composed, score_names)), set(map(composed, unknown_classes))
+    if missing := unknown - set(score_names):
         raise SettingError(
             "unknown_classes",
             found=", ".join(sorted(missing)),
             expected=f"names among {', '.join(score_names)}",
         )
     scores, rest = _scores_of(len(score_names), kind, count)
-    named = list(zip(scores, score_names, strict=True))
-    kept = [(k, name) for k, name in named if name not in unknown_classes]
-    if not kept:
-        raise SettingError("unknown_classes", found="all classes", expected="a part of them")
-    if not wins and (len(kept) == 1 or kind == "labels"):
+    classes = {name: k for k, name in zip(scores, score_names, strict=True) if name not in unknown}
+    if not classes or (not unknown_wins and (len(classes) == 1 or kind == "labels")):
         raise SettingError(
-            "unknown_wins",
-            found=f"false, for {kept[0][1]} alone" if len(kept) == 1 else "false, for label maps",
-            expected="true, because the network has no other class to predict",
+            "unknown_classes",
+            found=f"{', '.join(sorted(unknown)) or 'none'} with unknown_wins={unknown_wins}",
+            expected="other classes that can be predicted; unknown_wins=true for label maps",
         )
-    rest += [k for k, name in named if name in unknown_classes]
-    names = ["unknown", *(name for _, name in kept)]
-    if kind in ("logits", "probabilities") and not unknown_classes:
+    rest = rest + [k for k, name in zip(scores, score_names, strict=True) if name in unknown]
+    names = ["unknown", *classes]
+    if not rest and scores == list(range(count)):
         return names, None
-    return names, [[k] for k, _ in kept] + ([rest] if rest and wins else [])
+    return names, [[k] for k in classes.values()] + ([rest] if rest and unknown_wins else [])
 
 
 def _scores_of(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:
     """Return indices of the named classes' scores, and of scores without a class, see `ScoreKind`.
 
-    A single score, or labels with one name, belong to a class and its background. Of two names for
-    a single score, the first is the background.
+    Of two names for a single score, the first is the background.
     """
-    indices = list(range(named))
     if kind == "labels":
-        return ([1], [0, 2]) if named == 1 else (indices, [named])
-    independent = kind in ("sigmoid_logits", "sigmoid")
-    if independent and (count, named) == (1, 2):
-        return [1, 0], []
+        return list(range(named)), [named]
+    if count == 1 and named <= _MASK_NAMES:
+        return ([0], [1]) if named == 1 else ([1, 0], [])
     if named != count:
         raise SettingError(
             "class names of the network",
             found=f"{named}, for {count} score{'s' * (count > 1)}",
-            expected="one for each score"
-            + (", or two for one score, the background first" if count == 1 else ""),
+            expected="one for each score, or two for a single score, the background first",
         )
-    return indices, [count] if independent else []
+    return list(range(count)), []
 
 
-def _write_checkpoint(described: LoadedNetwork, path: Path) -> None:
-    content = metadata_of(described)
-    names = ("settings", "representation", "level")
-    network, representation, level = (content.pop(name) for name in names)
-    content |= {
-        "config": {"network": network, "representation": representation, "level": level},
-        "predicts": described.predicts,
-        "state_dict": {
-            name: t.contiguous().float() if t.is_floating_point() else t
-            for name, t in described.network.state_dict().items()
-        },
+def _write_checkpoint(loaded: LoadedNetwork, path: Path) -> None:
+    tensors = {
+        f"network.{name}": t.contiguous().float() if t.is_floating_point() else t
+        for name, t in loaded.module.state_dict().items()
     }
-    torch.save(content, path)
+    torch.save({METADATA_KEY: loaded.plain(), "state_dict": tensors}, path)

@@ -11,7 +11,6 @@ from torch import nn
 
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.config.build import is_class_name
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 
@@ -24,29 +23,24 @@ class PhotoNetwork:
     """A trained network for photos.
 
     Attributes:
-        network: Maps normalized RGB images ``(B, 3, h, w)`` to scores ``(B, K, h, w)``, to a dict
+        module: Maps normalized RGB images ``(B, 3, h, w)`` to scores ``(B, K, h, w)``, to a dict
             that contains them under ``"out"``, to label maps ``(B, h, w)``,
-            or to depth ``(B, 1, h, w)`` or ``(B, h, w)``.
+            or to depth ``(B, 1, h, w)`` or ``(B, h, w)``; see also `declared_sizes`.
         settings: Section of a config that builds the network; None for an ONNX file.
         score_names: Name of each score; none for depth.
         normalization: Normalization of the images.
         image_size: Rows and columns of the training images.
-        fixed_size: True if the network only takes images of this size.
-        score_kind: Kind of the network's output if its library declares it; None to find it by
-            trial.
+        score_kind: Kind of the network's output if its library declares it, see `usual_kind`.
         depth_kind: Kind of depth that the network predicts; None for classes.
-        remarks: Sentences to print for the user.
     """
 
-    network: nn.Module
+    module: nn.Module
     settings: Mapping[str, Any] | None
     score_names: Sequence[str]
     normalization: Normalization
     image_size: tuple[int, int] = USUAL_SIZE
-    fixed_size: bool = False
     score_kind: ScoreKind | None = None
     depth_kind: DepthKind | None = None
-    remarks: Sequence[str] = ()
 
 
 def class_names_in(path: Path | None, depth: DepthKind | None = None) -> tuple[str, ...]:
@@ -88,6 +82,6 @@ def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
     names = content if isinstance(content, list) else []
     if isinstance(content, dict):
         names = [content.get(str(index)) for index in range(len(content))]
-    if not names or not all(name and is_class_name(name) for name in names):
+    if not names or not all(isinstance(name, str) and name for name in names):
         raise DataError(path, found=str(content)[:80], expected=expected)
     return tuple(names)

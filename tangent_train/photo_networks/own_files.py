@@ -9,7 +9,7 @@ from typing import Any
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from models.pretrained import load_tensors, tensors_for
-from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.loaded import completed_settings
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
@@ -39,12 +39,11 @@ def load_onnx(
         raise SettingError("file", found="none", expected="an ONNX file")
     network = OnnxNetwork(file)
     return PhotoNetwork(
-        network=network,
+        module=network,
         settings=None,
         score_names=class_names_in(classes, depth),
         normalization=Normalization.of(normalization, 3),
-        image_size=network.image_size or USUAL_SIZE,
-        fixed_size=network.image_size is not None,
+        image_size=network.fixed_size or USUAL_SIZE,
         depth_kind=depth,
     )
 
@@ -77,4 +76,5 @@ def load_config(
     network = build_from_config(whole, "network")
     load_tensors(network, tensors_for(network, Path(weights)), weights)
     normalized = Normalization.of(normalization, 3)
-    return PhotoNetwork(network, whole, names, normalized, depth_kind=depth)
+    kind: ScoreKind | None = None if depth else "logits"
+    return PhotoNetwork(network, whole, names, normalized, score_kind=kind, depth_kind=depth)

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from models.pretrained import read_tensors
@@ -66,14 +64,11 @@ def json_in(folder: Path, name: str) -> dict[str, Any]:
     return content
 
 
-def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
-    """Read the weights of a saved model.
+def tensors_in(folder: Path) -> dict[str, Tensor]:
+    """Read the weights of a saved model by name, floats as float32.
 
     Args:
         folder: Folder of the model.
-
-    Returns:
-        Tensors by name, floats as float32; and remarks to print for the user.
 
     Raises:
         DataError: There are no safetensors files, or they are unreadable.
@@ -81,16 +76,12 @@ def tensors_in(folder: Path) -> tuple[dict[str, Tensor], Sequence[str]]:
     whole = folder / _WEIGHTS
     paths = [whole] if whole.is_file() else sorted(folder.glob(_SHARDS))
     if not paths:
-        others = [path.name for path in sorted(folder.glob("*.bin"))]
         raise DataError(
             folder,
-            found=f"{', '.join(others) or 'no weights'}, no {_WEIGHTS}",
+            found=f"no {_WEIGHTS}",
             expected="weights as safetensors: reading other formats may run code",
             remedy="If you trust the files, load them with from_pretrained(…) of their library and "
             "write them with save_pretrained(…), which creates safetensors.",
         )
     tensors = {name: t for path in paths for name, t in read_tensors(path)[""].items()}
-    floats = {name: t for name, t in tensors.items() if t.is_floating_point()}
-    kinds = sorted({str(t.dtype).removeprefix("torch.") for t in floats.values()} - {"float32"})
-    remarks = [f"weights as {', '.join(kinds)} are stored as float32"] if kinds else []
-    return tensors | {name: t.to(torch.float32) for name, t in floats.items()}, remarks
+    return {n: t.float() if t.is_floating_point() else t for n, t in tensors.items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 from datamodules.core.inputs import Normalization
 from models.pretrained import load_tensors
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.imports import offline
 from tangent_train.photo_networks.network import PhotoNetwork, class_names_in
@@ -48,18 +48,17 @@ def load(*, model: str | None, classes: Path | None, normalization: Any) -> Phot
             found=f"in_channels: {config['in_channels']}",
             expected="3: photo networks only get RGB images",
         )
-    network = build_from_config(settings, "network", SettingsFile(path))
+    network = build_from_file(settings, "network", path)
     given = None if normalization is None else Normalization.of(normalization, 3)
-    tensors, remarks = tensors_in(folder)
+    tensors = tensors_in(folder)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_HEAD_OF_IMAGES)}
     load_tensors(network, tensors, folder)
     return PhotoNetwork(
-        network=network,
+        module=network,
         settings=settings,
         score_names=class_names_in(classes),
         normalization=given or _of_encoder(config),
-        score_kind="sigmoid_logits" if "sigmoid" in str(config.get("activation")) else "logits",
-        remarks=remarks,
+        score_kind="logits",
     )
 
 

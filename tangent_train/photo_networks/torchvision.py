@@ -60,7 +60,7 @@ def load(
     load_tensors(network, tensors, weights)
     default = Normalization(preset.mean, preset.std)
     return PhotoNetwork(
-        network=network,
+        module=network,
         settings=settings,
         score_names=names,
         normalization=default if normalization is None else Normalization.of(normalization, 3),

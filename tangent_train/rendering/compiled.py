@@ -4,32 +4,21 @@ Compiled loops are serial and release the GIL; `over_rows` runs them on several 
 parallel loops are not used: its OpenMP layer kills worker processes forked after its first use, and
 its portable layer crashes when two threads use it at once.
 
-Compiled code is cached in a folder named after a checksum of its source file, so a loop must not
-call compiled functions of another file. The cache contains pickles, so only the user may have
-access to the folder. If that cannot be ensured, loops are compiled in every process.
+Numba caches compiled code by the source file of a loop, so a loop must not call compiled functions
+of another file.
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from functools import partial
 from itertools import pairwise
-from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Any, TypeVar
-from zlib import crc32
+from typing import Any
 
 import torch
-from numba import config, njit
+from numba import njit
 from numba.core.compiler import Compiler
-
-from tangent_train.imports import is_private
-
-config._config_fname = ""  # numba would read .numba_config.yaml here at every compilation
-
-Function = TypeVar("Function", bound=Callable[..., Any])
 
 _SMALLEST_SHARE = 2**15
 """Number of pixels from which another thread saves time."""
@@ -46,48 +35,16 @@ class _Restrict(Compiler):  # type: ignore[misc]
         return super().define_pipelines()
 
 
-def cache_folder() -> Path | None:
-    """Return the folder for compiled code, in ``NUMBA_CACHE_DIR`` or else in the user's cache.
+njit_exact: Any = partial(njit, nogil=True, cache=True, error_model="numpy")
+"""Compiles with IEEE arithmetic."""
 
-    Returns:
-        The folder; None if it cannot be written, or if other users have access to it.
-    """
-    with suppress(OSError, RuntimeError):  # no home
-        users = Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache").expanduser()
-        folder = Path(os.environ.get("NUMBA_CACHE_DIR") or users).absolute() / "tangent-train"
-        folder.mkdir(0o700, parents=True, exist_ok=True)
-        TemporaryFile(dir=folder).close()
-        if is_private(folder):
-            return folder
-    return None
+njit_fast: Any = partial(
+    njit_exact, fastmath={"contract", "reassoc", "nsz", "arcp"}, pipeline_class=_Restrict
+)
+"""Compiles with reordered arithmetic; infinities and NaN keep their meaning.
 
-
-_CACHE = cache_folder()
-
-
-def njit_exact(function: Function) -> Function:
-    """Compile with IEEE arithmetic."""
-    return _compiled(function)
-
-
-def njit_fast(function: Function) -> Function:
-    """Compile with reordered arithmetic; infinities and NaN keep their meaning.
-
-    Arrays that the function writes must not overlap its other arguments.
-    """
-    flags = {"contract", "reassoc", "nsz", "arcp"}
-    return _compiled(function, fastmath=flags, pipeline_class=_Restrict)
-
-
-def _compiled(function: Function, **settings: Any) -> Function:
-    loop = njit(nogil=True, error_model="numpy", **settings)(function)
-    if _CACHE is not None:
-        # A folder for each version of the file: numba unpickles outdated code before it checks it.
-        source = Path(function.__code__.co_filename).read_bytes()
-        users, config.CACHE_DIR = config.CACHE_DIR, str(_CACHE / f"{crc32(source):08x}")
-        loop.enable_caching()
-        config.CACHE_DIR = users
-    return loop
+Arrays that the function writes must not overlap its other arguments.
+"""
 
 
 def over_rows(kernel: Callable[..., None], rows: int, width: int, *arguments: Any) -> None:

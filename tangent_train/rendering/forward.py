@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,23 +15,19 @@ from tangent_train.geometry.pinhole_grid import Faces
 from tangent_train.rendering.checks import check_panorama
 from tangent_train.rendering.sampling import (
     EquirectMap,
-    bilinear_equirect_taps,
-    equirect_map,
     map_dtype,
     nearest_equirect_index,
-    sample,
+    positions_of_rays,
     sample_map,
+    sample_tensor,
     sphere_rays,
 )
-from tangent_train.rendering.tables import forward_map, forward_positions, tensors_on
+from tangent_train.rendering.tables import Positions, forward_map, forward_positions
 
 Interpolation = Literal["bilinear", "nearest"]
 
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 """A tensor or an array; results are of the same kind."""
-
-_CHUNK = 2**20
-"""Number of positions whose taps torch holds at once."""
 
 _TOGETHER = 2**16
 """Number of pixels sampled in one call: small images are grouped, to save calls."""
@@ -63,62 +59,36 @@ def equirect_to_tangent(
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
     check_panorama(image, interpolation)
-    indices = grid.face_indices(faces)
+    indices, (rows, columns) = grid.face_indices(faces), grid.size
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
-    together = faces is None or grid.rotation is not None
-    pixels = _CHUNK if isinstance(image, Tensor) else _TOGETHER
-    rows, columns = grid.size
-    step = max(1, pixels // max(rows * columns, 4 * rows)) if together else 1
+    is_together = faces is None or grid.rotation is not None
     if isinstance(image, Tensor):
-        return _render_tensor(image, grid, indices, step, interpolation)
+        step = len(indices) if is_together else 1
+        positions = [
+            forward_positions(grid, image, part, interpolation)
+            for part in np.split(indices, range(step, len(indices), max(1, step)))
+        ]
+        u, v = (torch.cat(lines) for lines in zip(*positions, strict=True))
+        values = _sampled(image, (u, v), interpolation)
+        return values.unflatten(-1, (len(indices), rows, columns)).movedim(-3, -4)
     image = np.ascontiguousarray(image)
-    shape = image.shape[0], image.shape[1]
+    step = max(1, _TOGETHER // max(rows * columns, 4 * rows)) if is_together else 1
     out = np.empty((len(indices) * rows, columns, *image.shape[2:]), image.dtype)
     dtype = map_dtype(image.dtype == np.float64, interpolation)
     for start in range(0, len(indices), step):
-        table = forward_map(grid, shape, indices[start : start + step], dtype)
-        part = out[start * rows : (start + step) * rows]
-        sample_map(table, image, interpolation, part)
+        faces = indices[start : start + step]
+        table = forward_map(grid, (image.shape[0], image.shape[1]), faces, dtype)
+        sample_map(table, image, interpolation, out[start * rows : (start + step) * rows])
     return out.reshape(len(indices), rows, *out.shape[1:])
 
 
-def _render_tensor(
-    image: Tensor,
-    grid: PinholeGrid,
-    indices: NDArray[np.int64],
-    step: int,
-    interpolation: Interpolation,
-) -> Tensor:
-    *batch, channels, height, width = image.shape
-    source = image.reshape(-1, height * width)
-    dtype = map_dtype(image.dtype == torch.float64, interpolation)
-    chunks = [image.new_empty((*batch, 0, channels, *grid.size))]
-    rows, columns = grid.size
-    at_once = max(step, _CHUNK // (rows * columns))  # on a GPU, many small calls take longer
-    for start in range(0, len(indices), at_once):
-        faces = indices[start : start + at_once].tolist()
-        tables = []
-        for first in range(0, len(faces), step):
-            part = tuple(faces[first : first + step])
-            # On the CPU the map itself is already cached.
-            key = None if image.device.type == "cpu" else ("forward", (height, width), part, dtype)
-            build = partial(forward_positions, grid, (height, width), part, dtype)
-            tables.append(tensors_on(image.device, grid, key, build))
-        u, v = (torch.cat(lines) for lines in zip(*tables, strict=True))
-        values = _sampled(source, u, v, (height, width), interpolation)
-        images = values.reshape(*batch, channels, len(faces), *grid.size)
-        chunks.append(images.movedim(-3, -4))
-    return torch.cat(chunks, dim=-4)
-
-
-def _sampled(
-    source: Tensor, u: Tensor, v: Tensor, shape: tuple[int, int], interpolation: Interpolation
-) -> Tensor:
-    """Return values ``(S, P)`` of a source ``(S, H W)`` at P columns and rows."""
+def _sampled(image: Tensor, positions: Positions, interpolation: Interpolation) -> Tensor:
+    """Return values ``(..., P)`` of a panorama ``(..., H, W)`` at P columns and rows."""
+    u, v = positions
+    shape = image.shape[-2], image.shape[-1]
     if interpolation == "nearest":
-        index = nearest_equirect_index(u, v, shape)
-        return source.gather(1, index.expand(len(source), -1))
-    return sample(source, bilinear_equirect_taps(u, v, shape))
+        return image.flatten(-2)[..., nearest_equirect_index(u, v, shape)]
+    return sample_tensor(image.reshape(-1, *shape), u, v).reshape(*image.shape[:-2], -1)
 
 
 def rotate_equirect(
@@ -140,17 +110,12 @@ def rotate_equirect(
     """
     check_panorama(image, interpolation)
     rotated = checked_rotation(rotation).tobytes()
+    is_exact = image.dtype in (torch.float64, np.float64)
+    height, width = image.shape[-2:] if isinstance(image, Tensor) else image.shape[:2]
+    table = _rotation_map(rotated, (height, width), map_dtype(is_exact, interpolation))
     if isinstance(image, Tensor):
-        shape = image.shape[-2], image.shape[-1]
-        dtype = map_dtype(image.dtype == torch.float64, interpolation)
-        positions = _rotation_map(rotated, shape, dtype).in_panorama()
-        on_device = (torch.from_numpy(line).to(image.device) for line in positions)
-        u, v = (torch.split(line, _CHUNK) for line in on_device)
-        source = image.reshape(-1, shape[0] * shape[1])
-        parts = [_sampled(source, *at, shape, interpolation) for at in zip(u, v, strict=True)]
-        return torch.cat(parts, dim=1).reshape(image.shape)
-    dtype = map_dtype(image.dtype == np.float64, interpolation)
-    table = _rotation_map(rotated, (image.shape[0], image.shape[1]), dtype)
+        u, v = (torch.from_numpy(line.ravel()).to(image.device) for line in table[:2])
+        return _sampled(image, (u, v), interpolation).reshape(image.shape)
     out = np.empty_like(image, order="C")
     sample_map(table, np.ascontiguousarray(image), interpolation, out)
     return out
@@ -162,4 +127,4 @@ def _rotation_map(
 ) -> EquirectMap:
     """Return source positions of all pixels; cached for the depth and labels of a panorama."""
     inverse = np.frombuffer(rotation).reshape(1, 3, 3).transpose(0, 2, 1)
-    return equirect_map(inverse, sphere_rays(shape), shape, dtype)
+    return EquirectMap.of(*positions_of_rays(inverse, sphere_rays(shape), shape, dtype), shape)

@@ -6,8 +6,8 @@ homogeneous pixels, proportional to ``(u, v, 1)``; a ray is in front of the imag
 number is positive.
 
 Sums are arrays ``(H, W, Kp)``: the K scores of a pixel are adjacent in memory, followed by zeros up
-to a multiple of `LANES`, so that loops over them compile to vector code without a remainder. One or
-two channels, such as depth and its weight, take 2 numbers.
+to a multiple of `LANES`, so that loops over them compile to vector code without a remainder. Up to
+`_FEW` channels, such as depth and its weight, have no zeros.
 """
 
 from __future__ import annotations
@@ -18,12 +18,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.rendering.compiled import njit_exact, njit_fast
+from tangent_train.rendering.compiled import njit_fast
 
 LANES = 16
-"""Kp, the number of scores stored per pixel, is a multiple of this, or `_PAIR`."""
-
-_PAIR = 2
+_FEW = 4
 
 _TILE_SCORES = 2**18
 """Number of sums in a tile: they fit into the processor's cache."""
@@ -36,6 +34,10 @@ _FLUSHED = np.float32(-40)
 Array = NDArray[Any]
 Tile = tuple[int, int, int, int]
 """First row and the one after the last, first column and the one after the last."""
+
+
+NO_OWNERS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
+NO_SPANS: NDArray[np.int32] = np.empty((0, 0, 2), np.int32)
 
 
 class CanvasGeometry(NamedTuple):
@@ -63,6 +65,9 @@ class CanvasGeometry(NamedTuple):
 class _TileBuffers(NamedTuple):
     """Buffers for the pixels of a tile that an image contributes to, and for runs of pixels.
 
+    Scores are interpolated between four pixels of the image with the weights a (upper left), b
+    (upper right), c (lower left) and d (lower right).
+
     Attributes:
         pixel: Index at which the result of each pixel is stored.
         u: Column in the image.
@@ -72,6 +77,11 @@ class _TileBuffers(NamedTuple):
         row: Integer part of the row.
         right: Fractional part of the column.
         below: Fractional part of the row.
+        first: Index of the upper left pixel of the four.
+        a: Weight of the upper left pixel.
+        b: Weight of the upper right pixel.
+        c: Weight of the lower left pixel.
+        d: Weight of the lower right pixel.
         runs: ``(n, 4)`` image, row of the canvas, first column and the one after the last.
     """
 
@@ -83,31 +93,18 @@ class _TileBuffers(NamedTuple):
     row: Array
     right: Array
     below: Array
-    runs: Array
-
-
-class _Taps(NamedTuple):
-    """The four pixels of a patch around each position, and their weights.
-
-    Attributes:
-        first: Index of the upper left pixel.
-        a: Weight of the upper left pixel.
-        b: Weight of the upper right pixel.
-        c: Weight of the lower left pixel.
-        d: Weight of the lower right pixel.
-    """
-
     first: Array
     a: Array
     b: Array
     c: Array
     d: Array
+    runs: Array
 
 
 @njit_fast
 def padded(channels: int) -> int:
     """Return the number Kp of numbers that are stored for some channels."""
-    return _PAIR if channels <= _PAIR else -(-channels // LANES) * LANES
+    return channels if channels <= _FEW else -(-channels // LANES) * LANES
 
 
 @njit_fast
@@ -153,16 +150,11 @@ def _tile_buffers(pixels: int) -> _TileBuffers:
     u, v, weight = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     column, row = np.empty(pixels, np.int32), np.empty(pixels, np.int32)
     right, below = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    pixel, runs = np.empty(pixels, np.int64), np.empty((pixels, 4), np.int32)
-    return _TileBuffers(pixel, u, v, weight, column, row, right, below, runs)
-
-
-@njit_fast
-def _tap_buffers(pixels: int) -> _Taps:
-    """Return buffers for the taps of a tile."""
     a, b = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
     c, d = np.empty(pixels, np.float32), np.empty(pixels, np.float32)
-    return _Taps(np.empty(pixels, np.int32), a, b, c, d)
+    pixel, first = np.empty(pixels, np.int64), np.empty(pixels, np.int32)
+    runs = np.empty((pixels, 4), np.int32)
+    return _TileBuffers(pixel, u, v, weight, column, row, right, below, first, a, b, c, d, runs)
 
 
 @njit_fast
@@ -290,22 +282,20 @@ def _split(n: int, side: tuple[int, int], buffers: _TileBuffers) -> tuple[int, i
 
 
 @njit_fast
-def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers, taps: _Taps) -> None:
-    """Write the taps of n pixels.
+def _weigh(n: int, step: tuple[int, int], buffers: _TileBuffers) -> None:
+    """Write the weights for the interpolation of n pixels.
 
     Args:
         n: Number of pixels.
         step: Distance between rows of the patch, and index of pixel (0, 0) of the image in it.
-        buffers: Columns, rows and weights of the pixels.
-        taps: Taps of the pixels, written.
+        buffers: Contains columns, rows and weights of the pixels; `first` and a to d are written.
     """
-    first, a, b, c, d = taps
     for p in range(n):
-        first[p] = buffers.row[p] * step[0] + buffers.column[p] + step[1]
+        buffers.first[p] = buffers.row[p] * step[0] + buffers.column[p] + step[1]
         lower = np.float32(buffers.weight[p]) * buffers.below[p]
         upper = np.float32(buffers.weight[p]) - lower
-        b[p], d[p] = buffers.right[p] * upper, buffers.right[p] * lower
-        a[p], c[p] = upper - b[p], lower - d[p]
+        b, d = buffers.right[p] * upper, buffers.right[p] * lower
+        buffers.a[p], buffers.b[p], buffers.c[p], buffers.d[p] = upper - b, b, lower - d, d
 
 
 @njit_fast
@@ -375,40 +365,33 @@ def _copy_patch(scores: Array, left: int, top: int, softmax: bool, patch: Array)
 
 @njit_fast
 def _add_samples(
-    patch: Array, width: int, blocks: int, taps: _Taps, pixel: Array, sums: Array
+    n: int, patch: Array, width: int, classes: int, buffers: _TileBuffers, sums: Array
 ) -> None:
     """Add weighted bilinear samples of a patch to sums.
 
     Args:
+        n: Number of pixels.
         patch: Scores of a part of an image, flat.
         width: Pixels in a row of the patch.
-        blocks: ``Kp / LANES``, so that the compiler can rely on a multiple of `LANES`.
-        taps: Taps of n pixels.
-        pixel: ``(n,)`` index of each pixel's sums.
+        classes: Kp.
+        buffers: Contains the pixels and their weights.
         sums: ``(h, w, Kp)`` sums, flat, changed.
     """
-    classes = np.uint64(LANES) * np.uint64(blocks)
-    below = classes * np.uint64(width)
-    for p in range(len(pixel)):
-        at, to = classes * np.uint64(taps.first[p]), classes * np.uint64(pixel[p])
-        a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
-        for k in range(classes):
-            upper = a * patch[at + k] + b * patch[at + classes + k]
-            lower = c * patch[at + below + k] + d * patch[at + below + classes + k]
-            sums[to + k] += upper + lower
-
-
-@njit_fast
-def _add_pairs(patch: Array, width: int, taps: _Taps, pixel: Array, sums: Array) -> None:
-    """Add samples of two channels, see `_add_samples`."""
-    below = np.uint64(_PAIR) * np.uint64(width)
-    for p in range(len(pixel)):
-        at, to = np.uint64(_PAIR) * np.uint64(taps.first[p]), np.uint64(_PAIR) * np.uint64(pixel[p])
-        a, b, c, d = taps.a[p], taps.b[p], taps.c[p], taps.d[p]
-        for k in range(np.uint64(_PAIR)):
-            upper = a * patch[at + k] + b * patch[at + np.uint64(_PAIR) + k]
-            lower = c * patch[at + below + k] + d * patch[at + below + np.uint64(_PAIR) + k]
-            sums[to + k] += upper + lower
+    blocks = classes // LANES  # so that the compiler can rely on a multiple of `LANES`
+    padded_classes = np.uint64(LANES) * np.uint64(blocks)
+    for p in range(n):
+        at, to = np.uint64(classes * buffers.first[p]), np.uint64(classes * buffers.pixel[p])
+        right, below = at + np.uint64(classes), at + np.uint64(classes * width)
+        diagonal = below + np.uint64(classes)
+        a, b, c, d = buffers.a[p], buffers.b[p], buffers.c[p], buffers.d[p]
+        if blocks == 0:
+            for k in range(np.uint64(classes)):
+                upper = a * patch[at + k] + b * patch[right + k]
+                sums[to + k] += upper + c * patch[below + k] + d * patch[diagonal + k]
+        else:
+            for k in range(padded_classes):
+                upper = a * patch[at + k] + b * patch[right + k]
+                sums[to + k] += upper + c * patch[below + k] + d * patch[diagonal + k]
 
 
 @njit_fast
@@ -488,7 +471,7 @@ def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -
 @njit_fast
 def _add_to_tile(
     tile: Tile, scores: Array, canvas: CanvasGeometry, softmax: bool, step: tuple[int, int],
-    owns: Array, buffers: _TileBuffers, taps: _Taps, patch: Array, sums: Array,
+    owns: Array, buffers: _TileBuffers, patch: Array, sums: Array,
 ) -> Array:  # fmt: skip
     """Add weighted scores of images to the sums of a tile.
 
@@ -500,7 +483,6 @@ def _add_to_tile(
         step: See `_list_pixels`.
         owns: Buffer for all images, True at first.
         buffers: Buffers for the tile's pixels.
-        taps: Buffers for the taps.
         patch: Buffer for a part of an image.
         sums: ``(h, w, Kp)`` sums, changed.
 
@@ -520,15 +502,11 @@ def _add_to_tile(
         if n == 0:
             continue
         top, left, high, wide = _split(n, side, buffers)
-        _weigh(n, (wide, -top * wide - left), buffers, taps)
+        _weigh(n, (wide, -top * wide - left), buffers)
         size = high * wide * classes
         patch = _at_least(patch, size)
-        part, blocks = patch[:size], classes // LANES  # 0 for pairs
-        _copy_patch(scores[m], left, top, softmax, part.reshape((high, wide, classes)))
-        if blocks == 0:
-            _add_pairs(part, wide, taps, buffers.pixel[:n], sums.reshape(-1))
-        else:
-            _add_samples(part, wide, blocks, taps, buffers.pixel[:n], sums.reshape(-1))
+        _copy_patch(scores[m], left, top, softmax, patch[:size].reshape((high, wide, classes)))
+        _add_samples(n, patch, wide, classes, buffers, sums.reshape(-1))
     return patch
 
 
@@ -563,7 +541,7 @@ def add_images(
     for image in canvas.images:
         covered[image] = True
     pixels = max(64, _TILE_SCORES // max(LANES, classes))
-    buffers, taps, patch = _tile_buffers(pixels), _tap_buffers(pixels), np.empty(0, np.float32)
+    buffers, patch = _tile_buffers(pixels), np.empty(0, np.float32)
     of_tile = np.empty(0, np.float32)
     for tile in _tiles(start, stop, canvas, pixels):
         top, bottom, left, right = tile
@@ -575,7 +553,7 @@ def add_images(
             sums[:] = 0
             step = wide, -top * wide - left
         before = softmax and not afterwards
-        patch = _add_to_tile(tile, scores, canvas, before, step, owns, buffers, taps, patch, sums)
+        patch = _add_to_tile(tile, scores, canvas, before, step, owns, buffers, patch, sums)
         if len(total) == 0:
             for i in range(top, bottom):
                 _write_classes(sums[i - top], num_classes, 0.0, labels[i, left:right])
@@ -617,14 +595,14 @@ def _best_of_part(scores: Array, left: int, top: int, highest: Array, best: Arra
 
 @njit_fast
 def _interpolated_classes(
-    scores: Array, count: int, taps: _Taps, highest: Array, best: Array
+    scores: Array, count: int, buffers: _TileBuffers, highest: Array, best: Array
 ) -> None:
     """Write classes of the largest interpolated scores; the first of equal ones, no NaN.
 
     Args:
         scores: ``(K, h, w)`` scores of an image.
         count: Number of pixels n.
-        taps: Taps of the pixels, in the image.
+        buffers: Contains the pixels and their weights.
         highest: Buffer.
         best: Class indices of the pixels, written.
     """
@@ -633,9 +611,9 @@ def _interpolated_classes(
     for k in range(len(scores)):
         plane, label = scores[k].reshape(-1), np.int32(k)
         for p in range(np.uint64(count)):
-            at = np.uint64(taps.first[p])
-            score = taps.a[p] * plane[at] + taps.b[p] * plane[at + right]
-            score += taps.c[p] * plane[at + below] + taps.d[p] * plane[at + below + right]
+            at = np.uint64(buffers.first[p])
+            score = buffers.a[p] * plane[at] + buffers.b[p] * plane[at + right]
+            score += buffers.c[p] * plane[at + below] + buffers.d[p] * plane[at + below + right]
             better = score > highest[p]
             best[p] = label if better else best[p]
             highest[p] = score if better else highest[p]
@@ -645,7 +623,7 @@ def _interpolated_classes(
 def _write_alike(
     n: int, best: Array, corner: tuple[int, int], buffers: _TileBuffers, labels: Array
 ) -> int:
-    """Write labels of pixels whose four taps in the image have the same best class.
+    """Write labels of pixels between four pixels of the image with the same best class.
 
     Args:
         n: Number of pixels.
@@ -678,8 +656,8 @@ def label_images(
 ) -> None:
     """Write the best classes of the pixels that images own, in rows ``start:stop`` of a canvas.
 
-    Where the four taps of a position have the same best class, it is also the best class of the
-    interpolated scores. Only the other positions are interpolated.
+    Where the four pixels around a position have the same best class, it is also the best class of
+    the interpolated scores. Only the other positions are interpolated.
 
     Args:
         start: First row.
@@ -689,11 +667,7 @@ def label_images(
         labels: ``(H, W)`` class indices, written.
     """
     side, width, pixels = (scores.shape[2], scores.shape[3]), labels.shape[1], _TILE_SCORES // LANES
-    buffers, taps, owns = (
-        _tile_buffers(pixels),
-        _tap_buffers(pixels),
-        np.empty(_count(canvas), np.bool_),
-    )
+    buffers, owns = _tile_buffers(pixels), np.empty(_count(canvas), np.bool_)
     highest, unlike = np.empty(max(side[1], pixels), np.float32), np.empty(pixels, np.int32)
     best, flat = np.empty(0, np.int32), labels.reshape(-1)
     for tile in _tiles(start, stop, canvas, pixels):
@@ -707,8 +681,8 @@ def label_images(
             part = best[: high * wide].reshape((high, wide))
             _best_of_part(scores[m], left, top, highest[:wide], part)
             n = _write_alike(n, part, (top, left), buffers, flat)
-            _weigh(n, (side[1], 0), buffers, taps)
-            _interpolated_classes(scores[m], n, taps, highest, unlike)
+            _weigh(n, (side[1], 0), buffers)
+            _interpolated_classes(scores[m], n, buffers, highest, unlike)
             for p in range(n):
                 flat[buffers.pixel[p]] = unlike[p]
 
@@ -729,42 +703,3 @@ def best_classes(
     """
     for i in range(start, stop):
         _write_classes(total[i], num_classes, min_confidence, labels[i])
-
-
-@njit_exact
-def seen_table(
-    start: int, stop: int, side: tuple[int, int], canvas: CanvasGeometry,
-    count: Array, face: Array, u: Array, v: Array, weight: Array,
-) -> None:  # fmt: skip
-    """List the images that contribute to each pixel of the rows ``start:stop``.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        side: Rows and columns of the images.
-        canvas: Geometry of images and canvas.
-        count: ``(H, W)`` number of images, 0 at first, written.
-        face: ``(R, H, W)`` images, written; if R is 0, images are only counted.
-        u: ``(R, H, W)`` columns in the images, written.
-        v: ``(R, H, W)`` rows in the images, written.
-        weight: ``(R, H, W)`` weights, written.
-    """
-    width = canvas.columns.shape[1]
-    owned, owns = len(canvas.owner) > 0, np.ones(_count(canvas), np.bool_)
-    buffers, num_runs = _tile_buffers(width), 0
-    for i in range(start, stop):
-        tile = i, i + 1, 0, width
-        if owned:
-            num_runs = _owned_runs(tile, canvas.owner, buffers.runs, owns)
-        for m in range(len(canvas.matrices)):
-            if not owns[canvas.images[m]]:
-                continue
-            if not owned:
-                num_runs = _covered_runs(tile, m, canvas, buffers.runs)
-            for p in range(_list_pixels(m, side, canvas, num_runs, (0, 0), buffers)):
-                j = buffers.pixel[p]
-                rank = count[i, j]
-                count[i, j] += 1
-                if rank < len(face):
-                    face[rank, i, j], weight[rank, i, j] = m, buffers.weight[p]
-                    u[rank, i, j], v[rank, i, j] = buffers.u[p], buffers.v[p]

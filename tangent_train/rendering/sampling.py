@@ -1,12 +1,10 @@
-"""Positions in panoramas and images, and the pixels around them.
+"""Positions in panoramas, and values at them.
 
 The ray of pixel (i, j) of a panorama or image is
 ``(rows[i, 0] columns[0, j], rows[i, 0] columns[1, j], rows[i, 1])``, with the factors of
 `sphere_rays` or `plane_rays`.
 
-Tensors are sampled as sparse sums, differentiably: every output value is a weighted sum of a few
-*taps*, flat indices into the source, one weight each. Both directions of rendering differ only in
-how the taps are found. Arrays are sampled by `sample_map`.
+Arrays are sampled by `sample_map`, tensors by `sample_tensor`.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
 from tangent_train.geometry import equirect_latitudes, equirect_longitudes
 from tangent_train.rendering.compiled import njit_exact, over_rows
@@ -32,8 +31,6 @@ _REMAP_LIMIT = 32767
 _REMAP_BILINEAR = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
 _SAME_SIZE = {1: np.uint8, 2: np.uint16, 4: np.float32, 8: np.float64}
 """Nearest sampling copies bytes: a dtype of the same size stands for every other."""
-_BLOCK = 2**18
-"""Number of positions sampled at once where cv2 cannot be used."""
 _COPIED = 36
 """Largest part of a panorama that is copied, in bytes per position: copying more takes longer."""
 
@@ -104,20 +101,13 @@ class EquirectMap(NamedTuple):
         part = np.array((top, bottom, left, right))
         return cls(u - u.dtype.type(left), v - u.dtype.type(top), polar, part)
 
-    def in_panorama(
-        self, chosen: NDArray[np.intp] | slice = slice(None)
-    ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-        """Return columns, some beyond the seam, and rows ``(P,)`` in the ERP of some positions."""
-        top, _, left, _ = self.part.astype(self.u.dtype)
-        return self.u.reshape(-1)[chosen] + left, self.v.reshape(-1)[chosen] + top
 
-
-def equirect_map(
+def positions_of_rays(
     matrices: NDArray[np.float64],
     rays: Rays,
     shape: tuple[int, int],
     dtype: np.dtype[np.floating],
-) -> EquirectMap:
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Return the positions in an ERP of the rays of n canvases, stacked vertically.
 
     Args:
@@ -127,16 +117,16 @@ def equirect_map(
         dtype: float32 or float64; the computation is float64 in both cases.
 
     Returns:
-        Positions ``(n h, w)``.
+        Columns in [−½, W − ½] and rows in [−½, H − ½], ``(n h, w)``.
     """
     columns, rows = rays
     u, v = np.empty((2, len(matrices) * len(rows), columns.shape[1]), dtype)
-    over_rows(equirect_positions, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
-    return EquirectMap.of(u, v, shape)
+    over_rows(_write_positions, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
+    return u, v
 
 
 @njit_exact
-def equirect_positions(
+def _write_positions(
     start: int, stop: int, matrices: Array, columns: Array, rows: Array,
     height: int, width: int, u: Array, v: Array,
 ) -> None:  # fmt: skip
@@ -184,111 +174,104 @@ def sample_map(
         interpolation: ``bilinear`` or ``nearest``.
         out: ``(h, w[, C])`` contiguous, same dtype, written.
     """
-    nearest = interpolation == "nearest"
-    if nearest:
+    is_nearest = interpolation == "nearest"
+    if is_nearest:
         plain = _SAME_SIZE[image.dtype.itemsize]
         image, out = image.view(plain), out.view(plain)
-    small = max(*image.shape[:2], *table.u.shape) < _REMAP_LIMIT
-    if not small or not (nearest or image.dtype in _REMAP_BILINEAR):
-        _gather(table, image, nearest, out, np.arange(table.u.size))
-        return
-    _remap(table, image, nearest, out)
-    if not nearest and len(table.polar):  # cv2 would continue at the other pole
-        _gather(table, image, nearest, out, table.polar)
-
-
-def _remap(
-    table: EquirectMap, image: NDArray[np.generic], nearest: bool, out: NDArray[np.generic]
-) -> None:
     top, bottom, left, right = table.part.tolist()
     part = image[top:bottom, left:right]
     if right > image.shape[1]:
         part = np.concatenate([part, image[top:bottom, : right - image.shape[1]]], axis=1)
+    is_small = max(*part.shape[:2], *table.u.shape) < _REMAP_LIMIT
+    if is_small and (is_nearest or image.dtype in _REMAP_BILINEAR):
+        _remap(table, part, is_nearest, out)
+    elif is_nearest:
+        row = np.rint(table.v).astype(np.intp).clip(0, len(part) - 1)
+        out[:] = part[row, np.rint(table.u).astype(np.intp) % part.shape[1]]
+    else:
+        out[:] = _interpolated(part, table.u, table.v)
+    if not is_nearest and len(table.polar):
+        _write_polar(table, image, out)
+
+
+def _remap(
+    table: EquirectMap, part: NDArray[np.generic], is_nearest: bool, out: NDArray[np.generic]
+) -> None:
+    """Sample a part of a panorama with `cv2.remap`."""
     # Copying the part row by row takes less time than waiting for memory at every position.
-    copied = image.dtype.itemsize < 4 and part.nbytes <= _COPIED * table.u.size
+    is_copied = part.dtype.itemsize < 4 and part.nbytes <= _COPIED * table.u.size
     u, v = (line.astype(np.float32, copy=False) for line in table[:2])
-    if nearest and len(table.polar):
+    if is_nearest and len(table.polar):
         v = v.clip(0, len(part) - 1)
-    flag = cv2.INTER_NEAREST if nearest else cv2.INTER_LINEAR
-    channels = 1 if image.ndim == 2 else image.shape[2]
-    padded = copied and channels % 3 == 0 and not nearest
-    if image.ndim == 2 or (channels in (3, 4) and not padded):
-        part = np.ascontiguousarray(part) if copied else part
+    flag = cv2.INTER_NEAREST if is_nearest else cv2.INTER_LINEAR
+    channels = 1 if part.ndim == 2 else part.shape[2]
+    is_padded = is_copied and channels % 3 == 0 and not is_nearest
+    if part.ndim == 2 or (channels in (3, 4) and not is_padded):
+        part = np.ascontiguousarray(part) if is_copied else part
         cv2.remap(part, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
         return
     # cv2 is fastest with 4 channels. It refuses more than 4, or rounds their positions.
     several = 3 if channels % 3 == 0 else 1
     for first in range(0, channels, several):
         group = part[..., first : first + several]
-        if padded:
+        if is_padded:
             group = cv2.cvtColor(group, cv2.COLOR_RGB2RGBA)
         sampled = cv2.remap(group, u, v, flag, borderMode=cv2.BORDER_WRAP)
-        if padded:
+        if is_padded:
             sampled = cv2.cvtColor(sampled, cv2.COLOR_RGBA2RGB)
         out[..., first : first + several] = sampled.reshape(*out.shape[:2], several)
 
 
-def _gather(
-    table: EquirectMap,
-    image: NDArray[np.generic],
-    nearest: bool,
-    out: NDArray[np.generic],
-    chosen: NDArray[np.intp],
-) -> None:
-    """Sample chosen positions with torch, for dtypes and sizes that cv2 does not support."""
-    shape = image.shape[0], image.shape[1]
-    source = image.reshape(shape[0] * shape[1], -1)
-    target = out.reshape(table.u.size, -1)
-    for start in range(0, len(chosen), _BLOCK):
-        part = chosen[start : start + _BLOCK]
-        u, v = map(torch.from_numpy, table.in_panorama(part))
-        if nearest:
-            target[part] = source[nearest_equirect_index(u, v, shape).numpy()]
-            continue
-        index, weight = bilinear_equirect_taps(u.double(), v.double(), shape)
-        values = np.einsum("tpc,tp->pc", source[index.numpy()], weight.numpy())
-        target[part] = np.rint(values) if image.dtype.kind in "ui" else values
+def _write_polar(table: EquirectMap, image: NDArray[np.generic], out: NDArray[np.generic]) -> None:
+    """Sample positions next to the poles, where cv2 would continue at the other pole."""
+    u, v = (line.reshape(-1)[table.polar].astype(np.float64) for line in table[:2])
+    v += table.part[0]
+    v = np.where(v < 0, v, v - (len(image) - 2))
+    values = _interpolated(image[[0, -1]], u + table.part[2], v)
+    out.reshape(table.u.size, -1)[table.polar] = values.reshape(len(u), -1)
 
 
-class Taps(NamedTuple):
-    """Sources and weights of P values, each a sum of T terms.
-
-    Attributes:
-        source: ``(T, P)`` int64, flat indices into the source.
-        weight: ``(T, P)`` floating-point weights.
-    """
-
-    source: Tensor
-    weight: Tensor
+def _interpolated(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
+    """Return float64 values ``(…[, C])`` of a whole or partial panorama ``(H, W[, C])``."""
+    shape = image.shape[:2]
+    planes = np.moveaxis(image.reshape(*shape, -1), -1, 0).astype(np.float64)
+    columns, rows = (torch.from_numpy(line.reshape(-1)).double() for line in (u, v))
+    values = sample_tensor(torch.from_numpy(planes), columns, rows).numpy().T
+    values = np.rint(values) if image.dtype.kind in "ui" else values
+    return values.reshape(*u.shape, *image.shape[2:])
 
 
-def bilinear_equirect_taps(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Taps:
-    """Return bilinear taps at positions in an ERP.
+def sample_tensor(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Interpolate a panorama bilinearly, differentiably on any device.
 
-    Beyond a pole the row reflects, rotated by half a revolution. With an odd width that falls
-    between two columns, so the two rows have separate columns and weights.
+    Longitude wraps. A row beyond a pole is the reflected row, shifted by half a revolution.
 
     Args:
-        u: ``(P,)`` columns, any real number.
+        image: ``(C, H, W)`` floating-point values.
+        u: ``(P,)`` columns in [−1, 2 W].
         v: ``(P,)`` rows in [−½, H − ½].
-        shape: ``(H, W)``.
 
     Returns:
-        Four taps per position, weights of the dtype of `u`.
+        ``(C, P)`` values of the dtype of the image.
     """
-    height, width = shape
-    top = v.floor()
-    indices, weights = [], []
-    for row, row_weight in ((top, 1 - (v - top)), (top + 1, v - top)):
-        reflected = torch.where(
-            row < 0, -1 - row, torch.where(row < height, row, 2 * height - 1 - row)
+    height, width = image.shape[-2:]
+    planes = image if image.dtype == torch.float64 else image.float()
+    beyond = [_half_revolution(planes[:, [row]]) for row in (0, -1)]
+    tall = torch.cat([beyond[0], planes, beyond[1]], dim=1)
+    padded = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=2)
+    x = (2 * torch.where(u < width, u, u - width) + 3) / (width + 2) - 1
+    positions = torch.stack([x, (2 * v + 3) / (height + 2) - 1], dim=-1)[None, None]
+    with torch.autocast(image.device.type, enabled=False):
+        values = grid_sample(
+            padded[None], positions.to(planes.dtype), padding_mode="border", align_corners=False
         )
-        column = torch.where(reflected == row, u, u + width / 2)
-        left = column.floor()
-        start = reflected.long() * width
-        indices += [start + left.long() % width, start + (left.long() + 1) % width]
-        weights += [row_weight * (1 - (column - left)), row_weight * (column - left)]
-    return Taps(torch.stack(indices), torch.stack(weights))
+    return values[0, :, 0].to(image.dtype)
+
+
+def _half_revolution(row: Tensor) -> Tensor:
+    """Return a row ``(C, 1, W)`` rotated by 180°; means of two columns if W is odd."""
+    width = row.shape[-1]
+    return (row.roll(width // 2, -1) + row.roll((width + 1) // 2, -1)) / 2
 
 
 def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
@@ -305,72 +288,3 @@ def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tens
     height, width = shape
     row = v.round().long().clamp(0, height - 1)
     return row * width + u.round().long() % width
-
-
-def image_taps(
-    face: Tensor,
-    u: Tensor,
-    v: Tensor,
-    size: tuple[int, int],
-    weight: Tensor,
-    values: int,
-) -> Taps:
-    """Return bilinear taps in tangent images, clamped to the outermost pixel centers.
-
-    Args:
-        face: ``(R, P)`` indices of images, any integer dtype.
-        u: ``(R, P)`` columns in the images.
-        v: ``(R, P)`` rows in the images.
-        size: Rows and columns of the images.
-        weight: ``(R, P)`` weights of the images.
-        values: Number of values from one image to the next in the flat source.
-
-    Returns:
-        4 R taps per position, weights of the dtype of `u`.
-    """
-    rows, columns = size
-    left = u.floor().clamp(0, columns - 2)
-    top = v.floor().clamp(0, rows - 2)
-    right, below = (u - left).clamp(0, 1), (v - top).clamp(0, 1)
-    first = face.long() * values + top.long() * columns + left.long()
-    index = torch.cat([first, first + 1, first + columns, first + columns + 1])
-    above, before = 1 - below, 1 - right
-    weights = [above * before, above * right, below * before, below * right]
-    return Taps(index, torch.cat([part * weight for part in weights]))
-
-
-def nearest_image_index(face: Tensor, u: Tensor, v: Tensor, size: tuple[int, int]) -> Tensor:
-    """Return the nearest pixel at positions in images; half-way between two, the even one.
-
-    Args:
-        face: ``(P,)`` indices of images, any integer dtype.
-        u: ``(P,)`` columns in the images.
-        v: ``(P,)`` rows in the images.
-        size: Rows and columns of the images.
-
-    Returns:
-        ``(P,)`` int64 flat indices into ``(N, h, w)``.
-    """
-    row, column = (
-        line.round().long().clamp(0, side - 1) for line, side in zip((v, u), size, strict=True)
-    )
-    return (face.long() * size[0] + row) * size[1] + column
-
-
-def sample(source: Tensor, taps: Taps) -> Tensor:
-    """Return weighted sums of taps, differentiable with respect to the source.
-
-    Args:
-        source: ``(S, M)`` values; taps index the columns.
-        taps: T taps for P positions.
-
-    Returns:
-        ``(S, P)`` sums of the dtype of the source, computed in the wider dtype of values and
-        weights.
-    """
-    # gather, not index_select: its gradient is ten times faster on a CPU.
-    size = (len(source), taps.source.shape[1])
-    total = source.gather(1, taps.source[0].expand(size)) * taps.weight[0]
-    for index, weight in zip(taps.source[1:], taps.weight[1:], strict=True):
-        total = total + source.gather(1, index.expand(size)) * weight
-    return total.to(source.dtype)

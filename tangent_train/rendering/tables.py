@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable
 from os import register_at_fork
 from threading import Lock
 from typing import Any, TypeVar
@@ -15,18 +15,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import PinholeGrid, xyz_to_lonlat
+from tangent_train.geometry import PinholeGrid
 from tangent_train.rendering import kernels
 from tangent_train.rendering.compiled import njit_exact, over_rows
 from tangent_train.rendering.sampling import (
     Array,
     EquirectMap,
-    equirect_map,
+    map_dtype,
     plane_rays,
+    positions_of_rays,
     sphere_rays,
 )
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
+Positions = tuple[Tensor, Tensor]
+"""Columns and rows ``(P,)`` in a panorama."""
 
 
 class TableCache:
@@ -122,7 +125,7 @@ def _cached(grid: PinholeGrid, key: tuple[Hashable, ...], build: Callable[[], Va
 def forward_map(
     grid: PinholeGrid,
     shape: tuple[int, int],
-    faces: Sequence[int] | NDArray[np.int64],
+    faces: NDArray[np.int64],
     dtype: np.dtype[np.floating],
 ) -> EquirectMap:
     """Return positions in the ERP of the pixels of tangent images, stacked vertically.
@@ -133,21 +136,35 @@ def forward_map(
         faces: Indices of the images.
         dtype: float32 or float64; the computation is float64 in both cases.
     """
-    chosen = tuple(map(int, faces))
 
     def build() -> EquirectMap:
-        world_from_pixel = grid.world_from_camera[list(chosen)] @ np.linalg.inv(grid.camera_matrix)
-        rays = plane_rays(grid.size)
-        return equirect_map(world_from_pixel[..., [0, 2, 1]], rays, shape, dtype)
+        return EquirectMap.of(*_positions(grid, shape, faces, dtype), shape)
 
-    return _cached(grid, ("forward", shape, chosen, dtype), build)
+    return _cached(grid, ("forward", shape, tuple(faces.tolist()), dtype), build)
 
 
 def forward_positions(
-    grid: PinholeGrid, shape: tuple[int, int], faces: Sequence[int], dtype: np.dtype[np.floating]
+    grid: PinholeGrid, panorama: Tensor, faces: NDArray[np.int64], interpolation: str
+) -> Positions:
+    """Return columns and rows ``(P,)`` in a panorama ``(..., H, W)``, on its device."""
+    shape, device = (panorama.shape[-2], panorama.shape[-1]), panorama.device
+    dtype = map_dtype(panorama.dtype == torch.float64, interpolation)
+
+    def build() -> Positions:
+        u, v = _positions(grid, shape, faces, dtype)
+        return torch.from_numpy(u.ravel()).to(device), torch.from_numpy(v.ravel()).to(device)
+
+    return _cached(grid, ("positions", device, shape, tuple(faces.tolist()), dtype), build)
+
+
+def _positions(
+    grid: PinholeGrid,
+    shape: tuple[int, int],
+    faces: NDArray[np.int64],
+    dtype: np.dtype[np.floating],
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Return the columns and rows of `forward_map` in the whole ERP, flat."""
-    return forward_map(grid, shape, faces, dtype).in_panorama()
+    world_from_pixel = grid.world_from_camera[faces] @ np.linalg.inv(grid.camera_matrix)
+    return positions_of_rays(world_from_pixel[..., [0, 2, 1]], plane_rays(grid.size), shape, dtype)
 
 
 def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
@@ -159,7 +176,7 @@ def owners(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.integer]:
         centers = np.ascontiguousarray(grid.centers_xyz)
         rays = sphere_rays(shape)
         mesh = (centers, grid.neighbors, _inner_cosine(grid))
-        over_rows(find_owners, *shape, *mesh, *rays, face)
+        over_rows(_write_owners, *shape, *mesh, *rays, face)
         return (face,)
 
     return _cached(grid, ("owners", shape), build)[0]
@@ -174,7 +191,7 @@ def _inner_cosine(grid: PinholeGrid) -> float:
 
 
 @njit_exact
-def find_owners(
+def _write_owners(
     start: int, stop: int, centers: Array, neighbors: Array, inner: float,
     columns: Array, rows: Array, face: Array,
 ) -> None:  # fmt: skip
@@ -211,139 +228,87 @@ def find_owners(
             face[i, j] = nearest
 
 
-def find_owned_spans(
-    grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int]
-) -> NDArray[np.int32]:
-    """Return ``(n, H, 2)`` spans that contain the owned pixels, see `kernels.CanvasGeometry`.
+def nearest_pixels(grid: PinholeGrid, shape: tuple[int, int]) -> NDArray[np.int64]:
+    """Return the nearest pixel of the owner of every ERP pixel.
 
-    Args:
-        grid: Geometry of all images.
-        faces: ``(n,)`` indices of the images.
-        shape: ``(H, W)`` of the panorama.
-    """
-
-    def build() -> tuple[NDArray[np.int32]]:
-        longitudes = xyz_to_lonlat(grid.centers_xyz)[:, 0]
-        before = (longitudes / (2 * math.pi) * shape[1]).astype(np.int64)
-        spans = np.zeros((grid.num_images, shape[0], 2), np.int32)
-        over_rows(write_owned_spans, *shape, owners(grid, shape), before, spans)
-        return (spans,)
-
-    return _cached(grid, ("owned spans", shape), build)[0][faces]
-
-
-@njit_exact
-def write_owned_spans(start: int, stop: int, owner: Array, before: Array, spans: Array) -> None:
-    """Find the columns of ERP rows ``start:stop`` that images own.
-
-    Args:
-        start: First row.
-        stop: One past the last row.
-        owner: ``(H, W)`` owners.
-        before: ``(N,)`` column opposite to the center of each image, modulo W.
-        spans: ``(N, H, 2)`` spans, 0 at first, written.
-    """
-    width = owner.shape[1]
-    for i in range(start, stop):
-        for j in range(width):
-            m = owner[i, j]
-            away = (j - before[m]) % width
-            if spans[m, i, 1] == 0:
-                spans[m, i, 0] = away
-            spans[m, i, 0] = min(spans[m, i, 0], away)
-            spans[m, i, 1] = max(spans[m, i, 1], away + 1)
-        for m in range(len(spans)):
-            spans[m, i, 1] -= spans[m, i, 0]
-            spans[m, i, 0] = (spans[m, i, 0] + before[m]) % width
-
-
-def image_table(
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    dtype: np.dtype[np.floating],
-    blend: str,
-    rows: slice,
-) -> tuple[NDArray[Any], ...]:
-    """Return the images that contribute to the ERP pixels of some rows, and positions in them.
+    Half-way between two pixels, the even one is taken.
 
     Args:
         grid: Geometry of the images.
         shape: ``(H, W)`` of the ERP.
-        dtype: dtype of positions and weights, float32 or float64; they are computed in float64.
-        blend: ``nearest``: the owner of every pixel, R = 1. ``feather``: all images that cover a
-            pixel; R is the largest number of them.
-        rows: Rows of the ERP, without a step.
 
     Returns:
-        Four arrays ``(R, rows, W)``: indices of images, int16 or int32; columns and rows in the
-        images; and weights that add up to 1.
+        ``(H, W)`` flat indices into images ``(N, h, w)``.
     """
-    part = owners(grid, shape)[rows] if blend == "nearest" else np.empty((0, 0), np.uint8)
-    geometry = canvas_geometry(grid, grid.face_indices(), shape, rows, part)
-    size = (rows.stop - rows.start, shape[1])
+    index = np.empty(shape, np.int64)
+    geometry = canvas_geometry(grid, grid.face_indices(), shape, owners(grid, shape))
+    arguments = geometry.matrices, geometry.columns, geometry.rows, geometry.owner
+    over_rows(_write_nearest_pixels, *shape, *arguments, grid.size, index)
+    return index
 
-    def fill(ranks: int) -> tuple[NDArray[Any], ...]:
-        count = np.zeros(size, np.int32)
-        face = np.zeros((ranks, *size), np.int16 if grid.num_images < 2**15 else np.int32)
-        u, v, weight = np.zeros((3, ranks, *size), dtype)
-        table = (count, face, u, v, weight)
-        over_rows(kernels.seen_table, *size, grid.size, geometry, *table)
-        return table
 
-    count, face, u, v, weight = fill(1 if blend == "nearest" else int(fill(0)[0].max()))
-    # Pixels covered by fewer than R images repeat the first one with weight 0.
-    unused = np.arange(len(face))[:, None, None] >= count
-    face, u, v = (np.where(unused, line[:1], line) for line in (face, u, v))
-    return face, u, v, weight / weight.sum(axis=0)
+@njit_exact
+def _write_nearest_pixels(
+    start: int, stop: int, matrices: Array, columns: Array, rows: Array, owner: Array,
+    size: tuple[int, int], index: Array,
+) -> None:  # fmt: skip
+    """Write `nearest_pixels` of the ERP rows ``start:stop``."""
+    for i in range(start, stop):
+        z = rows[i, 1]
+        for j in range(columns.shape[1]):
+            m, x, y = matrices[owner[i, j]], rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
+            w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
+            u = np.float32((m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) / w)
+            v = np.float32((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) / w)
+            row = min(max(np.int64(np.rint(v)), 0), size[0] - 1)
+            column = min(max(np.int64(np.rint(u)), 0), size[1] - 1)
+            index[i, j] = (np.int64(owner[i, j]) * size[0] + row) * size[1] + column
 
 
 def canvas_geometry(
     grid: PinholeGrid,
     faces: NDArray[np.int64],
     shape: tuple[int, int],
-    rows: slice,
-    owner: NDArray[np.integer],
+    owner: NDArray[np.integer] | None,
 ) -> kernels.CanvasGeometry:
-    """Return the geometry of images of a grid and rows of a panorama, for the kernels.
+    """Return the geometry of images of a grid and a panorama, for the kernels.
 
     Args:
         grid: Geometry of all images.
         faces: ``(n,)`` indices of the images.
         shape: ``(H, W)`` of the panorama.
-        rows: Rows of the panorama, without a step.
-        owner: ``(rows, W)`` owners; empty for feathering.
+        owner: ``(H, W)`` owners; None for feathering.
     """
     axes = grid.world_from_camera[faces]
     matrices = np.ascontiguousarray(grid.camera_matrix @ axes.transpose(0, 2, 1))
-    columns, lines = sphere_rays(shape)
-    spans = np.empty((0, 0, 2), np.int32) if owner.size else find_spans(grid, faces, shape, rows)
-    return kernels.CanvasGeometry(faces, matrices, spans, columns, lines[rows], owner)
+    rays = sphere_rays(shape)
+    if owner is not None:
+        return kernels.CanvasGeometry(faces, matrices, kernels.NO_SPANS, *rays, owner)
+    spans = _covered_spans(grid, faces, shape)
+    return kernels.CanvasGeometry(faces, matrices, spans, *rays, kernels.NO_OWNERS)
 
 
-def find_spans(
-    grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int], rows: slice
+def _covered_spans(
+    grid: PinholeGrid, faces: NDArray[np.int64], shape: tuple[int, int]
 ) -> NDArray[np.int32]:
-    """Return ``(n, rows, 2)`` spans, see `kernels.CanvasGeometry`.
+    """Return ``(n, H, 2)`` spans, see `kernels.CanvasGeometry`.
 
     Args:
         grid: Geometry of all images.
         faces: ``(n,)`` indices of the images.
         shape: ``(H, W)`` of the panorama.
-        rows: Rows of the panorama, without a step.
     """
 
     def build() -> tuple[NDArray[np.int32]]:
-        spans = np.empty((len(faces), rows.stop - rows.start, 2), np.int32)
+        spans = np.empty((len(faces), shape[0], 2), np.int32)
         matrices = grid.camera_matrix @ grid.world_from_camera[faces].transpose(0, 2, 1)
         u, v, w = matrices[:, None].transpose(2, 0, 1, 3)
         below, right = (side - 0.5 for side in grid.size)
         edges = np.concatenate([u + w / 2, right * w - u, v + w / 2, below * w - v], axis=1)
-        lines = sphere_rays(shape)[1][rows]
-        over_rows(write_spans, spans.shape[1], len(faces), edges, lines, shape[1], spans)
+        over_rows(_write_spans, shape[0], len(faces), edges, sphere_rays(shape)[1], shape[1], spans)
         return (spans,)
 
-    key = "spans", shape, rows.start, rows.stop, *map(int, faces)
-    return _cached(grid, key, build)[0]
+    return _cached(grid, ("spans", shape, tuple(faces.tolist())), build)[0]
 
 
 @njit_exact
@@ -356,7 +321,9 @@ def _inside(normals: Array, x: float, y: float, z: float) -> bool:
 
 
 @njit_exact
-def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array) -> None:
+def _write_spans(
+    start: int, stop: int, edges: Array, rows: Array, width: int, spans: Array
+) -> None:
     """Find the columns of ERP rows ``start:stop`` that images may cover.
 
     An image covers the directions between four planes through the center of the sphere. Its part of
@@ -396,24 +363,3 @@ def write_spans(start: int, stop: int, edges: Array, rows: Array, width: int, sp
                 first = math.floor(((middle + least) / (2 * math.pi) + 0.5) * width - 0.5)
                 last = math.ceil(((middle + most) / (2 * math.pi) + 0.5) * width - 0.5)
                 spans[m, i, 0], spans[m, i, 1] = first % width, min(last - first + 1, width)
-
-
-def tensors_on(
-    device: torch.device,
-    grid: PinholeGrid,
-    key: tuple[Hashable, ...] | None,
-    build: Callable[[], tuple[NDArray[Any], ...]],
-) -> tuple[Tensor, ...]:
-    """Return tables as tensors, cached; on the CPU they share the memory of the arrays.
-
-    Args:
-        device: Device of the tables.
-        grid: Geometry of the images.
-        key: All other values that the tables depend on; None for tables that are not cached.
-        build: Function that returns the arrays.
-    """
-
-    def tensors() -> tuple[Tensor, ...]:
-        return tuple(torch.from_numpy(part).to(device) for part in build())
-
-    return tensors() if key is None else _cached(grid, ("tensors", device, *key), tensors)

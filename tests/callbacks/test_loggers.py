@@ -1,20 +1,19 @@
-"""Scalars and pictures of one run in TensorBoard, CSV, offline W&B and MLflow."""
+"""Scalars and pictures of one run in TensorBoard, CSV and MLflow; pictures in W&B."""
 
 from __future__ import annotations
 
 import csv
-import json
-import struct
 from collections import defaultdict
-from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
+from unittest.mock import create_autospec
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.loggers import WandbLogger
 from numpy.typing import NDArray
 from tensorboard.backend.event_processing.event_accumulator import (  # type: ignore[import-untyped]
     EventAccumulator,
@@ -24,7 +23,8 @@ from torch import nn
 from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
-from tangent_train.cli.trainer import build_trainer
+from tangent_train.callbacks.pictures import log_image
+from tangent_train.cli.run import Run
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.pictures import prediction_panel
 from tangent_train.tasks import SegmentationTask
@@ -48,11 +48,12 @@ def _fit(folder: Path, data: Any, task: Any, *overrides: str) -> None:
     (folder / "runs" / "mine" / "seed_0").mkdir(parents=True)
     typed = ("trainer.max_epochs=2", "trainer.log_every_n_steps=1", "trainer.accelerator=cpu")
     settings = composed_settings("train", *typed, "validation_images=2", *overrides)
-    settings["trainer"] |= {"num_sanity_val_steps": 1, "enable_checkpointing": False}
-    contents = {"config": {"network": {"widths": [4, 8]}, "seed": 0}}
+    more = {"num_sanity_val_steps": 1, "enable_checkpointing": False}
+    settings = settings.model_copy(update={"trainer": settings.trainer | more})
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        trainer = build_trainer(settings, Path("runs/mine/seed_0/P"), task, contents)
+        patch.setattr(Run, "contents", lambda _: {})
+        trainer = Run(Path("runs/mine/seed_0/P"), settings, data, task).trainer()
         trainer.fit(task, datamodule=data)
 
 
@@ -61,8 +62,6 @@ def trained(
     stanford_root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
     """Two epochs of panoramas with all loggers."""
-    import wandb
-
     folder = tmp_path_factory.mktemp("trained")
     # Validation: 3 panoramas of 2 rooms.
     split: Any = {"val_fraction": 0.35, "seed": 3}
@@ -71,12 +70,8 @@ def trained(
     sgd = partial(torch.optim.SGD, lr=0.1)
     task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("WANDB_MODE", "offline")
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
-        wandb_settings = composed_settings("train", "logger=wandb")["logger"]["wandb"]
-        text = ", ".join(f"{n}: {'null' if v is None else v}" for n, v in wandb_settings.items())
-        _fit(folder, data, task, "logger=many", f"+logger.wandb={{{text}}}")
-        wandb.finish()
+        _fit(folder, data, task, "logger=many")
     return folder, task, data
 
 
@@ -109,45 +104,6 @@ def _of_csv(folder: Path) -> Scalars:
     return scalars
 
 
-def _wandb_records(folder: Path) -> Iterator[Any]:
-    """Records of an offline run: a file in LevelDB's format of logs, after 7 bytes."""
-    from wandb.proto.wandb_internal_pb2 import Record  # type: ignore[attr-defined]
-
-    (path,) = folder.glob("runs/mine/seed_0/P/wandb/offline-run-*/*.wandb")
-    content, position, whole = path.read_bytes(), 7, b""
-    while position < len(content):
-        rest = 2**15 - position % 2**15
-        if rest < 7:
-            position += rest
-            continue
-        _, length, kind = struct.unpack_from("<IHB", content, position)
-        whole += content[position + 7 : position + 7 + length]
-        position += 7 + length
-        if kind in (1, 4):  # the whole record, or its last part
-            yield Record.FromString(whole)
-            whole = b""
-
-
-def _of_wandb(folder: Path) -> tuple[Scalars, Pictures]:
-    scalars: Scalars = defaultdict(list)
-    pictures: Pictures = defaultdict(list)
-    (media,) = folder.glob("runs/mine/seed_0/P/wandb/offline-run-*/files")
-    for record in _wandb_records(folder):
-        if record.WhichOneof("record_type") != "history":
-            continue
-        row: dict[str, dict[str, Any]] = defaultdict(dict)
-        for item in record.history.item:
-            name, *field = [item.key] if item.key else item.nested_key
-            row[name][".".join(field)] = json.loads(item.value_json)
-        step = row.pop("trainer/global_step")[""]
-        for name, fields in row.items():
-            for file in fields.get("filenames", []):
-                pictures[_plain(name)].append(decoded((media / file).read_bytes()))
-            if "" in fields and not name.startswith("_"):
-                scalars[name].append((step, fields[""]))
-    return scalars, pictures
-
-
 def _of_mlflow(folder: Path) -> tuple[Scalars, Pictures, Any]:
     from mlflow.tracking import MlflowClient
 
@@ -172,7 +128,7 @@ def _plain(name: str) -> str:
 
 
 def _without_epochs(scalars: Scalars) -> Scalars:
-    """W&B and CSV files have epoch and learning rates in rows of their own."""
+    """CSV files have epoch and learning rates in rows of their own."""
     return {name: sorted(values) for name, values in scalars.items() if name != "epoch"}
 
 
@@ -186,20 +142,18 @@ def test_all_loggers_hold_the_same_scalars_and_pictures(
     assert [step for step, _ in expected["train/loss"]] == list(range(2 * STEPS))
     assert any(name.startswith("val_iou/") for name in expected)
     expected = _without_epochs(expected)
-    others = {
-        "csv": _of_csv(folder),
-        "wandb": _of_wandb(folder)[0],
-        "mlflow": _of_mlflow(folder)[0],
-    }
-    for logger, found in others.items():
+    in_mlflow, shown, _ = _of_mlflow(folder)
+    for logger, found in (("csv", _of_csv(folder)), ("mlflow", in_mlflow)):
         assert _without_epochs(found).keys() == expected.keys(), logger
         for name, values in expected.items():
             assert np.allclose(found[name], values, rtol=1e-6), (logger, name)
-    assert [len(shown) for shown in pictures.values()] == [2, 2]
-    for logger, shown in (("wandb", _of_wandb(folder)[1]), ("mlflow", _of_mlflow(folder)[1])):
-        assert shown.keys() == pictures.keys(), logger
-        for name, images in pictures.items():
-            np.testing.assert_array_equal(shown[name], images, err_msg=f"{logger} {name}")
+    assert [len(images) for images in pictures.values()] == [2, 2]
+    assert shown.keys() == pictures.keys()
+    for name, images in pictures.items():
+        np.testing.assert_array_equal(shown[name], images, err_msg=name)
+    logger: Any = create_autospec(WandbLogger, instance=True)
+    log_image(logger, "val_images/a", images[0], 3)
+    logger.log_image.assert_called_once_with("val_images/a", [images[0]], 3)
 
 
 def test_hyperparameters_name_and_group_are_logged_once(
@@ -207,12 +161,9 @@ def test_hyperparameters_name_and_group_are_logged_once(
 ) -> None:
     folder = trained[0]
     run = _of_mlflow(folder)[2]
-    assert run.data.params == {"network.widths": "[4, 8]", "seed": "0"}
+    assert run.data.params["network.widths"] == "[16, 32, 64, 128, 256, 256]"
     assert run.info.run_name == "mine/seed_0/P"
     assert run.data.tags["group"] == "mine"
-    records = list(_wandb_records(folder))
-    (of_run,) = [r.run for r in records if r.WhichOneof("record_type") == "run"]
-    assert (of_run.display_name, of_run.run_group) == ("mine/seed_0/P", "mine")
     files = folder / "runs/mine/seed_0/P"
     for path in (files / "tensorboard/hparams.yaml", files / "csv/version_0/hparams.yaml"):
         assert "network.widths" in path.read_text()

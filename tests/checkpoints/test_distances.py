@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 from typing import Any, get_args
 
 import pytest
 import torch
 from torch import Tensor, nn
 
-from datamodules.core.labels import DISTANCE
 from tangent_train.checkpoints.distances import (
     DistanceNetwork,
     along_rays,
@@ -20,12 +18,8 @@ from tangent_train.checkpoints.distances import (
     is_disparity,
 )
 from tangent_train.checkpoints.kinds import DepthKind
-from tangent_train.checkpoints.loaded import describe_network, load_network
-from tangent_train.checkpoints.scores import size_multiple_of
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
-from tangent_train.inference.label_maps import load_label_map, map_classes
-from tests.inference.trained import write_checkpoint
 
 
 @pytest.mark.parametrize("kind", get_args(DepthKind))
@@ -104,7 +98,6 @@ def test_outputs_of_several_forms_have_one_channel(output: str) -> None:
             network(images)
         return
     torch.testing.assert_close(network(images), images.mean(dim=1, keepdim=True))
-    assert size_multiple_of(network, 3) == 1
 
 
 def test_images_are_resized_for_networks_of_one_size() -> None:
@@ -115,32 +108,3 @@ def test_images_are_resized_for_networks_of_one_size() -> None:
     found = network(images)
     assert found.shape == (1, 1, 8, 12)
     torch.testing.assert_close(found[..., 1:-1, 1:-1], images[:, :1, 1:-1, 1:-1], atol=0.1, rtol=0)
-    assert size_multiple_of(DistanceNetwork(_MeanColor((4, 6)), "metric_z"), 3) is None
-
-
-def write_depth_checkpoint(path: Path, **changes: Any) -> Path:
-    """Write a checkpoint of a depth network: a 3×3 convolution to one channel."""
-    write_checkpoint(path)
-    content = torch.load(path, weights_only=True)
-    content["config"]["network"]["out_channels"] = 1
-    content["state_dict"] = {k: v[:1].clone() for k, v in content["state_dict"].items()}
-    depth = {"predicts": DISTANCE, "class_names": [], "tangent_train_version": "0"}
-    torch.save(content | depth | changes, path)
-    return path
-
-
-@pytest.mark.parametrize("kind", [None, "relative_disparity"])
-def test_checkpoints_contain_the_kind_of_depth(kind: DepthKind | None, tmp_path: Path) -> None:
-    """The checkpoint of a run contains no kind: it is that of `DepthTask`."""
-    changes = {} if kind is None else {"depth_kind": kind}
-    path = write_depth_checkpoint(tmp_path / "net.ckpt", **changes)
-    trained, described = load_network(path), describe_network(path)
-    assert described is not None
-    assert trained.depth_kind == described.depth_kind == (kind or "log_distance")
-    assert (trained.predicts, trained.class_names, trained.size_multiple) == (DISTANCE, (), 1)
-    assert trained.network(torch.zeros(2, 3, 16, 16)).shape == (2, 1, 16, 16)
-    with pytest.raises(SettingError, match=r"found a network that predicts distance.*label_map"):
-        map_classes(trained, load_label_map("ade20k_to_stanford2d3ds"), "unknown")
-    path = write_depth_checkpoint(tmp_path / "wrong.ckpt", depth_kind="inverse")
-    with pytest.raises(DataError, match="depth_kind='inverse'"):
-        load_network(path)

@@ -8,13 +8,16 @@ from typing import Any
 
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
-from tangent_train.checkpoints.content import read_checkpoint
-from tangent_train.checkpoints.loaded import completed_settings, load_network
-from tangent_train.checkpoints.scores import size_multiple_of
+from models import IcoCNN, UNet
+from tangent_train.checkpoints.loaded import (
+    METADATA_KEY,
+    completed_settings,
+    declared_sizes,
+    load_network,
+)
 from tangent_train.errors import DataError
-from tests.tasks.odd_networks import Looking, OneSize
 from tests.tasks.small_networks import save_checkpoint
 
 SMALL_UNET = ["network=unet", "network.widths=[4,8,8]"]
@@ -51,29 +54,25 @@ def test_a_network_computes_what_its_task_does(
     assert trained.representation["_target_"].startswith("tangent_train.rendering.")
 
 
-class Coarse(nn.Conv2d):
-    """A network whose scores are smaller than its images unless those are multiples of 6."""
+class Upsampled(nn.Sequential):
+    """A network that declares its stride."""
 
-    def forward(self, images: Tensor) -> Tensor:
-        rows, columns = (side // 6 * 6 for side in images.shape[-2:])
-        return super().forward(images[..., :rows, :columns])
+    size_multiple = 14
 
 
 @pytest.mark.parametrize(
-    ("network", "multiple"),
+    ("network", "sizes"),
     [
-        (nn.Conv2d(3, 5, 3, padding=1), 1),
-        (Looking(3, 5), 1),
-        (nn.Sequential(nn.AvgPool2d(8), nn.Upsample(scale_factor=8)), 8),
-        (nn.Sequential(nn.AvgPool2d(14), nn.Upsample(scale_factor=14)), 14),
-        (OneSize(3, 5), None),
-        (Coarse(3, 5, 1), None),
-        (nn.Conv2d(4, 5, 1), None),
+        (nn.Conv2d(3, 5, 3, padding=1), (1, None)),
+        (UNet(3, 5, [4, 8, 8]), (4, None)),
+        (nn.Sequential(UNet(3, 5, [4, 8, 8])), (4, None)),
+        (Upsampled(), (14, None)),
+        (IcoCNN(3, 5, 2, [1, 1]), (1, (1, 162))),
     ],
-    ids=["any", "looking", "eighths", "patches of 14", "one", "sixths", "other channels"],
+    ids=["undeclared", "strided", "inside", "user-defined", "icosphere"],
 )
-def test_sizes_that_a_network_takes_are_found(network: nn.Module, multiple: int | None) -> None:
-    assert size_multiple_of(network.eval(), 3) == multiple
+def test_sizes_are_declared_by_networks(network: nn.Module, sizes: Any) -> None:
+    assert declared_sizes(network) == sizes
 
 
 def test_nulls_of_networks_inside_networks_are_completed() -> None:
@@ -90,12 +89,15 @@ def _network(**settings: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"network": _network(widths=[4, 8])}, r"other tensors than .*the tensors of models\.UNet"),
-        ({"network": {"_target_": "no_such.Net"}}, r"network\._target_: no_such\.Net, .*PYTHON"),
-        ({"network": {"_target_": "torch.nn.Convolution"}}, r"network\..*, .*Correct the name"),
-        ({"network": _network(wide=3)}, r"network\.wide=3; expected one of its set"),
-        ({"network": _network(widths=[])}, r"network: models\.UNet cannot be made"),
-        ({"representation": None}, r"no representation in its config"),
+        (
+            {"settings": _network(widths=[4, 8])},
+            r"other tensors than .*the tensors of models\.UNet",
+        ),
+        ({"settings": {"_target_": "os.system"}}, r"network\._target_=?.*os\.system"),
+        ({"settings": _network(widths=[])}, r"network cannot be built"),
+        ({"representation": None}, r".*representation: Input should be"),
+        ({"depth_kind": "inverse"}, r".*depth_kind: Input should be"),
+        ({"unknown": 1}, r".*unknown: Unexpected"),
     ],
 )
 def test_files_that_cannot_be_loaded_are_explained(
@@ -104,10 +106,10 @@ def test_files_that_cannot_be_loaded_are_explained(
     path = tmp_path / "best.ckpt"
     save_checkpoint(path, *SMALL_UNET)
     content = torch.load(path, weights_only=True)
-    content["config"] |= changed
+    content[METADATA_KEY] |= changed
     torch.save(content, path)
     with pytest.raises(DataError, match=rf"(?s)^{re.escape(str(path))}: found {message}"):
-        load_network(path, ["no_such.Net", "torch.nn.Convolution"])
+        load_network(path)
 
 
 @pytest.mark.parametrize(
@@ -115,8 +117,8 @@ def test_files_that_cannot_be_loaded_are_explained(
     [
         (None, "no such file"),
         (b"not a checkpoint", r"a damaged file, or not a file of torch\.save"),
-        ({"state_dict": {}}, "no config inside"),
-        ([1, 2], "list instead of a mapping inside"),
+        ({"state_dict": {}}, "no description of a network"),
+        ([1, 2], "no description of a network"),
     ],
 )
 def test_other_files_are_refused(content: Any, message: str, tmp_path: Path) -> None:
@@ -125,5 +127,5 @@ def test_other_files_are_refused(content: Any, message: str, tmp_path: Path) -> 
         path.write_bytes(content)
     elif content is not None:
         torch.save(content, path)
-    with pytest.raises(DataError, match=f"{message}.*expected a checkpoint written by tangent"):
-        read_checkpoint(path)
+    with pytest.raises(DataError, match=f"{message}.*expected a network of tangent-train"):
+        load_network(path)

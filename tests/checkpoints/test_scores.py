@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tangent_train.checkpoints.scores import ClassScoreNetwork
+from tangent_train.checkpoints.kinds import ScoreKind
+from tangent_train.checkpoints.scores import ClassScoreNetwork, as_logits
 from tangent_train.errors import SettingError
 
 
@@ -34,6 +35,14 @@ def test_label_maps_are_certain() -> None:
     scores = ClassScoreNetwork(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
     assert scores.argmax(dim=1).tolist() == [[[0, 2, 1, 3, 3, 3, 3]] * 2]
     assert float(scores.softmax(dim=1).amax(dim=1).min()) > 0.999
+
+
+@pytest.mark.parametrize("kind", ["logits", "probabilities"])
+def test_a_single_score_is_that_of_a_sigmoid(kind: ScoreKind) -> None:
+    logits = torch.linspace(-3, 3, 6).reshape(1, 1, 2, 3)
+    returned = logits.sigmoid() if kind == "probabilities" else logits
+    found = as_logits(returned, kind, 1).softmax(dim=1)
+    torch.testing.assert_close(found[:, :1], logits.sigmoid())
 
 
 @pytest.mark.parametrize("size", [(4, 6), (5, 6), (11, 13)])

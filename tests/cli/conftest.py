@@ -11,7 +11,7 @@ import pytest
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.singleton import Singleton
 
-from tangent_train.cli import transfer_stages
+from tangent_train.cli import transfer
 from tangent_train.errors import DataError, SettingError
 from tangent_train.results import report
 from tests.cli.rendering import Refused, render_with
@@ -33,11 +33,11 @@ def stages(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     def run_process(line: Sequence[str]) -> int:
         state = Singleton.get_state()
         GlobalHydra.instance().clear()
-        run(*line[3:])
+        run(Path(line[0]).name.removeprefix("tangent-"), *line[1:])
         Singleton.set_state(state)
         return 0
 
-    monkeypatch.setattr(transfer_stages, "run_process", run_process)
+    monkeypatch.setattr(transfer, "run_process", run_process)
     monkeypatch.setattr(report, "report_png", lambda *_: b"a picture")
 
 

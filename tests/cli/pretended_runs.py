@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +10,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from tangent_train.checkpoints.content import write_settings
-from tangent_train.cli.command_settings import check_settings
 from tangent_train.cli.transfer import transfer
+from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
 from tests.cli.tiny_runs import SMALL_ROOMS
 from tests.results.example_results import example_result
@@ -41,31 +38,35 @@ class PretendedRuns:
 
     Attributes:
         started: Command and folder name of each, in order.
-        configs: The ``stage.yaml`` of each.
+        configs: Settings of each by the name of the stage; a resumed one has only `resume`.
         failing: A stage that ends with status 7 instead, having begun.
     """
 
     def __init__(self) -> None:
         self.started: list[tuple[str, str]] = []
-        self.configs: list[Any] = []
+        self.configs: dict[str, Any] = {}
         self.failing: str | None = None
 
     def __call__(self, line: Sequence[str]) -> int:
-        assert list(line[:3]) == [sys.executable, "-m", "tangent_train.cli.main"]
-        command, config_dir, _, _ = line[3:]
-        folder = Path(config_dir.removeprefix("--config-dir="))
-        config: Any = OmegaConf.load(folder / "stage.yaml")
-        assert config.pop("defaults")
+        command = Path(line[0]).name.removeprefix("tangent-")
+        first, *others = line[1:]
+        folder = Path(others[-1].partition("=")[2].strip("'\""))
+        config: Any = OmegaConf.create({"resume": first.removeprefix("resume=").strip("'")})
+        if first.startswith("--config-dir="):
+            name = others[0].removeprefix("--config-name=")
+            config = OmegaConf.load(Path(first.removeprefix("--config-dir="), f"{name}.yaml"))
+            assert config.pop("defaults")
+            given = {"init_from": None, "checkpoint": "."}  # files that are not written
+            validate(command, {name: given.get(name, v) for name, v in config.items()})
+            folder.mkdir(parents=True)
+            OmegaConf.save(config, folder / "config.yaml")
         self.started.append((command, folder.name))
-        self.configs.append(config)
-        settings: Any = OmegaConf.to_container(config, resolve=True)
-        check_settings(command, settings, ())
-        write_settings(folder / "config.yaml", settings)
+        self.configs[folder.name] = config
         if command == "train":
-            (folder / "checkpoints").mkdir(exist_ok=True)
             for name in ("best", "last"):
                 path = folder / "checkpoints" / f"{name}.ckpt"
-                path.write_text(f"{config.name} {config.seed}")
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.touch()
         if folder.name == self.failing:
             return 7
         score = 1.0 if folder.name == "S-FT-1" else 0.5
@@ -74,19 +75,12 @@ class PretendedRuns:
         return 0
 
 
-@lru_cache
-def _composed() -> Any:
-    return compose("transfer", list(SETTINGS), return_hydra_config=True)
-
-
-def run_transfer(*arguments: str) -> None:
-    """The command on a config that is composed once: this takes Hydra a second."""
+def run_transfer(*arguments: str, settings: Sequence[str] = SETTINGS) -> None:
+    """Run the command with the given overrides, after those of a small transfer."""
+    config_name("transfer", ())
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = _composed().copy()
-        OmegaConf.set_struct(config, value=False)
-        config.merge_with_dotlist(list(arguments))
-        config.hydra.overrides.task = list(arguments)
+        config = compose("transfer", [*settings, *arguments], return_hydra_config=True)
+        OmegaConf.set_readonly(config, value=False)
         config.hydra.runtime.output_dir = str(Path(config.hydra.run.dir).absolute())
         HydraConfig.instance().set_config(config)
-        del config["hydra"]
-        transfer(config)
+        transfer(None)

@@ -75,13 +75,13 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     command = command_of(experiment)
     arguments = [f"experiment={experiment}", *SMALL]
     settings = composed_settings(command, *arguments)
-    name = _class_of(settings["data"])
-    settings["data"]["root"] = folders[name]
-    data, task = build(settings)
+    name = _class_of(settings.data)
+    section = settings.data | {"root": str(folders[name])}
+    data, task = build(settings.model_copy(update={"data": section}))
     assert {**data.facts, **task.facts} == protocol
     arguments += [f"data.root={folders[name]}", *SIZES.get(name, SIZE)]
     if command == "transfer":
-        photos = folders[_class_of(settings["photos"]["data"])]
+        photos = folders[_class_of(settings.photos.data)]
         arguments += [f"photos.data.root={photos}", "photos.data.num_workers=0"]
         arguments += ["photos.data.batch_size=2"]
     run(command, *arguments)
@@ -106,8 +106,9 @@ OF_THE_PAPER = [
 )
 def test_experiments_of_the_paper_have_the_facts_of_its_scores(name: str, experiment: str) -> None:
     settings = composed_settings(command_of(experiment), f"experiment={experiment}")
-    settings |= settings["photos"] if name == "paper_photos" else {}
+    if name == "paper_photos":
+        settings = settings.model_copy(update=dict(settings.photos))
     protocol = facts(name)
-    assert settings["task"].get("absent_class") == protocol.pop("absent_class", None)
+    assert settings.task.get("absent_class") == protocol.pop("absent_class", None)
     assert protocol.pop("weighting", "pixels") == "pixels"
     assert build_data(settings).facts == protocol

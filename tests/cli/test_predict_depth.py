@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 from datamodules.core.inputs import RGB_NORMALIZATION
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
-from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Predict
 from tests.datamodules.data_files import read_png
-from tests.inference.trained import sphere
+from tests.inference.trained import sphere, write_depth_checkpoint
 from tests.running import Capture
 
 LEAST_M = 1.5
@@ -37,8 +36,8 @@ def network(tmp_path: Path) -> Path:
     weight = torch.zeros(1, 3, 3, 3)
     weight[0, 0, 1, 1] = RGB_NORMALIZATION.std[0]
     bias = torch.tensor([RGB_NORMALIZATION.mean[0] + math.log(LEAST_M)])
-    tensors = {"network.weight": weight, "network.bias": bias}
-    return write_depth_checkpoint(tmp_path / "depth.ckpt", state_dict=tensors)
+    tensors = {"weight": weight, "bias": bias}
+    return write_depth_checkpoint(tmp_path / "depth.ckpt", tensors=tensors)
 
 
 def _depth(path: Path) -> NDArray[np.float64]:
@@ -126,9 +125,9 @@ def test_a_part_of_a_panorama(tmp_path: Path, network: Path, predict: Predict) -
 
 def test_photos_have_z_depth(tmp_path: Path, predict: Predict) -> None:
     """A wall at 2 m, for a network that returns the same z-depth everywhere."""
-    tensors = {"network.weight": torch.zeros(1, 3, 3, 3), "network.bias": torch.tensor([2.0])}
+    tensors = {"weight": torch.zeros(1, 3, 3, 3), "bias": torch.tensor([2.0])}
     path = tmp_path / "net.ckpt"
-    network = write_depth_checkpoint(path, state_dict=tensors, depth_kind="metric_z")
+    network = write_depth_checkpoint(path, tensors=tensors, depth_kind="metric_z")
     write_pixels(tmp_path / "in" / "a.png", sphere(64)[10:40, 20:70])
     how = {"projection": "perspective", "fov": 70, "write": "[depth,points]"}
     entry = predict(checkpoint=network, **how)["a"]["depth"]
@@ -145,7 +144,7 @@ def test_relative_depth_is_marked(
     tmp_path: Path, network: Path, predict: Predict, capsys: Capture
 ) -> None:
     relative = torch.load(network, weights_only=True) | {"depth_kind": "relative_depth"}
-    relative["state_dict"]["network.bias"] += 1  # positive
+    relative["state_dict"]["bias"] += 1  # positive
     torch.save(relative, tmp_path / "relative.ckpt")
     write_pixels(tmp_path / "in" / "a.png", sphere(32))
     entry = predict(checkpoint=tmp_path / "relative.ckpt", align="none")["a"]["depth"]

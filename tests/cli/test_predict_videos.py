@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from tangent_train.io.palette import class_colors
 from tangent_train.io.videos import read_frames
 from tangent_train.results.pictures import colorize_distance
-from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import hide_start, read_png
-from tests.inference.trained import CLASS_NAMES, sphere
+from tests.inference.trained import CLASS_NAMES, sphere, write_depth_checkpoint
 from tests.running import Capture, Patch
 
 av: Any = pytest.importorskip("av")

@@ -16,7 +16,9 @@ FILES = {"report.md", "report.csv", "report.png"}
 @pytest.fixture
 def runs(tmp_path: Path) -> Path:
     """Two folds, no sofa in the second."""
-    write_run(tmp_path / "runs" / "1", example_result([0.6, 0.5, 1.0], bands=(0.6, 0.2), data__fold=1))
+    write_run(
+        tmp_path / "runs" / "1", example_result([0.6, 0.5, 1.0], bands=(0.6, 0.2), data__fold=1)
+    )
     write_run(
         tmp_path / "runs" / "2", example_result([0.8, 0.5, None], bands=(0.6, 0.2), data__fold=2)
     )

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import pytest
 from omegaconf import DictConfig
 
-from tangent_train.config.build import SettingsFile, build_from_config, named_arguments
-from tangent_train.errors import DataError, SettingError
-from tests.security.attacks import CANARY
+from tangent_train.config.build import build_from_config
+from tangent_train.errors import SettingError
 
 ME = __name__
 UNET = {"_target_": "models.UNet", "in_channels": 3, "num_classes": 13, "widths": [4, 8]}
@@ -100,35 +98,3 @@ def test_errors_of_ones_own_class_are_raised_as_they_are() -> None:
             build_from_config(section, "x")
         with pytest.raises(ValueError, match="invalid literal"):
             build_from_config({"_target_": f"{ME}.Kept", "x": section}, "x")
-
-
-def test_a_section_with_anything_of_a_file_is_not_given_to_hydra(tmp_path: Path) -> None:
-    fire = {"_target_": f"{CANARY}.fire"}
-    source = SettingsFile(tmp_path / "x.ckpt", (), {"network.widths", "data"})
-    network = build_from_config(UNET | {"_convert_": "all", "_recursive_": True}, "network", source)
-    assert type(network).__name__ == "UNet"
-    for key, value in (("_args_", [3]), ("_args_", []), ("_convert_", "x"), ("_recursive_", fire)):
-        with pytest.raises(DataError, match=rf"x\.ckpt: found network\.{key}="):
-            build_from_config(UNET | {key: value}, "network", source)
-    text = "${oc.env:HOME}"
-    trusted = SettingsFile(tmp_path / "x.ckpt", [f"{ME}.Kept"], {"network.y"})
-    section = {"_target_": f"{ME}.Kept", "_args_": [text], "x": {"z": text}, "y": text}
-    kept = build_from_config(section, "network", trusted)
-    assert (kept.positional, kept.named) == ((text,), {"x": {"z": text}, "y": text})
-    with pytest.raises(DataError, match=r"network\._args_\.0\._target_"):
-        build_from_config({"_target_": f"{ME}.Kept", "_args_": [fire]}, "network", trusted)
-
-
-def test_files_get_positional_arguments_by_name() -> None:
-    inner = {"_target_": f"{ME}.pair", "_args_": [1, 2]}
-    assert named_arguments({"network": inner | {"x": [inner]}, "level": 5}) == {
-        "network": {
-            "_target_": f"{ME}.pair",
-            "x": [{"_target_": f"{ME}.pair", "first": 1, "second": 2}],
-            "first": 1,
-            "second": 2,
-        },
-        "level": 5,
-    }
-    variable = {"_target_": f"{ME}.Kept", "_args_": [1]}
-    assert named_arguments(variable) == variable, "it has no name"

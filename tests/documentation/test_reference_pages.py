@@ -56,7 +56,7 @@ def test_file_formats_names_every_field_of_results() -> None:
 
 
 def test_file_formats_names_every_field_of_an_exported_network() -> None:
-    names = {field.name for field in fields(LoadedNetwork)} - {"module", "source"}
+    names = {field.name for field in fields(LoadedNetwork)} - {"module", "trust"}
     assert not missing(names, "file_formats.md")
 
 

@@ -19,7 +19,7 @@ from tangent_train.geometry import (
 )
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.equirect import area_mask
-from tangent_train.rendering.tables import find_owned_spans, owners
+from tangent_train.rendering.tables import owners
 from tests.geometry.directions import angle_deg, random_directions
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
@@ -87,12 +87,6 @@ def test_owners_are_the_nearest_centers_and_spans_contain_them(grid: PinholeGrid
     found = owners(grid, shape)
     of_owner = np.take_along_axis(nearness, found[..., None].astype(int), axis=-1)[..., 0]
     np.testing.assert_allclose(of_owner, nearness.max(axis=-1), atol=1e-12)
-    for faces in (np.arange(grid.num_images), np.array([grid.num_images - 1])):
-        first, count = np.moveaxis(find_owned_spans(grid, faces, shape)[..., None], 2, 0)
-        held = (np.arange(90) - first) % 90 < count
-        owned = found == faces[:, None, None]
-        assert not np.any(owned & ~held)
-        assert held.sum() < 1.6 * owned.sum()
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
-from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.cli.run import inputs_and_classes
+from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.checkpoints.loaded import METADATA_KEY, LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import equirect_directions
 
@@ -60,6 +61,7 @@ def trained_network(
         "representation": representation,
         "image_size": build_from_config(representation, "representation").image_size,
     }
+    settings["predicts"] = PIXEL_CLASSES if changes.get("depth_kind") is None else DISTANCE
     return LoadedNetwork(**(settings | changes))
 
 
@@ -67,19 +69,32 @@ def write_checkpoint(
     path: Path, representation: dict[str, Any] = TANGENT, channels: int = 3
 ) -> Path:
     """Write a checkpoint of such a network, as `tangent-train` does."""
-    trained = trained_network(representation, channels)
-    network = {"_target_": "torch.nn.Conv2d", "in_channels": None, "out_channels": 3}
-    network |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}
-    content = {
-        "config": {
-            "network": network,
-            "representation": representation,
-            "level": representation["level"],
-        },
-        "predicts": "pixel_classes",
-        "state_dict": trained.network.state_dict(),
-        **inputs_and_classes(trained),
-    }
+    settings = {"_target_": "torch.nn.Conv2d", "in_channels": channels, "out_channels": 3}
+    settings |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}
+    loaded = trained_network(representation, channels, settings=settings)
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(content, path)
+    save_network(path, loaded)
+    return path
+
+
+def save_network(path: Path, loaded: LoadedNetwork) -> None:
+    """Write a checkpoint without entries of Lightning."""
+    tensors = {f"network.{name}": tensor for name, tensor in loaded.module.state_dict().items()}
+    torch.save({METADATA_KEY: loaded.plain(), "state_dict": tensors}, path)
+
+
+def write_depth_checkpoint(
+    path: Path,
+    depth_kind: DepthKind = "log_distance",
+    tensors: dict[str, torch.Tensor] | None = None,
+) -> Path:
+    """Write a checkpoint of a depth network: a 3×3 convolution to one channel."""
+    settings = {"_target_": "torch.nn.Conv2d", "in_channels": 3, "out_channels": 1}
+    settings |= {"kernel_size": 3, "padding": 1, "padding_mode": "replicate"}
+    module = build_from_config(settings, "network")
+    usual = {name: tensor[:1] for name, tensor in color_network().state_dict().items()}
+    module.load_state_dict(usual if tensors is None else tensors)
+    of_depth = {"class_names": (), "depth_kind": depth_kind}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save_network(path, trained_network(TANGENT, module=module, settings=settings, **of_depth))
     return path

@@ -21,7 +21,6 @@ from tangent_train.io.pixel_files import (
     read_rgb,
     write_pixels,
 )
-from tangent_train.io.png import read_png_header
 from tests.datamodules.data_files import (
     as_displayed,
     exif_orientation,
@@ -116,32 +115,17 @@ def test_gray_palette_and_transparency_are_decoded(tmp_path: Path) -> None:
         np.testing.assert_array_equal(read_rgb(tmp_path / f"{name}.png"), pixels, err_msg=name)
 
 
-def _raw_profile(kind: bytes, exif: bytes) -> bytes:
-    digits = (b"Exif\0\0" + exif).hex().encode()
-    text = b"\n%s\n%8d\n%s" % (kind.lower(), len(exif) + 6, digits)
-    return png_chunk(b"tEXt", b"Raw profile type %s\0%s" % (kind, text))
-
-
-_EXIF_FORMS = {
-    "chunk": lambda exif: png_chunk(b"eXIf", exif),
-    "raw profile": lambda exif: _raw_profile(b"exif", exif),
-    "raw APP1": lambda exif: _raw_profile(b"APP1", exif),
-}
-
-
-@pytest.mark.parametrize("form", _EXIF_FORMS)
-@pytest.mark.parametrize("place", ["before", "behind"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 @pytest.mark.parametrize("channels", [(), (2,), (3,), (4,)])
-def test_png_is_turned_wherever_its_exif_data_are(
-    tmp_path: Path, form: str, place: str, dtype: Any, channels: tuple[int, ...]
+def test_png_is_turned_by_its_exif_data(
+    tmp_path: Path, dtype: Any, channels: tuple[int, ...]
 ) -> None:
     """Labels too."""
     stored = _noise((4, 6, *channels), dtype)
     path = tmp_path / "image.png"
     for orientation in range(1, 9):
-        chunk = _EXIF_FORMS[form](exif_orientation(orientation))
-        path.write_bytes(png_bytes(stored, **{place: chunk}))
+        chunk = png_chunk(b"eXIf", exif_orientation(orientation))
+        path.write_bytes(png_bytes(stored, before=chunk))
         shown = as_displayed(stored, orientation)
         expected = {2: shown[..., 0], 4: shown[..., :3]}.get(stored.size // 24, shown)
         np.testing.assert_array_equal(read_pixels(path, indices=True), expected)
@@ -280,43 +264,29 @@ def test_other_tiff_files(tmp_path: Path) -> None:
     path.write_bytes(tiff_bytes(inks, tags={262: 5}))
     expected = (255.0 - inks[..., :3]) * (255.0 - inks[..., 3:]) / 255
     assert np.abs(read_rgb(path) - expected).max() <= 1
-    refused: list[tuple[NDArray[Any], dict[int, Any]]] = [
-        (values, {284: 2}),  # planes
-        (gray.astype(np.uint16) * 257, {262: 0}),
-        (_values("u2", 4), {338: 1}),  # colors multiplied by alpha
-        (_values("u2", 4), {262: 5}),
-        (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colors of fewer pixels
-        (gray.astype(np.uint16) // 16, {258: 12}),
-        (values, {339: [1, 1, 2]}),
-    ]
-    for pixels, tags in refused:
-        path.write_bytes(tiff_bytes(pixels, tags=tags))
-        with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
-            read_pixels(path, indices=False)
+    planes = {284: 2}
+    path.write_bytes(tiff_bytes(values, tags=planes))
+    np.testing.assert_array_equal(read_pixels(path, indices=False), values)
 
 
 @pytest.mark.parametrize(
-    ("pixels", "tags", "found"),
+    ("pixels", "tags"),
     [
-        (_values("f2", 1), {339: 3}, r"BitsPerSample \(16,\), SampleFormat \(3,\)"),
-        (_values("f8", 1), {339: 3}, r"BitsPerSample \(64,\), SampleFormat \(3,\)"),
-        (_values("u4", 3), {}, r"BitsPerSample \(32, 32, 32\)"),
-        (_values("i1", 3), {339: [2] * 3}, r"SampleFormat \(2, 2, 2\)"),
-        (_values("u2", 1), {258: 10}, r"BitsPerSample \(10,\)"),
-        (_values("u2", 3), {258: [12] * 3}, r"BitsPerSample \(12, 12, 12\)"),
-        (_values("u1", 3), {259: 34712}, "Compression 34712"),  # JPEG 2000
-        (_values("u1", 3), {259: 34887}, "Compression 34887"),  # LERC
-        (_values("u2", 1), {262: 3}, "PhotometricInterpretation 3"),  # a palette
+        (_values("u2", 1), {262: 0}),  # 0 is white
+        (_values("u2", 4), {338: 1}),  # colors multiplied by alpha
+        (_values("u2", 4), {262: 5}),  # inks
+        (_values("u1", 3), {262: 6, 530: [2, 2]}),  # colors of fewer pixels
+        (_values("u2", 3), {339: [1, 1, 2]}),
+        (_values("u1", 3), {259: 34712}),  # JPEG 2000
+        (_values("u2", 1), {262: 3}),  # a palette
     ],
 )
-@pytest.mark.parametrize("big", [False, True])
-def test_layouts_of_tiff_files_that_are_not_read_are_named(
-    tmp_path: Path, pixels: NDArray[Any], tags: dict[int, Any], found: str, big: bool
+def test_layouts_of_tiff_files_that_are_not_decoded_are_refused(
+    tmp_path: Path, pixels: NDArray[Any], tags: dict[int, Any]
 ) -> None:
     path = tmp_path / "image.tif"
-    path.write_bytes(tiff_bytes(pixels, tags=tags, big=big))
-    expected = rf"found a TIFF layout .*{found}.*; expected .*16 bits or depth of 32-bit float"
-    with pytest.raises(DataError, match=expected):
+    path.write_bytes(tiff_bytes(pixels, tags=tags))
+    with pytest.raises(DataError, match=r"image\.tif: found .*(layout|no image)"):
         read_pixels(path, indices=False)
 
 
@@ -427,16 +397,12 @@ def test_files_without_depth_are_refused(tmp_path: Path) -> None:
             read_depth_m(tmp_path / name, 1000)
 
 
-# --- PNG files of data sets -----------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("missing", [slice(-20, None), slice(-1, None), slice(1000, 3000)])
+@pytest.mark.parametrize("missing", [slice(-60, None), slice(1000, 3000)])
 def test_truncated_files_are_named(tmp_path: Path, missing: slice) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, (64, 128, 3), np.uint8)
     path = tmp_path / "image.png"
-    write_png(path, noise)
+    write_png(path, _noise((64, 128, 3)))
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)
-    with pytest.raises(DataError, match=r"image\.png: found .* truncated"):
-        read_png_header(path)
+    with pytest.raises(DataError, match=r"image\.png: found no image that can be decoded"):
+        read_pixels(path, indices=False)

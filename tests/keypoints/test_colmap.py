@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
-from tangent_train.keypoints import TwoView
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import estimate_two_view
 from tests.geometry.directions import random_directions, unit
@@ -61,20 +60,3 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
             assert geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED.value
             rotation = axes.T @ geometry.cam2_from_cam1.rotation.matrix() @ axes
             np.testing.assert_allclose(rotation, np.asarray(two_view.rotation, np.float64))
-
-
-@pytest.mark.parametrize("kind", ["PANORAMIC", "DEGENERATE"])
-def test_pairs_without_translation_have_another_kind(tmp_path: Path, kind: str) -> None:
-    rotated = kind == "PANORAMIC"
-    rotation = random_rotation(np.random.default_rng(1)) if rotated else None
-    two_view = TwoView(np.full(9, rotated), rotation)
-    matches = np.stack([np.arange(9), np.arange(9)], axis=1)
-    points = keypoints_at(random_directions(9))
-    path = tmp_path / "pair.db"
-    images_of_pair = [("a", (50, 100)), ("b", (60, 120))]
-    add_pair(path, images_of_pair, (points, points), matches, two_view)
-    with pycolmap.Database.open(path) as database:
-        assert database.num_cameras() == 2
-        geometry = database.read_two_view_geometry(1, 2)
-        assert geometry.config == getattr(pycolmap.TwoViewGeometryConfiguration, kind).value
-        assert len(geometry.inlier_matches) == (9 if rotated else 0)

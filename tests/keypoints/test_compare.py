@@ -44,9 +44,9 @@ def test_figures_are_those_of_the_counts_and_of_the_truth(pair: PanoramaPair) ->
         assert row["pmr"] == pytest.approx((p / n_left + p / n_right) / 2)
         assert row["ms"] == pytest.approx((f / n_left + f / n_right) / 2)
         assert row["p"] == pytest.approx(f / p)
-        found = comparison.found[row["condition"]][row["representation"]]
+        found = comparison.matched[row["condition"]][row["representation"]]
         assert (len(found.matches), int(found.geometry.inliers.sum())) == (p, f)
-        assert (row["geometry"], row["judged"]) == ("general", p)
+        assert (row["geometry"], row["verifiable"]) == ("general", p)
         assert row["rotation_error_deg"] < 1
         assert row["translation_error_deg"] < 5
         # The recall of one pair is 0 up to its error, and 1 beyond.
@@ -55,7 +55,7 @@ def test_figures_are_those_of_the_counts_and_of_the_truth(pair: PanoramaPair) ->
         assert row["pose_auc_10"] == pytest.approx(recall.mean(), abs=1e-3)
         assert row["pose_auc_5"] < row["pose_auc_10"] < row["pose_auc_20"] < 1
         # Inliers by the estimate and by the truth are nearly the same matches.
-        assert row["correct_share"] == row["correct"] / row["judged"]
+        assert row["correct_share"] == row["correct"] / row["verifiable"]
         assert abs(row["correct_share"] - row["p"]) < 0.1
 
 
@@ -68,7 +68,7 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
         for row in comparer.compare(PanoramaPair("x", None, other, blank)).rows:
             assert (row["fov_overlap"], row["visible_by"]) == (None, "all keypoints")
             assert row["visible_left"] == row["keypoints_left"]
-            assert (row["judged"], row["rotation_error_deg"]) == (None, None)
+            assert (row["verifiable"], row["rotation_error_deg"]) == (None, None)
             assert (row["putative"], row["geometry"]) == (0, "none")
             assert row["pose_auc_20"] is None
             assert row["pmr"] is row["ms"] is row["p"] is None
@@ -94,7 +94,7 @@ def test_keypoints_of_partial_panoramas_lie_in_their_areas(
     np.testing.assert_array_equal(read.left.valid, valid)
     comparison = Comparer((1,), seed=3).compare(read)
     for condition in (AS_GIVEN, ROTATED):
-        for matched in comparison.found[condition].values():
+        for matched in comparison.matched[condition].values():
             assert len(matched.left) > 20
             assert is_valid(valid, matched.left.directions_xyz).all()
             is_inside = is_valid(valid, matched.right.directions_xyz)

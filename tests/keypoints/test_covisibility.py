@@ -134,16 +134,6 @@ def test_distances_between_pixels_of_a_wall_are_exact() -> None:
     np.testing.assert_allclose(reach_m, distance_m, rtol=1e-6)
 
 
-def test_at_an_edge_of_depth_there_are_two_distances() -> None:
-    near_far = np.full((4, 8), 1.0)
-    near_far[:, 4:] = 5.0
-    view = DepthView(near_far, LEFT)
-    rays = lonlat_to_xyz([(-0.1, 0.0), (0.1, 0.0), (np.pi - 0.1, 0.0), (-np.pi + 0.1, 0.0)])
-    distance_m, reach_m = view.distances(rays)
-    np.testing.assert_allclose(distance_m, (1, 5, 5, 1))
-    np.testing.assert_allclose(reach_m, (1.1, 5.5, 5.5, 1.1))
-
-
 def test_matches_of_the_same_point_are_correct() -> None:
     left, right = ROOM.view(LEFT, (256, 512)), ROOM.view(tilted((1.6, -0.4, 1.4), 5), (256, 512))
     rng = np.random.default_rng(3)

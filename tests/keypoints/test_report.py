@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from datamodules.stanford2d3ds.pairs import published_pairs
-from tangent_train.keypoints.compare import AS_GIVEN, ROTATED, SHRUNK, Row
+from tangent_train.keypoints.compare import AS_GIVEN, SHRUNK, Row
 from tangent_train.keypoints.report import KeypointReport, with_splits
 
 PUBLISHED = {str(pair.number): pair for pair in published_pairs()}
@@ -70,24 +70,3 @@ def test_the_papers_figures_stand_beside_ours() -> None:
     assert ["", overlap, "83.6", "83.6", "83.6", "83.6", "83.6"] in table
     assert ["", f"{overlap}, paper", "83.4", "–", "–", "–", "–"] in table
     assert ["", "inliers, paper", "298", "–", "–", "–", "–"] in table
-
-
-def test_other_data_have_nothing_of_the_papers() -> None:
-    rows = [
-        row("a|b", fov_overlap=0.5, rotation_error_deg=1.0, correct_share=0.5),
-        row("a|b", condition=ROTATED, fov_overlap=0.5, pmr=0.4),
-        row("c", fov_overlap=0.6, rotation_error_deg=2.0, pmr=None, inliers=12345, pose_auc_5=0.6),
-        row("c", condition=ROTATED, fov_overlap=0.6),
-    ]
-    text = KeypointReport(rows, ("ERP",), {"seed": 0}, {}).markdown()
-    assert "paper" not in text
-    assert "by depth and pose" in text
-    table = tables(text)["As they are"]
-    assert table[1:3] == [["hard (1)", "PMR %", "20.0"], ["", "MS %", "10.0"]]
-    assert ["", "right matches %", "50.0"] in table
-    assert ["", "inliers", "12,345"] in table
-    assert ["", "rotation error °, median", "2"] in table
-    assert ["easy (1)", "PMR %", "–"] in table
-    assert tables(text)["Right panorama randomly rotated"][1][2] == "40.0"
-    bare = [row("a", visible_by="all keypoints")]
-    assert "n_L and n_R are all keypoints" in KeypointReport(bare, ("ERP",), {}, {}).markdown()

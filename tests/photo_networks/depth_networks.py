@@ -194,5 +194,5 @@ def depth_of(network: PhotoNetwork | LoadedNetwork, image: Any) -> Tensor:
         torch.tensor(values)[:, None, None]
         for values in (network.normalization.mean, network.normalization.std)
     )
-    depth: Tensor = network.network.eval()(((rgb - mean) / std)[None])[0, 0]
+    depth: Tensor = network.module.eval()(((rgb - mean) / std)[None])[0, 0]
     return depth

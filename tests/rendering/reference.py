@@ -73,14 +73,21 @@ def panorama_position(lonlat: Array, shape: tuple[int, int]) -> tuple[Array, Arr
 
 
 def panorama_row(image: Array, row: NDArray[np.int64], column: Array) -> Array:
-    """Interpolate linearly along a row. A row beyond a pole continues half a revolution further."""
+    """Interpolate linearly along a row. A row beyond a pole continues half a revolution further.
+
+    For an odd width its pixels are the means of the two columns that are nearest.
+    """
     height, width = image.shape[:2]
-    beyond = (row < 0) | (row >= height)
-    column = np.where(beyond, column + width / 2, column)
+    beyond = ((row < 0) | (row >= height))[..., None]
     row = np.where(row < 0, -1 - row, np.where(row >= height, 2 * height - 1 - row, row))
     left = np.floor(column).astype(int)
     right = (column - left)[..., None]
-    return (1 - right) * image[row, left % width] + right * image[row, (left + 1) % width]
+
+    def pixel(column: NDArray[np.int64]) -> Array:
+        far = [image[row, (column + half) % width] for half in (width // 2, (width + 1) // 2)]
+        return np.where(beyond, sum(far) / 2, image[row, column % width])
+
+    return np.asarray((1 - right) * pixel(left) + right * pixel(left + 1))
 
 
 def sample_panorama(image: Array, lonlat: Array, interpolation: str) -> Array:

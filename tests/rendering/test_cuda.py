@@ -49,7 +49,7 @@ def test_signals_and_their_panoramas_equal_those_on_the_cpu(
     expected = views.render(panorama, interpolation)
     on_gpu = views.render(panorama.cuda(), interpolation)
     torch.testing.assert_close(on_gpu.cpu(), expected, rtol=1e-4, atol=1e-4)
-    canvas, placed = (views.placed(signal, SHAPE)[0] for signal in (expected, on_gpu))
+    canvas, placed = (views.on_canvas(signal, SHAPE)[0] for signal in (expected, on_gpu))
     torch.testing.assert_close(placed.cpu(), canvas, rtol=1e-4, atol=1e-4)
 
 

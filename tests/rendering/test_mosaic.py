@@ -22,15 +22,15 @@ from tangent_train.geometry import (
 from tangent_train.rendering import (
     Blend,
     PerspectiveRepresentation,
-    accumulate,
+    numba_sums,
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.mosaic import DepthMosaic, ScoreMosaic
+from tangent_train.rendering.mosaic import MeanMosaic, ScoreMosaic
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.views import PinholeViews
 
-Mosaic = TypeVar("Mosaic", ScoreMosaic, DepthMosaic)
+Mosaic = TypeVar("Mosaic", ScoreMosaic, MeanMosaic)
 
 RINGS = [{"pitch": pitch, "views": 5} for pitch in (0, 50, -50)]
 GRIDS = [
@@ -134,7 +134,7 @@ def test_large_sums_are_in_a_file_and_equal(monkeypatch: pytest.MonkeyPatch) -> 
     grid, shape = GRIDS[0]
     scores = _scores(grid)
     expected = _probabilities(_added(ScoreMosaic(shape, 7, "feather"), scores, grid))
-    monkeypatch.setattr(accumulate, "_IN_MEMORY_BYTES", 0)
+    monkeypatch.setattr(numba_sums, "_IN_MEMORY_BYTES", 0)
     result = _added(ScoreMosaic(shape, 7, "feather"), scores, grid)
     assert isinstance(result.sums, np.memmap)
     np.testing.assert_array_equal(_probabilities(result), expected)
@@ -149,12 +149,12 @@ def test_depth_is_the_weighted_mean_of_known_pixels(
     depth[torch.rand(depth.shape, generator=torch.Generator().manual_seed(0)) < 0.2] = torch.nan
     depth[0] = torch.inf
     depth[torch.from_numpy(grid.directions()[:, None] @ (0.6, 0, 0.8) > 0.7)] = torch.nan
-    result = _added(DepthMosaic(shape, blend), depth, grid)
+    result = _added(MeanMosaic(shape, blend), depth, grid)
     assert result.sums.shape[2] == 2, "16 numbers per pixel would be half a gigabyte at level 10"
     known = depth.isfinite()
     pair = torch.cat([depth.where(known, 0), known.float()], dim=1).double()
     total, weight = tangent_to_equirect(pair, grid, shape, blend)
-    values = result.values()
+    values = result.values()[0]
     least = 0.5 if blend == "nearest" else 0.05
     seen = weight > least + 1e-6
     torch.testing.assert_close(values[seen].double(), (total / weight)[seen], atol=1e-4, rtol=1e-4)

@@ -21,7 +21,6 @@ from tangent_train.rendering import (
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.accumulate import NO_OWNERS
 from tangent_train.rendering.compiled import over_rows
 
 ROTATION = random_rotation(np.random.default_rng(2))
@@ -54,7 +53,7 @@ def test_spans_contain_the_covered_pixels_and_few_others(at_pole: int | None) ->
     shape, grid = (130, 200), TangentGrid(1, 6)
     if at_pole is not None:
         grid = grid.with_rotation([[1], [-1], [1]] * grid.world_from_camera[at_pole].T)
-    geometry = tables.canvas_geometry(grid, grid.face_indices(), shape, slice(0, 130), NO_OWNERS)
+    geometry = tables.canvas_geometry(grid, grid.face_indices(), shape, None)
     first, count = np.moveaxis(geometry.spans[..., None], 2, 0)
     held = (np.arange(shape[1]) - first) % shape[1] < count
     x, y, z = np.einsum("nji,hwj->inhw", grid.world_from_camera, equirect_directions(shape))
@@ -62,28 +61,6 @@ def test_spans_contain_the_covered_pixels_and_few_others(at_pole: int | None) ->
     seen = (z > 0) & (np.maximum(np.abs(x), np.abs(y)) < half * z)
     assert not np.any(seen & ~held)
     assert held.sum() < 1.1 * seen.sum()
-
-
-@pytest.mark.parametrize("blend", ["feather", "nearest"])
-def test_bands_are_parts_of_the_whole(monkeypatch: pytest.MonkeyPatch, blend: Any) -> None:
-    grid, shape = TangentGrid(0, 5), (32, 64)
-    images = torch.rand(20, 2, 32, 32, dtype=torch.float64)
-    arrays = images.movedim(1, -1).float().numpy()
-
-    def rendered() -> list[torch.Tensor]:
-        return [
-            tangent_to_equirect(images, grid, shape, blend),
-            tangent_to_equirect(images, grid, shape, interpolation="nearest"),
-            tangent_to_labels(images, grid, shape, blend).double(),
-            tangent_to_labels(images.float(), grid, shape, blend).double(),
-            torch.from_numpy(tangent_to_equirect(arrays, grid, shape, blend)).double(),
-        ]
-
-    whole = rendered()
-    monkeypatch.setattr("tangent_train.rendering.backward._BAND", 64 * 5)
-    monkeypatch.setattr("tangent_train.rendering.accumulate._SPANS", 1)
-    for band, expected in zip(rendered(), whole, strict=True):
-        torch.testing.assert_close(band, expected, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
@@ -104,7 +81,7 @@ def test_tables_are_computed_once(
         pytest.fail("a table was computed again")
 
     first = render((40, 80))
-    for maker in ("over_rows", "equirect_map"):
+    for maker in ("over_rows", "positions_of_rays"):
         monkeypatch.setattr(tables, maker, computed_again)
     for result, before in zip(render((40, 80)), first, strict=True):
         np.testing.assert_array_equal(result, before)

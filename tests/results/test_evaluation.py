@@ -19,7 +19,6 @@ from tangent_train.results.evaluation import (
     confusion_table,
     headline,
     result_tables,
-    summary_lines,
     write_results,
 )
 from tangent_train.results.evaluation_result import EvaluationResult
@@ -135,16 +134,6 @@ def test_means_over_fewer_classes_have_a_note() -> None:
     as_zero = _record(_matrices({(1, 1): 90}), "zero")
     assert headline(as_zero).endswith(" over 7 panoramas")
     assert result_tables(as_zero)[0].note == ""
-
-
-def test_facts_of_the_protocol_stand_below_the_headline(tmp_path: Path) -> None:
-    record = replace(_record(), protocol={"range": "0 to 10 m", "test_rotation": "none"})
-    facts = "range: 0 to 10 m; test rotation: none"
-    assert summary_lines(record) == [headline(record), facts]
-    assert summary_lines(_record()) == [headline(_record())]
-    write_results(record, tmp_path, ["a note"])
-    text = (tmp_path / "results.md").read_text()
-    assert f"{headline(record)}\n\n{facts}\n\na note\n" in text
 
 
 def test_means_stand_with_their_intervals(tmp_path: Path) -> None:

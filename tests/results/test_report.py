@@ -17,7 +17,6 @@ from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
 from tangent_train.results.published import (
     facts,
-    publications,
     published_lines,
     published_rows,
     published_table,
@@ -179,19 +178,6 @@ def test_every_published_score_has_a_protocol_and_every_protocol_its_data() -> N
         assert 0 < float(line["mean"] or 50) < 100
 
 
-def test_rows_are_in_the_order_of_their_levels() -> None:
-    records = [example_result([0.5] * 3, name=str(level), level=level) for level in (10, 9)]
-    assert list(_cells(_runs_report(*records))) == ["9", "10"]
-
-
-@pytest.mark.parametrize(
-    "changes", [{"protocol": {"data": "SynthRooms"}}, {"protocol": {}}, {"level": 6}]
-)
-def test_nothing_published_stands_beside_other_data(changes: dict[str, Any]) -> None:
-    assert _paper()
-    assert not {name for name in _paper(**changes) if name[0] == "S"}
-
-
 @pytest.mark.parametrize(("name", "macc", "miou"), [("P", 61.8, 45.7), ("S-FT-10", 64.0, 49.6)])
 def test_the_papers_transfer_is_the_mean_of_its_printed_folds(
     name: str, macc: float, miou: float
@@ -254,34 +240,6 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
     low, middle, high = map(blue_rows, (0.0, 0.4, 0.8))  # two rows of axes, the legend's handle
     assert high - middle == pytest.approx(middle - low, abs=8)
     assert high - low > 200
-
-
-def test_published_depth_has_its_units_and_the_smallest_error_is_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """The file has no such scores yet."""
-    lines = [
-        dict.fromkeys(next(published_lines()), "")
-        | {"protocol": "stanford2d3ds_depth", "method": method, "score": score, "mean": mean}
-        for method, scores in (("far", ("0.12", "88", "0.4")), ("near", ("0.1", "92.5", "0.36")))
-        for score, mean in zip(("absrel", "delta1", "rmse"), scores, strict=True)
-    ]
-    monkeypatch.setattr("tangent_train.results.published.published_lines", lambda: lines)
-    uncached = publications.__wrapped__
-    monkeypatch.setattr("tangent_train.results.published.publications", uncached)
-    protocol = facts("stanford2d3ds_depth")
-    means = dict.fromkeys(DepthTask.columns, 0.25)
-    record = EvaluationResult("panoramas", 2, DepthTask.columns, means, protocol=protocol)
-    aligned = replace(record, protocol=protocol | {"views_aligned": "scale"})
-    rows, _ = published_rows([aligned])
-    table = published_table(rows, aligned)
-    assert table.header == ("", "input", "AbsRel ↓", "δ1 %", "RMSE m ↓")
-    assert table.rows == [
-        ("far (paper)", "–", "0.12", "88.0", "0.4"),
-        ("near (paper)", "–", "0.1", "92.5", "0.36"),
-    ]
-    _, (note,) = published_rows([replace(record, protocol=protocol | {"mask": "-60"})])
-    assert note.startswith("Not comparable: near: 0.1 and 1 more (stanford2d3ds_depth). mask: ")
 
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:

@@ -32,19 +32,14 @@ class _Plain(nn.Conv2d):
 class OneSize(_Plain):
     """Something learned for every pixel."""
 
+    fixed_size = (24, 40)
+
     def __init__(self, channels: int = 4, classes: int = 4) -> None:
         super().__init__(channels, classes)
         self.places = nn.Parameter(torch.randn(classes, 24, 40))
 
     def forward(self, images: Tensor) -> Tensor:
         return super().forward(images) + self.places
-
-
-class TwoSizes(_Plain):
-    """Another computation for wide images: a trace contains only one of them."""
-
-    def forward(self, images: Tensor) -> Tensor:
-        return super().forward(images) * (2 if images.shape[-1] > 35 else 1)
 
 
 class Tracing(_Plain):

@@ -10,10 +10,9 @@ import torch
 from torch import nn
 
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.loaded import LoadedNetwork, completed_settings
-from tangent_train.checkpoints.scores import ClassScoreNetwork, size_multiple_of
-from tangent_train.cli.run import build, inputs_and_classes
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.checkpoints.loaded import LoadedNetwork, declared_sizes
+from tangent_train.cli.run import Run, build
+from tangent_train.config.build import build_from_config
 from tangent_train.tasks import SegmentationTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
@@ -38,7 +37,7 @@ def small_trained(
     """As it comes out of a checkpoint, with random numbers."""
     torch.manual_seed(1)
     network = with_statistics(build_from_config(settings, "network")).eval()
-    multiple = size_multiple_of(ClassScoreNetwork(network, len(NAMES) - 1), 4)
+    multiple, fixed = declared_sizes(network)
     return trained_network(
         TANGENT | {"level": 5},
         channels=4,
@@ -46,11 +45,11 @@ def small_trained(
         class_names=NAMES,
         normalization=Normalization([0.5, 0.4, 0.3, 1.1], [0.2, 0.25, 0.3, 0.8]),
         image_size=image_size,
-        size_multiple=multiple or 1,
-        fixed_size=None if multiple else image_size,
+        size_multiple=multiple,
+        fixed_size=fixed,
         fill="edge",
         settings=settings,
-        source=SettingsFile(Path("x.ckpt"), trust={settings["_target_"]}),
+        trust=(settings["_target_"],),
     )
 
 
@@ -67,11 +66,9 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
     settings = composed_settings("train", "level=4", *overrides)
     torch.manual_seed(2)
     data, task = build(settings)
-    settings["network"] = completed_settings(
-        settings["network"], data.in_channels, data.num_classes
-    )
     with_statistics(task.network)
-    content = {"config": settings, "predicts": task.predicts, **inputs_and_classes(data)}
+    run = Run(path.parent, settings, data, task)
+    content = run.contents()
     torch.save(content | {"state_dict": task.state_dict()}, path)
     trained: SegmentationTask = task.eval()
     return trained

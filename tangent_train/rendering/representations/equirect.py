@@ -63,7 +63,7 @@ class EquirectViews(Views):
         view: Any = np.ascontiguousarray(shown[None])
         return view
 
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
+    def on_canvas(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return the scores of the unrotated panorama, extended by a pixel on all sides."""
         scores = scores.roll(self.first, -1)
         if self.rotation is not None:

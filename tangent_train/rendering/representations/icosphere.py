@@ -42,9 +42,7 @@ from tangent_train.rendering.representations.pinhole import unless_identity, ver
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import (
-    Taps,
-    bilinear_equirect_taps,
-    sample,
+    sample_tensor,
 )
 from tangent_train.rendering.tables import Value, cached
 
@@ -54,7 +52,7 @@ _SYMMETRY_DEG = 72.0
 """Rotation about the vertical after which an icosphere is the same."""
 
 _CHUNK = 2**18
-"""Number of points whose positions or taps are computed at once."""
+"""Number of points that are sampled at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,14 +115,14 @@ class IcosphereViews(Views):
         result = np.rint(result) if image.dtype.kind in "ui" else result
         return result.astype(image.dtype).reshape(1, 1, -1, *rest)
 
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
+    def on_canvas(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return scores ``(1, K, 1, V)`` interpolated to the canvas, and the canvas as one view."""
         values = scores[0, :, 0]
         if self.elements == "faces" and self.interpolation == "barycentric":
             values = torch.cat([_at_vertices(values, self.level), values], dim=1)
-        source, weight = self._table(("scores", self.interpolation), shape, self._score_taps)
-        taps = Taps(*(torch.from_numpy(part).to(scores.device) for part in (source, weight)))
-        canvas = sample(values, taps).reshape(1, -1, *shape)
+        table = self._table(("scores", self.interpolation), shape, self._score_weights)
+        source, weight = (torch.from_numpy(part).to(scores.device) for part in table)
+        canvas = _weighted_sums(values, source, weight).reshape(1, -1, *shape)
         box = np.array([[0.0, 0.0, shape[1], shape[0]]])
         return canvas, PhotoCrops(box, shape, is_overlapping=False)
 
@@ -167,17 +165,19 @@ class IcosphereViews(Views):
 
     def _means(self, image: Tensor) -> Tensor:
         """Return means ``(C, V)`` of an image ``(C, H, W)`` over cells, differentiable."""
-        shape, source = (image.shape[-2], image.shape[-1]), image.flatten(-2)
+        shape = image.shape[-2], image.shape[-1]
         positions = self._table(("points",), shape, self._points)[0]
         parts = []
         for start in range(0, positions.shape[1], _CHUNK):
             u, v = torch.from_numpy(positions[:, start : start + _CHUNK]).to(image.device)
-            parts.append(sample(source, bilinear_equirect_taps(u, v, shape)))
-        _, *taps = sampling_points(self.level, self.elements)
-        average = Taps(*(torch.from_numpy(part).to(image.device) for part in taps))
-        return sample(torch.cat(parts, dim=1), average)
+            parts.append(sample_tensor(image, u, v))
+        _, *tables = sampling_points(self.level, self.elements)
+        source, weight = (torch.from_numpy(part).to(image.device) for part in tables)
+        return _weighted_sums(torch.cat(parts, dim=1), source, weight)
 
-    def _score_taps(self, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    def _score_weights(
+        self, shape: tuple[int, int]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return sources and weights ``(T, H W)`` of the scores at each pixel of a canvas."""
         directions = equirect_directions(shape).reshape(-1, 3)
         if self.matrix is not None:
@@ -202,7 +202,16 @@ def _at_vertices(values: Tensor, level: int) -> Tensor:
     around = torch.tensor(faces_of_vertices(level).T).to(values.device)
     is_face = around >= 0
     weight = is_face / is_face.sum(dim=0).to(values.dtype)
-    return sample(values, Taps(around.clamp(min=0), weight))
+    return _weighted_sums(values, around.clamp(min=0), weight)
+
+
+def _weighted_sums(values: Tensor, source: Tensor, weight: Tensor) -> Tensor:
+    """Return ``(K, P)`` sums of values ``(K, V)``, given sources and weights ``(T, P)``."""
+    # gather, not index_select: its gradient is ten times faster on a CPU.
+    size, total = (len(values), source.shape[1]), torch.zeros((), device=values.device)
+    for index, share in zip(source, weight, strict=True):
+        total = total + values.gather(1, index.expand(size)) * share
+    return total.to(values.dtype)
 
 
 class IcosphereRepresentation:

@@ -21,7 +21,7 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 from tangent_train.geometry import lengths_of_rays, shift_range
 from tangent_train.rendering.forward import Interpolation, Pixels
-from tangent_train.rendering.kernels import CanvasGeometry
+from tangent_train.rendering.kernels import NO_OWNERS, CanvasGeometry
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.resampling import crop
 from tangent_train.rendering.sampling import plane_rays
@@ -65,6 +65,11 @@ class PhotoCrops(Views):
         return np.arange(len(self.boxes)) if self.numbers is None else self.numbers
 
     @property
+    def num_images(self) -> int:  # type: ignore[override]
+        """See `Views`."""
+        return len(self.boxes)
+
+    @property
     def all_images(self) -> object:  # type: ignore[override]
         """See `Views`."""
         return self.boxes
@@ -104,14 +109,14 @@ class PhotoCrops(Views):
 
     def owners(self, shape: tuple[int, int]) -> NDArray[np.int32]:
         """See `Views`."""
+        height, width = shape
+        edges = np.ceil(cells_of(self._on_canvas) - 0.5).clip(0, (width, height, width, height))
         owner = np.zeros(shape, np.int32)
-        for number, (left, top, right, bottom) in enumerate(self._owned_pixels(shape)):
+        for number, (left, top, right, bottom) in enumerate(edges.astype(np.intp)):
             owner[top:bottom, left:right] = number
         return owner
 
-    def geometry(
-        self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
-    ) -> CanvasGeometry:
+    def geometry(self, shape: tuple[int, int], owner: NDArray[np.integer] | None) -> CanvasGeometry:
         """See `Views`."""
         boxes = self._on_canvas[self.chosen]
         across, down = (self.size[1 - i] / (boxes[:, 2 + i] - boxes[:, i]) for i in (0, 1))
@@ -122,18 +127,9 @@ class PhotoCrops(Views):
         matrices[:, 2, 1] = 1
         columns, lines = plane_rays(shape)
         seen = np.concatenate([np.floor(boxes[:, :2]), np.ceil(boxes[:, 2:])], axis=1)
-        spans = _spans(seen, shape)[:, rows]
-        return CanvasGeometry(self.chosen, matrices, spans, columns, lines[rows], owner)
-
-    def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """See `Views`."""
-        return _spans(self._owned_pixels(shape)[self.chosen], shape)
-
-    def _owned_pixels(self, shape: tuple[int, int]) -> NDArray[np.intp]:
-        """Return ``(N, 4)``: first column and row of the owned pixels, and those after the last."""
-        height, width = shape
-        edges = np.ceil(cells_of(self._on_canvas) - 0.5).clip(0, (width, height, width, height))
-        return edges.astype(np.intp)
+        spans = _spans(seen, shape)
+        owner = NO_OWNERS if owner is None else owner
+        return CanvasGeometry(self.chosen, matrices, spans, columns, lines, owner)
 
     @property
     def _on_canvas(self) -> NDArray[np.float64]:

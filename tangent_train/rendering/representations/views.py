@@ -21,7 +21,7 @@ from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
-from tangent_train.rendering.tables import canvas_geometry, find_owned_spans, owners
+from tangent_train.rendering.tables import canvas_geometry, owners
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
 """Rotation of training panoramas: none, about the vertical, or uniformly over SO(3)."""
@@ -39,11 +39,13 @@ class Views:
     Attributes:
         is_overlapping: True if every pixel is inside an image, not only on its outer edge.
         chosen: ``(n,)`` numbers of these views, 0 … N − 1.
+        num_images: Number N of views in the set.
         all_images: An object that identifies the set of N views.
     """
 
     is_overlapping: bool
     chosen: NDArray[np.int64]
+    num_images: int
     all_images: object
 
     def __len__(self) -> int:
@@ -81,7 +83,7 @@ class Views:
         """
         return np.ones((1, 1, 1), np.float32)
 
-    def placed(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
+    def on_canvas(self, scores: Tensor, shape: tuple[int, int]) -> tuple[Tensor, Views]:
         """Return scores ``(n, K, h, w)`` as images on the canvas ``(H, W)``, and their geometry."""
         del shape
         return scores, self
@@ -90,20 +92,13 @@ class Views:
         """Return the number of the image with the nearest center for each pixel ``(H, W)``."""
         raise NotImplementedError
 
-    def geometry(
-        self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
-    ) -> CanvasGeometry:
-        """Return the geometry of the views and some rows of the canvas.
+    def geometry(self, shape: tuple[int, int], owner: NDArray[np.integer] | None) -> CanvasGeometry:
+        """Return the geometry of the views and the canvas.
 
         Args:
             shape: ``(H, W)`` of the canvas.
-            rows: Rows of the canvas, without a step.
-            owner: ``(rows, W)`` owners; empty for feathering.
+            owner: ``(H, W)`` owners; None for feathering.
         """
-        raise NotImplementedError
-
-    def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """Return ``(n, H, 2)`` spans of the canvas that contain the owned pixels of each image."""
         raise NotImplementedError
 
 
@@ -171,6 +166,11 @@ class PinholeViews(Views):
         return self.grid
 
     @property
+    def num_images(self) -> int:  # type: ignore[override]
+        """See `Views`."""
+        return self.grid.num_images
+
+    @property
     def is_overlapping(self) -> bool:  # type: ignore[override]
         """See `Views`."""
         return self.grid.is_overlapping
@@ -201,12 +201,6 @@ class PinholeViews(Views):
         """See `Views`."""
         return owners(self.grid, shape)
 
-    def geometry(
-        self, shape: tuple[int, int], rows: slice, owner: NDArray[np.integer]
-    ) -> CanvasGeometry:
+    def geometry(self, shape: tuple[int, int], owner: NDArray[np.integer] | None) -> CanvasGeometry:
         """See `Views`."""
-        return canvas_geometry(self.grid, self.chosen, shape, rows, owner)
-
-    def owned_spans(self, shape: tuple[int, int]) -> NDArray[np.int32]:
-        """See `Views`."""
-        return find_owned_spans(self.grid, self.chosen, shape)
+        return canvas_geometry(self.grid, self.chosen, shape, owner)

@@ -162,11 +162,11 @@ def test_round_trip_of_a_smooth_function(
     expected = smooth(equirect_directions(shape)).astype(np.float32)
     signal = views.render(expected, "bilinear")[0]
     scores = torch.from_numpy(signal).movedim(-1, 0)[None]
-    canvas, placed = views.placed(scores, shape)
+    canvas, placed = views.on_canvas(scores, shape)
     assert len(placed) == 1
     assert np.abs(canvas[0].movedim(0, -1).numpy() - expected).max() < most, "poles and seam too"
     exactly = torch.full_like(scores, 3.5)
-    torch.testing.assert_close(views.placed(exactly, shape)[0], torch.full_like(canvas, 3.5))
+    torch.testing.assert_close(views.on_canvas(exactly, shape)[0], torch.full_like(canvas, 3.5))
 
 
 @both_elements
@@ -174,7 +174,7 @@ def test_scores_at_the_directions_of_a_signal_are_kept(elements: IcosphereElemen
     # A canvas of one row and column per direction does not exist: the nearest pixels of a fine one.
     views, shape = IcosphereViews(1, elements), (512, 1024)
     values = torch.rand(1, 2, 1, icosphere_count(1, elements))
-    canvas, _ = views.placed(values, shape)
+    canvas, _ = views.on_canvas(values, shape)
     there = views.render(canvas[0], "nearest")[0]
     assert (there - values[0]).abs().max() < 0.02
 

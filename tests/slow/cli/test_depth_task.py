@@ -14,9 +14,8 @@ import torch
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
-from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
-from tests.inference.trained import sphere
+from tests.inference.trained import sphere, write_depth_checkpoint
 from tests.slow.cli.test_sweeps import OLD_SQLALCHEMY
 
 SETTINGS = (

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
 from tangent_train.cli.run import build
-from tangent_train.cli.transfer_stages import plan
+from tangent_train.cli.transfer import Stage, stage_settings
 from tangent_train.config.build import build_from_config
-from tests.cli.test_compose import EXPERIMENTS
+from tangent_train.config.settings import SETTINGS, validate
+from tests.config.test_settings import EXPERIMENTS
 from tests.running import command_of, composed
 
 TRANSFERS = [name for name in EXPERIMENTS if command_of(name) == "transfer" and name != "zero_shot"]
@@ -22,14 +22,15 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
     """Build all of a run without numbers; the names of all tensors."""
     if "weights" in config.network:
         config.network.weights = None  # nothing from the internet
-    settings: Any = OmegaConf.to_container(config, resolve=True)
+    known = [name for name in SETTINGS["check"].model_fields if name in config]
+    settings = validate("check", {name: config[name] for name in known})
     with torch.device("meta"):  # shapes only: build runs the network on an image of full size
         data, task = build(settings)
     assert task.class_names == data.class_names
     trainer = build_from_config(
-        settings["trainer"], "trainer", logger=False, enable_checkpointing=False
+        settings.trainer, "trainer", logger=False, enable_checkpointing=False
     )
-    assert trainer.max_epochs == settings["trainer"]["max_epochs"]
+    assert trainer.max_epochs == settings.trainer["max_epochs"]
     assert task.optimization(lambda: {"epoch": 1000, "step": 1000})
     return set(task.state_dict())
 
@@ -40,13 +41,11 @@ def test_every_experiment_composes_and_instantiates(experiment: str) -> None:
 
 
 @pytest.mark.parametrize("experiment", TRANSFERS)
-def test_both_kinds_of_images_of_a_transfer_get_one_network(
-    experiment: str, tmp_path: Path
-) -> None:
+def test_both_kinds_of_images_of_a_transfer_get_one_network(experiment: str) -> None:
     config = composed("transfer", f"experiment={experiment}")
-    stages = plan(config, tmp_path, {})
-    first = [stage for stage in stages if stage.fold == stages[0].fold]
-    assert first[-1].name.startswith("S-FT-" if config.fine_tuning.epochs else "S")
-    photos = next(stage for stage in first if stage.name == "P")
-    names = [_builds_at_full_size(OmegaConf.create(s.config)) for s in (photos, first[-1])]
+    names = []
+    for kind in ("P", "S"):
+        stage = Stage(kind, "train", {})
+        settings = stage_settings(config, Path(), stage)
+        names.append(_builds_at_full_size(OmegaConf.create(settings)))
     assert names[0] == names[1]

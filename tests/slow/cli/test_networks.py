@@ -26,7 +26,7 @@ ALIKE = {"unet_small", "unet_context", "fcn_resnet_context"}
 DEPTH = {"fcn_resnet": "network.depth=50", "fcn_resnet_context": "network.network.depth=50"}
 
 
-def _composed(*overrides: str) -> dict[str, Any]:
+def _composed(*overrides: str) -> Any:
     return composed_settings("train", "level=5", "representation.erp_height=32", *overrides)
 
 
@@ -59,7 +59,7 @@ def test_every_kind_of_network_can_be_exported_for_images_of_any_size(
     save_checkpoint(tmp_path / "net.ckpt", f"network={network}", *level, *shallow)
     trained = load_network(tmp_path / "net.ckpt")
     path = tmp_path / f"net{suffix}"
-    assert export_network(trained, path).trained.fixed_size is None
+    assert export_network(trained, path).loaded.fixed_size is None
     again, step = load_network(path), trained.size_multiple
     for count, size in ((1, (64, 96)), (5, (32 + step, 64))):
         images = some_images(trained, count, size)

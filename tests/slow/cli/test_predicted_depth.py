@@ -12,11 +12,10 @@ from datamodules import FolderPanoramas
 from datamodules.core.splits import SPLITS
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
-from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.cli.tiny_runs import Run, predicted, results, run_command
 from tests.datamodules.data_files import read_png
 from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_panorama
-from tests.inference.trained import sphere, write_checkpoint
+from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 
 ROWS = 64
 

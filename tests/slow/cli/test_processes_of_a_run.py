@@ -3,28 +3,26 @@
 from __future__ import annotations
 
 import csv
-import os
 import re
 import shutil
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from tangent_train.cli.processes import command_line
 from tangent_train.results.evaluation_result import load_result
-from tests.cli.test_commands import CUT_SHORT
+from tests.cli.test_train import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.datamodules.data_files import write_png
-from tests.running import ROOT, further_processes, has_ended, run_python, wait_for
+from tests.running import run_python
+
+TRAIN, EVALUATE = (command_line(name, (), Path())[0] for name in ("train", "evaluate"))
 
 
-def _train(folder: Path, *arguments: str, status: int = 0, program: str = "-m") -> str:
-    command = ["-m", "tangent_train.cli.main", "train"] if program == "-m" else [program]
-    done = run_python(folder, *command, *arguments)
+def _train(folder: Path, *arguments: str, status: int = 0, program: str = TRAIN) -> str:
+    done = run_python(folder, program, *arguments)
     assert done.returncode == status, done.stderr
     return done.stderr
 
@@ -75,15 +73,14 @@ def test_two_processes_make_the_steps_and_figures_of_one(
 
     (tmp_path / "cut_short.py").write_text(CUT_SHORT)
     _train(tmp_path, *two, "hydra.run.dir=cut", status=143, program="cut_short.py")
-    resumed = (f"resume={tmp_path / 'cut'}", rooms, *devices, "trainer.strategy=ddp")
-    _train(tmp_path, *resumed)
+    _train(tmp_path, f"resume={tmp_path / 'cut'}")
     assert results(tmp_path / "cut") == results(tmp_path / "two")
     checkpoint = f"checkpoint={tmp_path / 'one' / 'checkpoints' / 'last.ckpt'}"
     odd = "data.fold=3"  # five test panoramas: 3 and 2
-    run("evaluate", checkpoint, rooms, odd, "hydra.run.dir=again")
+    data = [text for text in SETTINGS if text.startswith("data.")] + [rooms, "data=synthrooms"]
+    run("evaluate", checkpoint, *data, odd, "hydra.run.dir=again")
     ddp = ["trainer=ddp", *devices, "hydra.run.dir=evaluated"]
-    evaluate = ("-m", "tangent_train.cli.main", "evaluate", checkpoint, rooms, odd, *ddp)
-    assert run_python(tmp_path, *evaluate).returncode == 0
+    assert run_python(tmp_path, EVALUATE, checkpoint, *data, odd, *ddp).returncode == 0
     figures = [results(tmp_path / folder) for folder in ("again", "evaluated")]
     assert figures[0]["images"] == figures[1]["images"] == 5
     assert figures[0]["confusion"] == figures[1]["confusion"]
@@ -119,21 +116,3 @@ def test_depth_of_two_processes_is_that_of_one(
         assert second.intervals[name] == pytest.approx(interval, rel=1e-4)
     for bands in zip(first.latitude_bands, second.latitude_bands, strict=True):
         assert bands[1]["absrel"] == pytest.approx(bands[0]["absrel"], rel=1e-4)
-
-
-@pytest.mark.parametrize("seconds", [0, 3, 8])
-def test_no_process_outlives_a_first_one_that_was_killed(
-    seconds: float, rooms: str, tmp_path: Path
-) -> None:
-    """Killed when it has started the other one, while they join, and in training."""
-    settings = [*SETTINGS, rooms, "trainer=ddp", "trainer.accelerator=cpu", "trainer.devices=2"]
-    line = [sys.executable, "-m", "tangent_train.cli.main", "train", *settings]
-    line += ["data.val_fraction=0.4", "trainer.max_epochs=1000"]
-    environment = {name: text for name, text in os.environ.items() if name != "LOCAL_RANK"}
-    environment["PYTHONPATH"] = str(ROOT)
-    with subprocess.Popen(line, cwd=tmp_path, env=environment) as first:
-        wait_for(lambda: further_processes(first.pid), 120)
-        (other,) = further_processes(first.pid)
-        time.sleep(seconds)
-        first.kill()
-        wait_for(lambda: has_ended(other), 60)

@@ -26,7 +26,6 @@ from PIL import ExifTags, Image
 from datamodules.cityscapes.classes import CLASSES
 from tangent_train.geometry import TangentGrid
 from tangent_train.io.camera_files import write_rig
-from tests.checkpoints.test_distances import write_depth_checkpoint
 from tests.conftest import fabricate
 from tests.datamodules.cityscapes.street_format import (
     write_cityscapes,
@@ -40,6 +39,7 @@ from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pa
 from tests.datamodules.structured3d.structured3d_format import write_structured3d
 from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
 from tests.datamodules.zind.zind_format import write_homes
+from tests.inference.trained import write_depth_checkpoint
 from tests.photo_networks import depth_networks
 from tests.photo_networks import huggingface_networks as networks
 from tests.slow.documentation.commands import TIME, fill_in, small_settings

@@ -12,7 +12,7 @@ import tangent_train as tt
 from models.huggingface import DEPTH, network_types
 from tangent_train.errors import SettingError
 from tangent_train.inference.export import export_network
-from tangent_train.photo_networks import depth_kinds, huggingface, import_network
+from tangent_train.photo_networks import huggingface, import_network
 from tests.photo_networks import depth_networks as depth
 from tests.photo_networks.huggingface_networks import saved
 from tests.photo_networks.test_depth import check_family
@@ -27,7 +27,7 @@ def test_depth_is_that_of_the_library(family: Any, tmp_path: Path) -> None:
 
 def test_all_families_are_tried_or_refused() -> None:
     tried = {make()[0].config.model_type for make, *_ in depth.FAMILIES}
-    assert tried | set(depth_kinds._REFUSED) == network_types(DEPTH)
+    assert tried | set(huggingface._REFUSED) == network_types(DEPTH)
 
 
 @each_family
@@ -66,4 +66,4 @@ def test_a_graph_that_the_exporter_specializes_is_for_one_size(tmp_path: Path) -
     network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
     trained = import_network(network, tmp_path / "net.ckpt")
     assert (trained.size_multiple, trained.fixed_size) == (14, None)
-    assert export_network(trained, tmp_path / "net.onnx").trained.fixed_size == (70, 70)
+    assert export_network(trained, tmp_path / "net.onnx").loaded.fixed_size == (70, 70)

@@ -157,49 +157,6 @@ def test_walls_are_straight_from_three_sides_and_from_inside(
     close(report.pixels(), colors_at(np.nan_to_num(inside)), but=0.04)
 
 
-def test_drag_keys_and_fingers_turn_move_and_reset_the_scene(browser: Browser, path: Path) -> None:
-    middle = middle_of(0, path)
-    with opened(browser, path, touch=True) as report:
-        report.layer("input")
-        report.press("p")
-        first = report.text(".looking")
-        away, axes = axes_of(report)
-        x, y, width, height = report.box()
-        step = away * math.tan(HALF_ANGLE) / (max(width, height) / 2)
-
-        def moved(right: float, down: float) -> NDArray[np.float64]:
-            return middle - step * (right * axes[1] - down * axes[2])
-
-        report.press("Shift+ArrowLeft", "Shift+ArrowUp")
-        eighth = max(width, height) / 16
-        check(report, moved(eighth, eighth))
-        report.press("0")
-        report.page.mouse.move(x + 100, y + 100)
-        report.page.mouse.down(button="right")
-        report.page.mouse.move(x + 140, y + 75)
-        report.page.mouse.up(button="right")
-        report.drawn()
-        check(report, moved(40, -25))
-        assert report.text(".looking") == first, "moved, not turned"
-        report.page.mouse.dblclick(x + 50, y + 50)
-        report.drawn()
-        check(report, middle)
-        touch = report.page.context.new_cdp_session(report.page)
-        for offset in range(0, 61, 3):
-            kind = "touchMove" if offset else "touchStart"
-            fingers = [{"x": x + side + offset, "y": y + 200, "id": side} for side in (150, 250)]
-            touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
-        report.drawn()
-        check(report, moved(60, 0))
-        fingers = [
-            {"x": x + side, "y": y + 200, "id": id_} for side, id_ in ((160, 150), (360, 250))
-        ]
-        touch.send("Input.dispatchTouchEvent", {"type": "touchMove", "touchPoints": fingers})
-        touch.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-        report.drawn()
-        assert axes_of(report)[0] == pytest.approx(away / 2, rel=0.01), "twice as near"
-
-
 def test_points_are_as_dense_at_the_pole_as_elsewhere(browser: Browser, tmp_path: Path) -> None:
     """A sphere of 1 m, from outside: its far side, from the lower pole to latitude 30°."""
     rows, columns = 64, 128
@@ -297,28 +254,3 @@ def test_layers_show_distances_and_their_errors(report: OpenReport) -> None:
     report.project("inside")
     ahead = np.linalg.norm(exit_points(CENTER, np.array([1.0, 0, 0])))
     assert f"truth: {ahead:.2f} m · prediction: {ahead:.2f} m" in report.text(".readout")
-
-
-def test_without_webgl_distances_are_shown_flat(browser: Browser, path: Path) -> None:
-    with opened(browser, path, before=NO_WEBGL) as report:
-        assert report.text(".message") == FLAT_MESSAGE
-        assert not report.page.locator(".points").is_visible()
-        report.layer("prediction")
-        distance = np.linalg.norm(exit_points(CENTER, equirect_directions(SIZE)), axis=-1)
-        width, height = report.box()[2:]
-        u = ((np.arange(int(width)) + 0.5) / width * SIZE[1]).astype(int)
-        middle = report.pixels()[round(height / 2)]
-        row = colorize_distance(distance)[SIZE[0] // 2]
-        close(middle, row[u].astype(np.int64), but=0.02)
-        assert report.text(".readout").startswith("in the middle · prediction: 3.00 m")
-
-
-def test_on_a_phone_buttons_and_scale_fit(report: OpenReport) -> None:
-    report.page.set_viewport_size({"width": 390, "height": 844})
-    report.layer("overlay")
-    for selector in (".points", ".projection", ".scale", ".opacity"):
-        box = report.page.locator(selector).bounding_box()
-        assert box is not None
-        assert box["x"] >= 0
-        assert box["x"] + box["width"] <= 390
-    assert report.page.evaluate("document.documentElement.scrollWidth") <= 390

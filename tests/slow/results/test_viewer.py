@@ -11,12 +11,11 @@ import cv2
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from playwright.sync_api import Browser, FloatRect
+from playwright.sync_api import Browser
 
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.palette import class_colors
 from tangent_train.results.html import EncodedImage, encode_image, write_report
-from tangent_train.results.tables import Table
 from tests.rendering.reference import sample_panorama, to_lonlat
 from tests.slow.results.browser import EDGE, OpenReport, close, opened
 
@@ -218,43 +217,3 @@ def test_photos_are_flat_with_pan_and_zoom(report: OpenReport) -> None:
     shown = factor * scale
     corner = report.pixels()[20, 20]
     close(corner, color(20.5 / PHOTO[1] / shown, 20.5 / PHOTO[0] / shown))
-
-
-def test_on_a_phone_more_classes_are_announced_and_errors_take_lines(
-    browser: Browser, tmp_path: Path
-) -> None:
-    labels = np.arange(60, dtype=np.uint8).reshape(6, 10)
-    rgb = np.zeros((6, 10, 3), np.uint8)
-    error = (
-        "found 1000×1800 pixels; expected twice as wide as high. Only full panoramas can be used."
-    )
-    rows = [["holiday/a folder of a long name/hall.jpg", error], ["b", error]]
-    path, columns = tmp_path / "phone.html", ("image", "error")
-    write_report(
-        path,
-        "Phone",
-        tables=[Table("Errors", columns, rows, "", (0, 1))],
-        images=[encode_image("many", rgb, 60, prediction=labels, sphere=False)],
-        class_names=[f"class {k}" for k in range(60)],
-    )
-    with opened(browser, path) as report:
-        report.page.set_viewport_size({"width": 390, "height": 844})
-        assert report.text(".legend strong") == "Classes (60)"
-        for text in report.page.locator(".long").all():
-            box = text.bounding_box()
-            assert box is not None
-            assert box["x"] >= 0
-            assert box["x"] + box["width"] <= 390, "nothing is cut"
-        report.page.locator(".legend ul").scroll_into_view_if_needed()
-        shades = []
-        for place in (0, 10_000):
-            report.page.locator(".legend ul").evaluate(f"e => e.scrollTo(0, {place})")
-            report.drawn()
-            box = report.page.locator(".legend ul").bounding_box()
-            assert box is not None
-            x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] - 2
-            clip: FloatRect = {"x": x, "y": y, "width": 1, "height": 1}
-            png = report.page.screenshot(clip=clip)
-            pixels: Any = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR)
-            shades.append(pixels.mean())
-        assert shades[0] < shades[1] - 20, "a shade where more follows, none at the end"

@@ -1,4 +1,4 @@
-"""``--help``: the settings of a command with the comments of the config files."""
+"""Settings with their comments, for ``--help`` and the reference page."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import yaml  # type: ignore[import-untyped]
+
+from tangent_train.config.settings import SETTINGS, Settings, comment_of, plain
+from tangent_train.files import config_folder
 
 _COLUMN = 32
 _BASE = re.compile(r"^  - (?:/(\w+)@(\w+): )?(?!_self_)(\w+)$", re.MULTILINE)
@@ -34,24 +37,39 @@ class Setting(NamedTuple):
     comment: str
 
 
-def annotate(text: str, folder: Path, command: str) -> str:
-    """Add the comments of the config files to the settings in Hydra's help.
+def annotate(text: str, command: str) -> str:
+    """Add the comments of all settings to the help that Hydra has composed.
 
     Args:
-        text: Help text that Hydra has composed. If nothing follows its last heading, the settings
-            of the command's own file are added, without its groups.
-        folder: Folder of the configs.
-        command: Name of the command, whose settings are in ``<command>.yaml``.
+        text: Help text, with the composed settings after the heading "Settings".
+        command: Name of the command.
     """
     *head, printed = re.split(r"^(== Settings.*\n)", text, flags=re.MULTILINE)
-    file = folder / f"{command}.yaml"
-    values = yaml.safe_load(printed)
-    if values is None:
-        written = yaml.safe_load(file.read_text("utf-8"))
-        values = {name: written[name] for name in written if name not in ("defaults", "hydra")}
-    comments = _option_comments(folder)
-    comments |= {("", name): setting.comment for name, setting in _with_bases(file).items()}
-    return "".join([*head, *_explain(values, comments, (), ())])
+    comments = _option_comments(config_folder())
+    comments |= {("", s.name): s.comment for s in command_settings(command)}
+    return "".join([*head, *_explain(yaml.safe_load(printed), comments, (), ())])
+
+
+def command_settings(command: str) -> list[Setting]:
+    """Return the settings of a command; the values of groups are their default options."""
+    file = config_folder() / f"{command}.yaml"
+    files = [file, *(file.with_name(f"{name}.yaml") for _, _, name in bases(file))]
+    settings = {one.name: one for one in _declared(SETTINGS[command], "")}
+    for one in (one for file in files if file.exists() for one in read_settings(file)):
+        if not one.name.startswith("hydra"):
+            known = settings.get(one.name, one)
+            settings[one.name] = known._replace(value=one.value or known.value)
+    return list(settings.values())
+
+
+def _declared(kind: type[Settings], prefix: str) -> Iterator[Setting]:
+    for name, field in kind.model_fields.items():
+        inner = field.annotation
+        has_inner = isinstance(inner, type) and issubclass(inner, Settings)
+        value = "" if has_inner or field.is_required() else _flow(plain(field.default))
+        yield Setting(f"{prefix}{name}", value, comment_of(field))
+        if has_inner:
+            yield from _declared(inner, f"{prefix}{name}.")  # type: ignore[arg-type]
 
 
 def read_settings(file: Path) -> list[Setting]:

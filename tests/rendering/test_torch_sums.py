@@ -17,9 +17,9 @@ from tangent_train.rendering import (
     HorizontalRepresentation,
     PerspectiveRepresentation,
     TangentRepresentation,
-    device_mosaic,
+    torch_sums,
 )
-from tangent_train.rendering.mosaic import DepthMosaic, ScoreMosaic
+from tangent_train.rendering.mosaic import MeanMosaic, ScoreMosaic
 from tests.fake_gpu import fake_gpu
 
 TILT = rotation_about((1, 2, 0), 0.9)
@@ -94,7 +94,7 @@ def test_torch_blends_depth_as_the_compiled_kernels_do(name: str, blend: Blend) 
     sets = make(blend)
     depth = [scores.where(scores > -2, torch.nan) for scores in _scores(sets, 1)]
     expected, values = (
-        _filled(DepthMosaic(shape, blend, backend=backend), sets, depth).values()
+        _filled(MeanMosaic(shape, blend, backend=backend), sets, depth).values()
         for backend in ("numba", "torch")
     )
     unknown = expected.isnan()
@@ -111,7 +111,7 @@ def test_torch_blends_depth_as_the_compiled_kernels_do(name: str, blend: Blend) 
 def test_torch_agrees_with_the_compiled_kernels(
     name: str, blend: Blend, settings: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(device_mosaic, "_SCORES_AT_ONCE", 2**15)
+    monkeypatch.setattr(torch_sums, "_SCORES_AT_ONCE", 2**15)
     make, shape = SETS[name]
     sets, classes = make(blend), 6
     settings = settings | {"blend": blend, "averaged": len(sets) > 1 or "averaged" in settings}
@@ -159,5 +159,5 @@ def test_images_without_pixels_change_nothing(blend: Blend) -> None:
 
 
 def test_sums_that_are_too_large_are_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_mosaic, "_BYTES", 64 * 128 * 4 * 4 - 1)
+    monkeypatch.setattr(torch_sums, "_BYTES", 64 * 128 * 4 * 4 - 1)
     assert ScoreMosaic((64, 128), 4, "feather", device="cuda").labels().device.type == "cpu"

@@ -1,0 +1,245 @@
+"""``tangent-train`` on a few tiny synthetic rooms: train, interrupt, resume, fine-tune."""
+
+from __future__ import annotations
+
+import csv
+import inspect
+import shlex
+import signal
+from pathlib import Path
+from typing import Any
+
+import cv2
+import lightning
+import pytest
+import torch
+from lightning.pytorch.callbacks import Callback, RichModelSummary
+
+from datamodules import SynthRooms
+from tangent_train.checkpoints.loaded import load_network
+from tangent_train.cli import main
+from tangent_train.cli.run import build_callbacks, build_loggers
+from tangent_train.tasks.segmentation import SegmentationTask
+from tests.cli.tiny_runs import SETTINGS, Run, results
+from tests.running import Capture, Patch, composed_settings, run_python
+from tests.tasks.shapes import shape_task
+
+CUT_SHORT = """
+import os, signal
+from tangent_train.cli.main import train
+from tangent_train.callbacks.checkpoints import LastCheckpoint
+
+original = LastCheckpoint.on_train_batch_end
+
+def cut_short(self, trainer, *rest):
+    if trainer.global_step == 2:
+        os.kill(os.getpid(), signal.SIGTERM)
+    original(self, trainer, *rest)
+
+LastCheckpoint.on_train_batch_end = cut_short
+train()
+"""
+
+
+def _last(folder: Path) -> Any:
+    return torch.load(folder / "checkpoints" / "last.ckpt", weights_only=True)
+
+
+def test_a_run_leaves_everything_in_its_folder(run_folder: Path) -> None:
+    found = results(run_folder)
+    assert found["images"] == 2
+    assert len(found["classes"]) == 13
+    for name in ("results.md", "results.csv", "config.yaml", "validation.json"):
+        assert (run_folder / name).is_file(), name
+    assert list((run_folder / "tensorboard").glob("events.*"))
+    (panel,) = (run_folder / "panels").glob("*.png")
+    picture = cv2.imread(str(panel))
+    assert picture is not None
+    assert picture.shape[1] == 2 * 512 + 8
+    page = (run_folder / "report.html").read_text()
+    assert all(f"<h2>{title}</h2>" in page for title in ("Per class", "Confusion"))
+    loaded = load_network(run_folder / "checkpoints" / "best.ckpt")
+    assert loaded.class_names[:2] == ("unknown", "beam")
+    assert loaded.inputs == ("rgb", "depth")
+    assert _last(run_folder)["config"]["data"]["rooms"]["height"] == 32
+
+
+def test_a_terminated_run_goes_on_as_if_nothing_had_happened(
+    run_folder: Path, rooms: str, tmp_path: Path, run: Run
+) -> None:
+    (tmp_path / "cut_short.py").write_text(CUT_SHORT)
+    cut = run_python(tmp_path, "cut_short.py", *SETTINGS, rooms, "hydra.run.dir=cut")
+    assert cut.returncode == 128 + signal.SIGTERM, cut.stderr
+    assert "Traceback" not in cut.stderr
+    printed = shlex.split(cut.stderr.strip().splitlines()[-1])
+    assert printed == ["tangent-train", f"resume={tmp_path / 'cut'}"]
+    run("train", printed[1])
+    found, expected = _last(tmp_path / "cut"), _last(run_folder)
+    for part in ("state_dict", "optimizer_states"):
+        torch.testing.assert_close(found[part], expected[part], rtol=0, atol=0)
+    assert found["lr_schedulers"] == expected["lr_schedulers"]
+    assert results(tmp_path / "cut") == results(run_folder)
+
+
+def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
+    rooms: str, tmp_path: Path, run: Run, monkeypatch: Patch
+) -> None:
+    weights: list[dict[str, torch.Tensor]] = []
+    step = SegmentationTask.training_step
+
+    def kept(task: SegmentationTask, *arguments: Any) -> Any:
+        weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
+        if len(weights) == 4:
+            raise CutError
+        return step(task, *arguments)
+
+    class CutError(Exception):
+        pass
+
+    monkeypatch.setattr(SegmentationTask, "training_step", kept)
+    typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.batch_size=1")
+    with pytest.raises(CutError):
+        run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    content = _last(tmp_path / "run")
+    assert content["global_step"] == 3
+    for name, third in weights[3].items():  # the average begins with the first step
+        first, second = weights[1][name], weights[2][name]
+        expected = 0.7 * (0.7 * first + 0.3 * second) + 0.3 * third
+        torch.testing.assert_close(
+            content["state_dict"][name].double(), expected, rtol=0, atol=1e-6
+        )
+        assert torch.equal(content["current_model_state"][name].double(), third)
+
+
+def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path, run: Run) -> None:
+    checkpoints = tmp_path / "run" / "checkpoints"
+    typed = ("scheduler=constant", "data.val_fraction=0", "trainer.max_epochs=1")
+    run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    first = (checkpoints / "best.ckpt").read_bytes()
+    assert first == (checkpoints / "last.ckpt").read_bytes()
+    run("train", "resume=run", "trainer.max_epochs=2")
+    assert first != (checkpoints / "best.ckpt").read_bytes()
+    assert results(tmp_path / "run")["images"] == 2
+    with pytest.raises(SystemExit, match=r"hydra\.run\.dir: found .*run, the folder of another"):
+        run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+
+
+def test_without_test_images_training_ends_without_results(
+    rooms: str, tmp_path: Path, run: Run, capsys: Capture, monkeypatch: Patch
+) -> None:
+    find = SynthRooms.find_images
+
+    def without_test(data: SynthRooms, problems: Any) -> Any:
+        reader, splits = find(data, problems)
+        return reader, {**splits, "test": []}
+
+    monkeypatch.setattr(SynthRooms, "find_images", without_test)
+    run("train", *SETTINGS, rooms, "trainer.max_epochs=1", "hydra.run.dir=run")
+    assert "No panoramas to test: no results are written." in capsys.readouterr().out
+    assert (tmp_path / "run" / "checkpoints" / "best.ckpt").is_file()
+    assert not list((tmp_path / "run").glob("results.*"))
+
+
+@pytest.mark.parametrize("limit", ["debug=fast", "+trainer.limit_test_batches=1"])
+def test_an_incomplete_test_leaves_no_results(
+    limit: str, rooms: str, tmp_path: Path, run: Run, capsys: Capture
+) -> None:
+    run("train", *SETTINGS, rooms, "trainer.max_epochs=1", limit, "hydra.run.dir=run")
+    assert "1 of 2 test panoramas were evaluated" in capsys.readouterr().out
+    assert not list((tmp_path / "run").glob("results.*"))
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["+data.rot=x"], "unexpected keyword argument 'rot'|found rot for"),
+        (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
+        (["task=classification"], "task: found ClassificationTask, which needs image_class"),
+        (["data=zind_pairs"], "data: found .*|expected labeled images"),
+        (["network._target_=models.Absent"], "Absent"),
+        (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
+    ],
+)
+def test_impossible_settings_are_refused_before_any_data_is_made(
+    overrides: list[str], message: str, tmp_path: Path, run: Run
+) -> None:
+    with pytest.raises(SystemExit, match=message):
+        run("train", "experiment=rooms/demo", "trainer.accelerator=cpu", *overrides)
+    assert not (tmp_path / "data").exists()
+
+
+def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
+    rooms: str, run: Run, monkeypatch: Patch
+) -> None:
+    # The best epoch is the first one: nothing is learned.
+    settings = [*SETTINGS, rooms, "trainer.max_epochs=9", "scheduler=constant", "optimizer.lr=1e-9"]
+    settings += ["logger=csv", "callbacks=early_stopping", "callbacks.early_stopping.patience=3"]
+    settings += ["callbacks.early_stopping.min_delta=0.01"]
+    run("train", *settings, "hydra.run.dir=whole")
+    start = SegmentationTask.on_train_epoch_start
+
+    def interrupt(task: SegmentationTask) -> None:
+        if task.current_epoch == 2:
+            raise RuntimeError("interrupted")
+        start(task)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SegmentationTask, "on_train_epoch_start", interrupt)
+        with pytest.raises(RuntimeError, match="interrupted"):
+            run("train", *settings, "hydra.run.dir=cut")
+    for _ in range(2):  # the second time, its training is over
+        run("train", "resume=cut")
+        assert _epochs(Path("cut")) == _epochs(Path("whole"))
+        assert _last(Path("cut"))["global_step"] == _last(Path("whole"))["global_step"]
+
+
+def _epochs(folder: Path) -> list[dict[str, str]]:
+    """Return the validations of a run, without what differs in a resumed one."""
+    rows = []
+    for path in sorted((folder / "csv").glob("*/metrics.csv")):
+        lines = path.read_text().splitlines()
+        rows += [row for row in csv.DictReader(lines) if row.get("val/miou")]
+    return [
+        {n: v for n, v in row.items() if n.startswith(("epoch", "val", "step"))} for row in rows
+    ]
+
+
+class Named(Callback):
+    """A callback of the user."""
+
+    def __init__(self, monitor: str | None, mode: str | None) -> None:
+        self.given = monitor, mode
+
+
+def test_loggers_and_callbacks_of_the_user_are_built() -> None:
+    settings = composed_settings(
+        "train",
+        "logger=csv",
+        "+logger.mine={_target_: lightning.pytorch.loggers.CSVLogger, save_dir: here, name: null}",
+        "callbacks=model_summary",
+        f"+callbacks.mine={{_target_: {__name__}.Named, monitor: null, mode: null}}",
+    )
+    folder = Path("/x/runs/demo/2026-01-02/fold_1/P")
+    loggers: Any = build_loggers(settings, folder)
+    assert [logger.save_dir for logger in loggers] == [str(folder), "here"]
+    assert loggers[1].name == "demo/2026-01-02/fold_1/P"
+    summary, mine = build_callbacks(settings, shape_task())
+    assert isinstance(summary, RichModelSummary)
+    assert mine.given == ("val/accuracy", "max")
+
+
+def test_the_calls_from_a_command_to_its_training(rooms: str, run: Run, monkeypatch: Patch) -> None:
+    calls: list[str] = []
+
+    class BegunError(Exception):
+        pass
+
+    def fit(*_: object, **__: object) -> None:
+        package = str(Path(main.__file__).parents[1])
+        calls.extend(f.function for f in inspect.stack() if f.filename.startswith(package))
+        raise BegunError
+
+    monkeypatch.setattr(lightning.Trainer, "fit", fit)
+    with pytest.raises(BegunError):
+        run("train", *SETTINGS, rooms, "hydra.run.dir=run")
+    assert calls == ["_fit", "train", "job", "_main"]
