@@ -67,7 +67,7 @@ class Cache:
 
         Raises:
             DataError: A source file is broken.
-            NoRoomError: The disk is full.
+            OSError: The disk is full.
         """
         path = self.path(files)
         if not path.is_file():

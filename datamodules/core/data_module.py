@@ -229,9 +229,7 @@ class DataModule(LightningDataModule, ABC):
         """Number of samples in a batch of validation and test."""
         return 1
 
-    def in_parallel(
-        self, work: Callable[[Any], Any], items: Sequence[Any]
-    ) -> Generator[Any]:
+    def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
         """Yield results of a function for all items as they come."""
         return in_threads(work, items)
 
@@ -290,6 +288,9 @@ class DataModule(LightningDataModule, ABC):
     def _find_files(self) -> dict[Split, list[Any]]:
         """Return the files of all splits; note problems of files and of the whole data set."""
         self.problems = Problems()
+        for name in [*vars(self)]:  # lists of files are made anew
+            if isinstance(getattr(type(self), name, None), cached_property):
+                delattr(self, name)
         found: dict[Split, list[Any]] = {split: [] for split in SPLITS}
         with self.problems.noted():
             missing = f"no {self.noun}" if self.root.is_dir() else "no such folder"

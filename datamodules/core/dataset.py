@@ -121,7 +121,8 @@ class ImageDataset(SplitDataset):
 
     def labels(self, index: int) -> NDArray[Any]:
         """Return the labels of the valid pixels of an image, without decoding colors."""
-        if self._kept or self.data.cache is not None:
+        is_masked = getattr(self.data, "mask", None) is not None
+        if self._kept or self.data.cache is not None or is_masked:
             image = self.read(index)
             return image.labels if image.valid is None else image.labels[image.valid]
         labels: NDArray[Any] = self.data.read_labels(self.files[index])

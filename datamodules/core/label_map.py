@@ -188,7 +188,9 @@ def read_label_map(path: Path) -> LabelMap:
     Raises:
         DataError: The file cannot be read, has another form, or repeats a value.
     """
-    content = read_json(path, _EXPECTED, "docs/how-to/own_data.md shows how to bring your own data.")
+    content = read_json(
+        path, _EXPECTED, "docs/how-to/own_data.md shows how to bring your own data."
+    )
     if isinstance(content, dict) and isinstance(content.get("classes"), dict):
         content = content["classes"]
     if isinstance(content, list):

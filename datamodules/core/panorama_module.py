@@ -201,9 +201,7 @@ def place(image: Image, canvas: PanoramaArea, fill: Fill) -> Image:
     )
 
 
-def draw_rotation(
-    rotation: float | Literal["so3"], seed: int, index: int
-) -> NDArray[np.float64]:
+def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> NDArray[np.float64]:
     """Draw the rotation R of a test panorama, ``(3, 3)``: direction d moves to R d.
 
     Args:

@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import NoRoomError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from datamodules.core.splits import Item, Split
+    from datamodules.core.cache import Files
+    from datamodules.core.images import ImageFiles
+    from datamodules.core.splits import Split
 
 
-_Item = TypeVar("_Item", bound="Item")
+_Files = TypeVar("_Files", bound="Files")
 
 
 class Problem(NamedTuple):
@@ -59,15 +61,15 @@ class Problems:
             file: Broken file, if the error does not name it first.
 
         Raises:
-            NoRoomError: The disk is full.
+            OSError: The disk is full.
         """
         try:
             yield
-        except NoRoomError:
-            raise
         except (DataError, SettingError) as error:
             self.add(error, item, file)
         except OSError as error:
+            if error.errno == errno.ENOSPC:
+                raise
             path = file if error.filename is None else Path(os.fsdecode(error.filename))
             found = error if error.errno is None else os.strerror(error.errno)
             expected = "a file or folder that can be read"
@@ -88,7 +90,7 @@ class Problems:
         self._noted += others._noted
 
     def compare_counts(
-        self, splits: Mapping[Split, Sequence[Item]], *published: Mapping[str, int]
+        self, splits: Mapping[Split, Sequence[Files]], *published: Mapping[str, int]
     ) -> None:
         """Warn if the numbers of images of the splits are not published ones.
 
@@ -108,9 +110,9 @@ class Problems:
             if count not in allowed:
                 self.incomplete[split] = f"{count} of {' or '.join(map(str, allowed))}"
 
-    def note_strays(self, labels: Iterable[Path], images: Iterable[Item]) -> None:
+    def note_strays(self, labels: Iterable[Path], images: Iterable[ImageFiles]) -> None:
         """Warn of label images that belong to none of the images."""
-        strays = set(labels) - {image.parts["labels"] for image in images}
+        strays = set(labels) - {image.labels for image in images}
         self.note_absent("label images", map(str, strays))
 
     def note_absent(self, source: str, names: Iterable[str]) -> None:
@@ -134,7 +136,7 @@ class Problems:
         """Names of unusable images or shapes."""
         return {p.item for p in self._noted if p.item is not None}
 
-    def without(self, items: Iterable[_Item]) -> list[_Item]:
+    def without(self, items: Iterable[_Files]) -> list[_Files]:
         """Return the usable images or shapes."""
         broken = self.items
         return [item for item in items if item.name not in broken]

@@ -70,10 +70,9 @@ class LabeledFolder(ImageDataModule):
         images = self._list_images()
         self._note_ignored(images)
         division = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
-        splits: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
-        with self.problems.noted():  # the images are checked even if this fails
-            splits = division.divide(images, self.problems)
-        return splits
+        with self.problems.noted():
+            return division.divide(images, self.problems)
+        return {"train": images, "val": [], "test": []}  # checked even without splits
 
     def _list_images(self) -> list[ImageFiles]:
         """Return all images, in the order of their names: paths below ``images/`` without suffix.
@@ -175,6 +174,4 @@ def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
         found = ", ".join(sorted(set(ignored) - set(names)))
         raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
     labels = [names.index(name) + 1 for name in ignored]
-    return Masks(
-        folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels)
-    )
+    return Masks(folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels))

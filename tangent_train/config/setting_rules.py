@@ -20,7 +20,7 @@ _RULES = (
         _ALWAYS,
         "checkpoint checkpoint_every_n_steps choices logger panels resume trust validation_images",
     ),
-    (_ALWAYS, "data.in_memory data.label_table data.num_workers data.root data.store"),
+    (_ALWAYS, "data.in_memory data.label_table data.num_workers data.cache data.root"),
     (_ALWAYS, "task.channels_last task.compile task.eval_view_batch_size"),
     (_ALWAYS, "trainer.accelerator trainer.enable_model_summary trainer.enable_progress_bar"),
     (_ALWAYS, "trainer.log_every_n_steps trainer.num_sanity_val_steps trainer.strategy"),
@@ -50,7 +50,7 @@ _TRAINER_SETTINGS = (
 )
 OF_THIS_MACHINE = (
     *("callbacks", "logger"),
-    *("data.label_table", "data.root", "data.store", "task.compile"),
+    *("data.cache", "data.label_table", "data.root", "task.compile"),
     *(f"trainer.{name}" for name in _TRAINER_SETTINGS.split()),
 )
 """Settings of this machine (paths, processes, logging), which are not taken from a file."""

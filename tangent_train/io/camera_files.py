@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
 CAMERAS_FILE = "cameras.json"
@@ -153,7 +153,7 @@ def read_cameras(path: Path) -> CameraFile:
         DataError: The file is missing, or its content is not valid.
     """
     try:
-        content = parse_json(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(path, found=error, expected=_EXPECTED) from error
     is_tangent = not (isinstance(content, Mapping) and "views" in content)
@@ -258,7 +258,7 @@ def read_rig(path: Path) -> RigFile:
         DataError: The file is missing, or another program wrote it.
     """
     try:
-        (rig,) = parse_json(path.read_bytes())
+        (rig,) = json.loads(path.read_bytes())
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
             axes = {
                 str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])

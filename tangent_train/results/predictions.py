@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.core.label_map import UNKNOWN_NAME
 from tangent_train.errors import SettingError, counted
-from tangent_train.files import csv_text, parse_json, write_text
+from tangent_train.files import csv_text, write_text
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
 from tangent_train.io.image_files import composed
 from tangent_train.io.videos import write_video
@@ -228,7 +228,7 @@ class PredictionFolder:
             SettingError: Earlier predictions have other settings.
         """
         try:
-            content = parse_json((summary or self.path / _SUMMARY).read_bytes())
+            content = json.loads((summary or self.path / _SUMMARY).read_bytes())
             entries = {entry["name"]: entry for entry in self.predicted(content["images"])}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.nn import functional
 
-from datamodules.core.labels import DISTANCE
 from datamodules.core.images import STEPS_PER_M
+from datamodules.core.labels import DISTANCE
 from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.checkpoints.distances import (
     along_rays,

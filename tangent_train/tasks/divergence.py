@@ -30,7 +30,7 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     elif broken:
         reason = f"from weights that were not finite before: {_some(broken)}"
     trainer: Any = task.trainer
-    names = [trainer.datamodule.source("train").name(k) for k in batch.index.tolist()]
+    names = [trainer.datamodule.dataset("train").name(k) for k in batch.index.tolist()]
     raise SettingError(
         f"loss of step {trainer.global_step} (epoch {trainer.current_epoch}, {_some(names)})",
         found=f"{loss}, {reason}",

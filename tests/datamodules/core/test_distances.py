@@ -139,8 +139,8 @@ def test_labels_are_the_depth_that_is_an_input_elsewhere(made: tuple[Source, Pat
     source, root = made
     data = _data(source, root)
     assert (data.class_names, data.num_classes, "classes" in data.facts) == ((), 0, False)
-    inputs = _data(source, root, labels=PIXEL_CLASSES, inputs=["rgb", "depth"]).source("test")
-    distances = data.source("test")
+    inputs = _data(source, root, labels=PIXEL_CLASSES, inputs=["rgb", "depth"]).dataset("test")
+    distances = data.dataset("test")
     assert len(distances) == len(inputs) > 0
     for number in range(len(distances)):
         labels, depth = distances.read(number).labels, inputs.read(number).depth
@@ -161,7 +161,7 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
     for others in batches[1:]:
         for one, other in zip(batches[0], others, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
-    data = _data(source, root, store=tmp_path, in_memory=True, labels=PIXEL_CLASSES)
+    data = _data(source, root, cache=tmp_path, in_memory=True, labels=PIXEL_CLASSES)
     data.prepare_data()
     target = data.dataset("test")[0].target
     assert 0 < target.max() < 50
@@ -234,7 +234,7 @@ def test_masked_and_rotated_distances_keep_their_values(
     expected[np.deg2rad(90 - (np.arange(32) + 0.5) * 180 / 32) < np.deg2rad(-30)] = 0
     expected[(read_png(files.rgb)[..., :3] == 0).any(-1)] = 0
     if rotation:
-        R = data.source("test").transforms[-1].rotation(0)
+        R = data.dataset("test").transforms[-1].rotation(0)
         expected = expected[_pixels(equirect_directions((32, 64)) @ R, 32)]
     target = data.dataset("test")[0].target.numpy()
     distance_m = data.images("test")[0].distance_m

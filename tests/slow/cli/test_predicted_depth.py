@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.core.problems import Problems
-from datamodules.folder.classes import read_classes
-from datamodules.folder.reader import FolderReader, list_images
+from datamodules import FolderPanoramas
+from datamodules.core.splits import SPLITS
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Run, predicted, results, run_command
@@ -42,12 +41,12 @@ def test_folders_of_images_with_depth(run: Run, tmp_path: Path, kind: str) -> No
     shutil.copytree("in", root / "images")
     shutil.copytree("out/depth", root / "depth")
     (root / "classes.json").write_text('["wall"]')
-    reader = FolderReader(read_classes(root / "classes.json"), 1000)
-    files = list_images(root, Problems(), with_labels=False, with_depth=True)
-    assert [one.name for one in files] == ["flat/kitchen", "hall"]
+    data = FolderPanoramas(root, labels="distance", level=2)
+    files = [one for split in SPLITS for one in data.files(split)]
+    assert sorted(one.name for one in files) == ["flat/kitchen", "hall"]
     for one in files:
         expected = read_depth_m(tmp_path / "out" / "depth" / f"{one.name}.{kind}", 1000)
-        np.testing.assert_allclose(reader.depth(one) / 512, expected, atol=1 / 1024 + 1e-6)
+        np.testing.assert_allclose(data.decode_depth(one) / 512, expected, atol=1 / 1024 + 1e-6)
     write_checkpoint(tmp_path / "rgbd.ckpt", channels=4)
     run("predict", "checkpoint=rgbd.ckpt", "input=in", "output=labels", "depth=out/depth")
     assert predicted(Path("labels")).keys() == {"hall", "flat/kitchen"}
