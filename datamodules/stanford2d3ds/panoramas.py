@@ -129,7 +129,7 @@ def list_pictures(
     return found
 
 
-def read_instance_map(path: Path) -> LabelMap:
+def read_label_table(path: Path) -> LabelMap:
     """Read `semantic_labels.json`, a list of names ``class_instance_room_number_area``.
 
     A pixel of a `semantic` image holds the index of an instance as the color
@@ -207,17 +207,17 @@ class StanfordImages(ImageDataModule):
         }
 
     @cached_property
-    def _instance_map(self) -> LabelMap:
+    def _label_table(self) -> LabelMap:
         """Label of the color of every instance."""
         label_map: Any = self.label_map
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         path = self.label_table or next(filter(Path.is_file, places), places[0])
-        return read_instance_map(path).regrouped(LabelMap.grouped(label_map.names))
+        return read_label_table(path).regrouped(LabelMap.grouped(label_map.names))
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`: by the class table."""
         path: Any = files.labels
-        return self._instance_map.read_labels(path)
+        return self._label_table.read_labels(path)
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""
@@ -233,7 +233,7 @@ class StanfordImages(ImageDataModule):
 
     def decode_settings(self) -> dict[str, Any]:
         """See `DataModule`."""
-        table = "" if self.has_distances else str(self._instance_map.labels)
+        table = "" if self.has_distances else str(self._label_table.labels)
         return {**super().decode_settings(), "class table": table}
 
 

@@ -14,7 +14,7 @@ from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
-    read_instance_map,
+    read_label_table,
 )
 from tangent_train.errors import DataError
 from tangent_train.geometry import camera_matrix_from_fov
@@ -32,11 +32,11 @@ def test_pixels_of_instances_past_the_end_of_the_table_are_unknown(tmp_path: Pat
     path = tmp_path / "semantic_labels.json"
     path.write_text(json.dumps(["<UNK>_0_<UNK>_0_0", *["clutter_1_office_1_1"] * 9815]))
     colors = [[i >> 16, i >> 8 & 255, i & 255] for i in (0x0D0D0D, 9815, 9816, 0xFFFFFF, 0)]
-    labels = read_instance_map(path).decode(np.array([colors], np.uint8))
+    labels = read_label_table(path).decode(np.array([colors], np.uint8))
     assert labels.tolist() == [[0, 6, 0, 0, 0]]
     path.write_text('["beamer_1_office_1_1"]')
     with pytest.raises(DataError, match="found class 'beamer'"):
-        read_instance_map(path)
+        read_label_table(path)
 
 
 # --- splits ------------------------------------------------------------------------------------

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import nn
 
-from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
 from datamodules.core.samples import valid_mask
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry.equirect import area_mask
 from tangent_train.geometry.valid_views import is_valid

@@ -16,14 +16,14 @@ from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
 import datamodules
-from datamodules.cityscapes.classes import CLASSES as CITYSCAPES
-from datamodules.cityscapes.classes import THIRTEEN
+from datamodules.cityscapes import CLASSES as CITYSCAPES
+from datamodules.cityscapes import THIRTEEN
 from datamodules.core.label_map import LabelMap
-from datamodules.matterport360.panoramas import CLASSES as MATTERPORT
+from datamodules.matterport360 import CLASSES as MATTERPORT
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.stanford2d3ds.files import EIGHT
-from datamodules.structured3d.classes import CLASSES as STRUCTURED3D
-from datamodules.synpass.panoramas import CLASSES as SYNPASS
+from datamodules.structured3d import CLASSES as STRUCTURED3D
+from datamodules.synpass import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.loaded import LoadedNetwork
@@ -85,9 +85,9 @@ def test_a_map_names_published_classes(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "labels"),
     [
-        ("cityscapes_to_densepass13", datamodules.Cityscapes.label_maps),
-        ("synpass_to_densepass13", datamodules.SynPASS.label_maps),
-        ("structured3d_to_span8", datamodules.Structured3D.label_maps),
+        ("cityscapes_to_densepass13", datamodules.cityscapes.Cityscapes.label_maps),
+        ("synpass_to_densepass13", datamodules.synpass.SynPASS.label_maps),
+        ("structured3d_to_span8", datamodules.structured3d.Structured3D.label_maps),
     ],
 )
 def test_a_map_maps_a_network_as_label_maps_the_files(name: str, labels: Any) -> None:

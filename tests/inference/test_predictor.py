@@ -15,10 +15,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules import Stanford2D3DS
 from datamodules.core.images import distance_from_z_depth
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from models import make_distortion_aware
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules import FolderPanoramas
 from datamodules.core.panorama_module import draw_rotation
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.gpano import PanoramaArea, area_of_angles, whole_area

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import FolderPanoramas
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.gpano import Fill, PanoramaArea
 from tangent_train.rendering import EquirectRepresentation

@@ -11,24 +11,17 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules import (
-    Cityscapes,
-    DensePASS,
-    FolderPanoramas,
-    FolderPhotos,
-    Matterport360,
-    OmniSynthia,
-    Stanford2D3DS,
-    Stanford2D3DSPerspective,
-    Structured3D,
-    Structured3DPerspective,
-    SynPASS,
-    SynthiaPerspective,
-    Zind,
-)
+from datamodules.cityscapes import Cityscapes
 from datamodules.core.image_module import ImageDataModule, PhotoDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.synthia.omnisynthia import SEQUENCES
+from datamodules.densepass import DensePASS
+from datamodules.folder.labeled import FolderPanoramas, FolderPhotos
+from datamodules.matterport360 import Matterport360
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.structured3d import Structured3D, Structured3DPerspective
+from datamodules.synpass import SynPASS
+from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
+from datamodules.zind.panoramas import Zind
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.pixel_files import write_depth_m
@@ -102,7 +95,10 @@ SOURCES = {
         "*/*/*/perspective/full/*/depth.png",
     ),
     "synthia_perspective": Source(
-        *(SynthiaPerspective, lambda root: write_views(root, dict.fromkeys(SEQUENCES, 2))),
+        *(
+            SynthiaPerspective,
+            lambda root: write_views(root, dict.fromkeys(("01", "02", "04", "05", "06"), 2)),
+        ),
         "*/Depth/Stereo_Left/*/*.png",
     ),
     "folder_photos": Source(FolderPhotos, _folder_photos, "depth/*/*.png"),

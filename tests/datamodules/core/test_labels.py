@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import (
-    Cityscapes,
-    DensePASS,
-    Stanford2D3DS,
-    Stanford2D3DSPerspective,
-    SynPASS,
-)
+from datamodules.cityscapes import Cityscapes
 from datamodules.core.image_module import ImageDataModule
+from datamodules.densepass import DensePASS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.synpass import SynPASS
 from tangent_train.errors import SettingError
 from tests.conftest import fabricate
 

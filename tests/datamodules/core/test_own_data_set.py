@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import datamodules
 from datamodules.core.data_module import data_set
 from datamodules.core.images import ImageFiles
 from datamodules.core.label_map import LabelMap
@@ -80,13 +79,6 @@ def test_settings_are_checked_by_their_types(
 ) -> None:
     with pytest.raises(SettingError, match=message):
         _toy(tmp_path, **settings)
-
-
-def test_data_sets_that_are_read_are_those_that_are_not_generated() -> None:
-    read = {name for name in datamodules.__all__ if datamodules.is_read(f"datamodules.{name}")}
-    generated = {"SynthRooms", "SynthRoomsPairs", "SynthRoomsPerspective", "SynthShapes"}
-    assert read == set(datamodules.__all__) - generated
-    assert not datamodules.is_read("mine.Toy")
 
 
 def test_a_data_set_without_images_is_refused(tmp_path: Path) -> None:

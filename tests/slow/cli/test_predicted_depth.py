@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules import FolderPanoramas
 from datamodules.core.splits import SPLITS
+from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Run, predicted, results, run_command
@@ -81,7 +81,7 @@ def test_keypoints_are_compared_with_predicted_depth(run: Run, tmp_path: Path) -
     for path in (tmp_path / "out" / "depth").iterdir():
         shutil.copy(path, pano / "depth" / path.name.replace("_rgb", "_depth"))
     assert (read_png(next((pano / "depth").iterdir())) != true).any()
-    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.pairs=rooms")
+    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.selection=rooms")
     run("keypoints", *data, "base_level=0", "controls=false", "pictures=0", "output=keypoints")
     assert {row["visible_by"] for row in results(tmp_path / "keypoints")["rows"]} == {"depth"}
     pair = StanfordPairs(root, pairs="rooms").read(0)

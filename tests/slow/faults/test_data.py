@@ -16,9 +16,11 @@ import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
 from datamodules.core.data_module import DataModule
 from datamodules.core.splits import SPLITS
+from datamodules.folder.labeled import FolderPanoramas
+from datamodules.modelnet40.shapes import ModelNet40
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.cli.tiny_runs import run_command

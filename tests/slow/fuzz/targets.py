@@ -22,7 +22,7 @@ from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras as read_photo_cameras
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.files import CLASSES
-from datamodules.stanford2d3ds.reader import (
+from datamodules.stanford2d3ds.panoramas import (
     read_camera_matrix,
     read_label_table,
     read_panorama_pose,
