@@ -244,7 +244,6 @@ def build_data(settings: RunSettings) -> Any:
     if not isinstance(data, DataModule):
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=type(data).__name__, expected=expected)
-    data.check_classes()
     task = _task_class(settings)
     if task.labels != data.labels:
         raise SettingError(
