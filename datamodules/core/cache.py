@@ -73,7 +73,8 @@ class Cache:
         if not path.is_file():
             self._write(path, decode())
         record = np.load(path, mmap_mode="r", allow_pickle=False)
-        item: _Item = self.kind(**{name: np.asarray(record[name]) for name in record.dtype.names})
+        arrays = {name: np.asarray(record[name]) for name in record.dtype.names}
+        item: _Item = self.kind(**{**dict.fromkeys(self.kind._fields), **arrays})
         return item
 
     def path(self, files: Files) -> Path:

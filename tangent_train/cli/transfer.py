@@ -40,7 +40,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.engine import views_per_forward
-from tangent_train.inference.representations import PERSPECTIVE, panorama_settings
+from tangent_train.inference.views import PERSPECTIVE, panorama_settings
 from tangent_train.manifest import Manifest
 from tangent_train.results.evaluation_result import load_result
 from tangent_train.results.report import levels_report, transfer_report
@@ -214,7 +214,7 @@ def _views(config: Any, loaded: LoadedNetwork | None) -> Iterator[tuple[str, dic
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
-    sets the level of the stage; names such as ``task.align`` change the task. Distortion-aware
+    sets the level of the stage; names such as ``task.head.align`` change the task. Distortion-aware
     views of a network that does not allow them are left out.
     """
     if config.study_levels:

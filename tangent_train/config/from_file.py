@@ -26,7 +26,7 @@ _VIEWS = "tangent_train.rendering.representations"
 
 _FUNCTIONS = (
     *("models.stem.widen_stem", "timm.models._factory.create_model"),
-    *("models.tables.face_neighbors", "models.tables.gnomonic_taps"),
+    *("models.tables.face_neighbors", "models.tables.gnomonic_points"),
     *("models.tables.hexagonal_rings", "models.tables.mapped_samples"),
     "models.tables.mesh_operators",
 )
@@ -69,6 +69,19 @@ def without_weights(section: Any) -> Any:
         name: None if _WEIGHTS.search(str(name)) else without_weights(value)
         for name, value in section.items()
     }
+
+
+def classes_to_trust(section: Any) -> list[str]:
+    """Return the classes in a section that only a user who trusts them can load from a file."""
+    if not isinstance(section, Mapping):
+        return []
+    names = [name for value in section.values() for name in classes_to_trust(value)]
+    if (target := section.get("_target_")) is not None:
+        try:
+            _allowed(target, "network")
+        except DataError:
+            names.append(target)
+    return names
 
 
 def _build(section: Any, place: str, trust: tuple[str, ...]) -> Any:

@@ -36,14 +36,14 @@ class MappedNetwork:
     """A network with the classes of a map.
 
     Attributes:
-        trained: The network.
+        loaded: The network.
         classes: Classes of the original network in each target class.
         absent: Source classes of the map that the original network lacks.
         unmapped: Other classes of the original network.
         unmapped_wins: True if unmapped classes may win, as label 0.
     """
 
-    trained: LoadedNetwork
+    loaded: LoadedNetwork
     classes: Mapping[str, Sequence[str]]
     absent: Sequence[str]
     unmapped: Sequence[str]
@@ -88,7 +88,7 @@ def load_label_map(given: str | Path) -> LabelMap:
 
 
 def map_classes(
-    trained: LoadedNetwork,
+    loaded: LoadedNetwork,
     label_map: LabelMap,
     unmapped: Unmapped = "unknown",
     targets: Sequence[str] | None = None,
@@ -96,7 +96,7 @@ def map_classes(
     """Return a network with the classes of a map instead of its own.
 
     Args:
-        trained: The network.
+        loaded: The network.
         label_map: The map.
         unmapped: Treatment of classes that are not in the map. Unknown classes of an imported
             network remain unknown.
@@ -117,9 +117,9 @@ def map_classes(
     target_of = {
         str(key): label_map.names[label - 1] for key, label in label_map.labels.items() if label
     }
-    trained.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
-    names = trained.class_names[1:]
-    groups = trained.groups or [[k] for k in range(len(names))]
+    loaded.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
+    names = loaded.class_names[1:]
+    groups = loaded.groups or [[k] for k in range(len(names))]
     members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
     for k, name in enumerate(names):
         members[target_of.get(plain_name(name))].append(k)
@@ -130,7 +130,7 @@ def map_classes(
             found=f"no class of the map in a network of {', '.join(names)}",
             expected="a map whose source classes include the network's",
         )
-    if remaining and unmapped == "never" and trained.score_kind == "labels":
+    if remaining and unmapped == "never" and loaded.score_kind == "labels":
         raise SettingError(
             "unmapped",
             found="never, for a network that returns labels",
@@ -143,7 +143,7 @@ def map_classes(
     scores += [unknown] if unknown else []
     found = {str(target): [names[k] for k in group] for target, group in members.items()}
     return MappedNetwork(
-        trained=replace(trained, class_names=("unknown", *targets), groups=scores),
+        loaded=replace(loaded, class_names=("unknown", *targets), groups=scores),
         classes=found,
         absent=[n for n in target_of if n not in map(plain_name, names)],
         unmapped=[names[k] for k in remaining],

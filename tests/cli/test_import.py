@@ -20,9 +20,10 @@ from models import UNet
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import (
+from tangent_train.inference.views import (
     PanoramaViews,
     PhotoViews,
     images_of_side,
@@ -47,8 +48,8 @@ def here(tmp_path: Path) -> Path:
     return tmp_path
 
 
-TORCHVISION = ("network=torchvision", "output=net.ckpt")
-OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
+TORCHVISION = ("library=torchvision", "output=net.ckpt")
+OF_ONNX = ("library=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
 
 
 @pytest.mark.parametrize("wins", [True, False])
@@ -64,7 +65,9 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255], [110, 90, 110]], np.uint8)
     rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
-    scores = Predictor(trained, PanoramaViews(trained, levels=(7,))).predict(InputImage(rgb))
+    scores = Predictor(trained, head_of(trained), PanoramaViews(trained, levels=(7,))).predict(
+        InputImage(rgb)
+    )
     labels = trained.labels(scores.labels())
     scores_by_hand = rgb / 255 @ WEIGHT.T + BIAS
     expected = (
@@ -90,7 +93,7 @@ def test_a_file_for_images_that_are_not_square(
         run("import", *OF_ONNX, "output=other.onnx", "image_size=[64,65]")
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8)
     rgb = colors[[0, 1, 2, 1]].repeat(32, axis=0)[None].repeat(64, axis=0)
-    mosaic = Predictor(trained, PanoramaViews(trained)).predict(InputImage(rgb))
+    mosaic = Predictor(trained, head_of(trained), PanoramaViews(trained)).predict(InputImage(rgb))
     labels = trained.labels(mosaic.labels())
     expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
     middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks
@@ -115,7 +118,7 @@ def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: P
     name = "lraspp_mobilenet_v3_large"
     monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
-    given = ("network=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
+    given = ("library=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
     with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as message:
         run("import", *given)
     file = Path(str(message.value).rpartition("save it as ")[2].removesuffix("."))
@@ -174,7 +177,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     network = torchvision_models.get_model(name, weights=None, weights_backbone=None).eval()
     torch.save(network.state_dict(), here / "state.pt")
     (here / "classes.json").unlink()
-    arguments = ("network=torchvision", f"model={name}", "weights=state.pt")
+    arguments = ("library=torchvision", f"model={name}", "weights=state.pt")
     run("import", *arguments, "output=net.ckpt")
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
@@ -191,7 +194,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
 # Depth.
 
 OF_DEPTH = (
-    *("network=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx"),
+    *("library=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx"),
     "depth=metric_z",
 )
 
@@ -248,19 +251,19 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
         ((*OF_DEPTH[:-1], "depth=meters"), "depth: found meters; expected .*metric_z"),
         ((*OF_ONNX, "output=o.onnx", "depth=metric_z"), "classes: .*expected null for depth"),
         (
-            ("network=onnx", "file=net.onnx", *OF_DEPTH[2:]),
+            ("library=onnx", "file=net.onnx", *OF_DEPTH[2:]),
             "found 4 per pixel, .*Leave out depth=",
         ),
         (
-            ("network=huggingface", "model=net", "output=net.ckpt", "depth=metric_z"),
+            ("library=huggingface", "model=net", "output=net.ckpt", "depth=metric_z"),
             "depth: found metric_z; expected null for networks of classes",
         ),
-        ((*TORCHVISION, "depth=metric_z"), "depth: found metric_z; .*null for network=torchvision"),
+        ((*TORCHVISION, "depth=metric_z"), "depth: found metric_z; .*null for library=torchvision"),
         (
-            ("network=huggingface", "output=net.ckpt", "weights=DEFAULT"),
-            "weights: .*network=huggingface",
+            ("library=huggingface", "output=net.ckpt", "weights=DEFAULT"),
+            "weights: .*library=huggingface",
         ),
-        ((*OF_DEPTH, "model=net"), "model: found net; expected null for network=onnx"),
+        ((*OF_DEPTH, "model=net"), "model: found net; expected null for library=onnx"),
         (("network=unet", "output=net.ckpt", "file=depth.onnx"), "file: .*null for network=unet"),
     ],
 )
