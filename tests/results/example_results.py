@@ -9,7 +9,8 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
-from tangent_train.results.evaluation_result import EvaluationResult, flat_settings
+from tangent_train.config.settings import flat_settings
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.published import facts
 from tangent_train.tasks import SegmentationTask
 

@@ -8,10 +8,10 @@ from statistics import fmean
 from typing import Any
 
 import pytest
+from omegaconf import OmegaConf
 
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
-from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
@@ -254,7 +254,7 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
         written = EvaluationResult("panoramas", 2, columns, means, protocol=protocol)
         written = replace(written, protocol=protocol | {"alignment": alignment})
         write_text(folder / "results.json", written.json())
-        write_settings(folder / "config.yaml", settings | {"task": {"alignment": alignment}})
+        OmegaConf.save(settings | {"task": {"alignment": alignment}}, folder / "config.yaml")
         records.append(load_result(folder))
     assert records[0].columns == columns
     assert records[0].scores == means
