@@ -148,16 +148,3 @@ def test_nothing_leaves_the_device(name: str, blend: Blend) -> None:
             labels = _filled(ScoreMosaic(shape, 4, **how), sets, on_device).labels()
         assert labels.device.type == "cuda"
         assert set(transfers) <= {"from {'cpu'} to {'cuda'}"}
-
-
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_images_without_pixels_change_nothing(blend: Blend) -> None:
-    (views,) = TangentRepresentation(0, 4).view_sets()
-    mosaic = ScoreMosaic((16, 32), 3, blend, averaged=True, backend="torch")
-    mosaic.add(torch.ones(0, 3, 16, 16), views[:0])
-    assert not mosaic.probabilities(slice(None)).any()
-
-
-def test_sums_that_are_too_large_are_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch_sums, "_BYTES", 64 * 128 * 4 * 4 - 1)
-    assert ScoreMosaic((64, 128), 4, "feather", device="cuda").labels().device.type == "cpu"

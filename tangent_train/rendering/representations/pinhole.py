@@ -19,8 +19,7 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.geometry.coverage import check_coverage
-from tangent_train.geometry.valid_views import best_views, needed_views
+from tangent_train.geometry.coverage import best_views, check_coverage, needed_views
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
