@@ -6,9 +6,8 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
-from tangent_train.config.build import Text, check_fields, check_plain
 from tangent_train.errors import DataError
-from tangent_train.files import load_plain
+from tangent_train.files import Text, check_fields, load_plain
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """Inputs of a network; equal to `datamodules.core.inputs.Input`, which is slow to import."""
@@ -43,7 +42,4 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
         raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
     content = load_plain(path, _EXPECTED, mmap=True)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
-    checked = check_fields(path, content, kinds, _EXPECTED)
-    if "config" in checked:
-        checked["config"] = check_plain(path, checked["config"], "config")
-    return checked
+    return check_fields(path, content, kinds, _EXPECTED)

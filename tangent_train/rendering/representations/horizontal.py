@@ -6,9 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid
 from tangent_train.geometry.coverage import check_coverage
@@ -18,7 +15,6 @@ from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
 from tangent_train.rendering.representations.views import (
     STRIDE,
-    PinholeViews,
     RotationAugmentation,
 )
 
@@ -104,18 +100,6 @@ class HorizontalRepresentation(PinholeRepresentation):
             covered is not None,
             is_joint,
         )
-
-    def sample(
-        self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None
-    ) -> PinholeViews:
-        """See `PinholeRepresentation`; of one field of view, drawn by the number of its views."""
-        if not self._is_joint:
-            return super().sample(rng, valid)
-        needed = self._needed([grid.with_rotation(None) for grid in self.grids], valid)
-        counts = np.array([len(faces) for faces in needed])
-        drawn = rng.choice(len(counts), p=counts / counts.sum())
-        least = counts[counts > 0].min()
-        return self._sample(rng, self.grids[drawn], needed[drawn], valid, least)
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:
