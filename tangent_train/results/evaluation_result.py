@@ -14,7 +14,6 @@ from typing import Any
 import yaml  # type: ignore[import-untyped]
 from pydantic import TypeAdapter
 
-from tangent_train.config.settings import flat_settings
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.metrics.score_columns import ScoreColumn
@@ -111,6 +110,15 @@ class EvaluationResult:
         adapter = TypeAdapter(EvaluationResult)
         content = adapter.dump_json(self, indent=1, exclude={"settings", "folder"})
         return content.decode() + "\n"
+
+
+def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Return settings of nested sections by name, ``section.setting``."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        flat |= flat_settings(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
 
 
 def load_result(folder: Path) -> EvaluationResult:
