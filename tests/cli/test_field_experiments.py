@@ -78,7 +78,7 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     name = _class_of(settings.data)
     section = settings.data | {"root": str(folders[name])}
     data, task = build(settings.model_copy(update={"data": section}))
-    assert {**data.facts, **task.facts} == protocol
+    assert {**data.facts, **task.head.facts} == protocol
     arguments += [f"data.root={folders[name]}", *SIZES.get(name, SIZE)]
     if command == "transfer":
         photos = folders[_class_of(settings.photos.data)]
