@@ -109,6 +109,6 @@ def test_experiments_of_the_paper_have_the_facts_of_its_scores(name: str, experi
     if name == "paper_photos":
         settings = settings.model_copy(update=dict(settings.photos))
     protocol = facts(name)
-    assert settings.task.get("absent_class") == protocol.pop("absent_class", None)
+    assert settings.task["head"].get("absent_class") == protocol.pop("absent_class", None)
     assert protocol.pop("weighting", "pixels") == "pixels"
     assert build_data(settings).facts == protocol
