@@ -26,7 +26,7 @@ from tangent_train.config.from_file import classes_to_trust
 from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import camera_matrix_from_fov, vertex_resolution
-from tangent_train.inference.representations import (
+from tangent_train.inference.views import (
     Levels,
     ViewChoice,
     check_size,

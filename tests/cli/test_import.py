@@ -23,7 +23,7 @@ from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import (
+from tangent_train.inference.views import (
     PanoramaViews,
     PhotoViews,
     images_of_side,
