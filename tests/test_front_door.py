@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import datamodules
 import models
 import tangent_train
 from models import UNet
@@ -19,14 +18,14 @@ from tests.running import run_python
 
 def test_names_come_from_their_packages() -> None:
     from tangent_train import geometry, rendering
-    from tangent_train.inference import applying, network
+    from tangent_train.inference import api, applying
 
     assert tangent_train.TangentGrid is geometry.TangentGrid
-    assert tangent_train.load is network.load
+    assert tangent_train.load is api.load
     assert tangent_train.apply is applying.apply
     for name in ("equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)
-    for package in (tangent_train, datamodules, models):
+    for package in (tangent_train, models):
         assert set(package.__all__) <= set(dir(package))
     with pytest.raises(AttributeError, match="no attribute 'missing'"):
         _ = tangent_train.missing

@@ -20,8 +20,9 @@ from tangent_train.cli.run import (
     write_settings,
 )
 from tangent_train.config.settings import EvaluateSettings
+from tangent_train.errors import SettingError
 from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.representations import check_size, panorama_settings
+from tangent_train.inference.views import check_size, panorama_settings
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -30,7 +31,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     Raises:
         SettingError: The network does not fit the data.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    hydra = HydraConfig.get()
+    typed = [text for text in hydra.overrides.task if text.startswith(("data=", "experiment="))]
+    if "data" in hydra.runtime.choices and not typed:
+        expected = "the data set of the evaluation, data=… or experiment=…"
+        raise SettingError("data", found="nothing", expected=expected)
+    folder = Path(hydra.runtime.output_dir)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
@@ -40,7 +46,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.label_map is not None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
-        loaded, notes = mapped.trained, [f"Label map {label_map.name}: {mapped}."]
+        loaded, notes = mapped.loaded, [f"Label map {label_map.name}: {mapped}."]
     check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
@@ -55,7 +61,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
     """Return the settings that come from the file: views, level, inputs and normalization."""
     level, section = settings.level or loaded.level, settings.representation or {}
     if "_target_" not in section:  # changes of the views of the file
-        stored = panorama_settings(loaded, level) if level != loaded.level else {}
+        stored = {} if settings.level is None else panorama_settings(loaded, level)
         section = {**loaded.representation, **stored, **section}
     if section.get("level", 0) is None:
         section = {**section, "level": level}

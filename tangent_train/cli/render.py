@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder.reader import class_masks
+from datamodules.folder.labeled import class_masks
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
-from tangent_train.inference.representations import view_settings
+from tangent_train.inference.views import view_settings
 from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,

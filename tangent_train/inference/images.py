@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from datamodules.core.panoramas import meters_to_steps, resize_depth, resize_nearest
+from datamodules.core.images import meters_to_steps, resize_depth
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.gpano import PanoramaArea, read_up, whole_area
@@ -25,8 +25,8 @@ from tangent_train.rendering.resampling import resize
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from datamodules.core.image_module import Upright
-    from tangent_train.inference.judge import NetworkJudge
+    from datamodules.core.panorama_module import Upright
+    from tangent_train.inference.up_likelihood import UpLikelihood
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]
     """Returns depth for an image of a size, in steps of 1/512 m; None without depth."""
@@ -114,7 +114,7 @@ class DepthFolder:
                 found=width_height((height, width)),
                 expected=f"the aspect ratio of the image, {width_height(shape)}",
             )
-        return meters_to_steps(resize_nearest(depth_m, shape))
+        return meters_to_steps(resize(depth_m, shape, "nearest"))
 
 
 def read_panorama(
@@ -151,17 +151,17 @@ def read_panorama(
     return InputImage(area.place(rgb), placed, up, area=area)
 
 
-def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
+def with_up(image: InputImage, max_tilt_deg: float, up_likelihood: UpLikelihood) -> InputImage:
     """Return a panorama with its zenith, which is estimated if it is not given.
 
     Args:
         image: A panorama.
         max_tilt_deg: Largest tilt of an estimate, see `estimate_up`.
-        judge: Evidence for the estimate, from the confidence of a network.
+        up_likelihood: Evidence for the estimate, from the confidence of a network.
     """
     if image.up is not None:
         return image
-    return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(judge, image)))
+    return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(up_likelihood, image)))
 
 
 def read_photo(

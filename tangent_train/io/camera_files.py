@@ -17,9 +17,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError
-from tangent_train.files import write_text
+from tangent_train.files import Text, check_fields, write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
 CAMERAS_FILE = "cameras.json"

@@ -6,7 +6,6 @@ import csv
 import json
 import math
 import shutil
-import signal
 import threading
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,7 @@ from PIL import Image
 from tangent_train.geometry import rotation_about
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
@@ -99,19 +98,18 @@ def test_an_interruption_keeps_what_is_done(
 
     def interrupted(*args: Any, **settings: Any) -> Any:
         if next(names) == "b":
-            signal.raise_signal(signal.SIGTERM)
+            raise KeyboardInterrupt
         return whole(*args, **settings)
 
     monkeypatch.setattr(Predictor, "predict", interrupted)
     with pytest.raises(SystemExit) as stopped:
         predict()
-    assert stopped.value.code == 128 + signal.SIGTERM
+    assert stopped.value.code == 130
     assert predicted(tmp_path / "out").keys() == {"a"}
     first = tmp_path / "out" / "labels" / "a.png"
     assert list(first.parent.iterdir()) == [first]
     printed = capsys.readouterr()
     assert "1 of 3 images are done. Continue with resume=true" in printed.out
-    assert printed.err == "tangent-predict: ended by SIGTERM\n"
     monkeypatch.setattr(Predictor, "predict", whole)
     written = first.stat().st_mtime_ns
     with pytest.raises(SystemExit, match="resume: found blend=nearest, which differs"):
@@ -215,11 +213,11 @@ def test_the_network_estimates_the_up_direction(
     room = draw_room((128, 256), tilt)
     write_pixels(tmp_path / "in" / "a.png", room)
 
-    def judge(self: NetworkJudge, image: InputImage, ups: NDArray[np.float64]) -> Any:
+    def judge(self: UpLikelihood, image: InputImage, ups: NDArray[np.float64]) -> Any:
         np.testing.assert_array_equal(image.rgb, room)
         return 30 * ups @ tilt[:, 2]
 
-    monkeypatch.setattr(NetworkJudge, "__call__", judge)
+    monkeypatch.setattr(UpLikelihood, "__call__", judge)
     found = predict(upright="auto", max_tilt_deg=180, write="[labels]", report=0)["a"]
     assert found["tilt_deg"] == pytest.approx(100, abs=0.5)
 

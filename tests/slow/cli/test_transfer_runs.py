@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from datamodules.cityscapes.classes import CLASSES
+from datamodules.cityscapes import CLASSES
 from tangent_train.results.published import facts
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
 from tests.cli.tiny_runs import Run, results
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
+from tests.datamodules.street_format import write_cityscapes, write_densepass
 
 
 def test_real_runs_from_photos_to_panoramas(
@@ -89,7 +89,7 @@ def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_
     photos = write_cityscapes(tmp_path / "photos")
     size = {"height": 32, "width": 32}
     networks.saved(partial(networks.segformer, CLASSES), tmp_path / "segformer", size=size)
-    run("import", "network=huggingface", "model=segformer", "output=segformer.ckpt")
+    run("import", "library=huggingface", "model=segformer", "output=segformer.ckpt")
     experiment = "field/cityscapes_densepass_13"
     arguments = [f"experiment={experiment}", "checkpoint=segformer.ckpt", "level=6"]
     arguments += [f"data.root={panoramas}", f"photos.data.root={photos}", "panels=0"]

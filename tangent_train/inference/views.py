@@ -1,0 +1,465 @@
+"""Select views of new panoramas and photos for a trained network."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import cv2
+import numpy as np
+from omegaconf import OmegaConf
+
+from datamodules.core.images import distance_from_z_depth, resize_depth
+from tangent_train.config.build import build_from_config
+from tangent_train.errors import SettingError, counted, width_height
+from tangent_train.files import config_folder
+from tangent_train.geometry import PinholeGrid, TangentGrid
+from tangent_train.inference.images import InputImage
+from tangent_train.io.gpano import PanoramaArea
+from tangent_train.orientation.gravity import upright_rotation
+from tangent_train.rendering import (
+    EquirectRepresentation,
+    IcosphereRepresentation,
+    PerspectiveRepresentation,
+    Representation,
+)
+from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
+from tangent_train.rendering.representations.views import PinholeViews
+from tangent_train.rendering.resampling import resize
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from tangent_train.checkpoints.loaded import LoadedNetwork
+    from tangent_train.io.gpano import Fill
+    from tangent_train.rendering import Blend
+    from tangent_train.rendering.representations.views import Views
+
+Levels = int | Sequence[int] | None
+"""A level s, which sets the angular resolution, or several to average over; None as trained."""
+
+ViewChoice = str | Mapping[str, Any] | None
+"""Views of panoramas: an option of the configs of representations, such as ``horizontal``; or its
+name as ``option``, with changed settings of the representation. None as trained."""
+
+_TANGENT = "tangent_train.rendering.TangentRepresentation"
+PERSPECTIVE = "tangent_train.rendering.PerspectiveRepresentation"
+_EQUIRECT = "tangent_train.rendering.EquirectRepresentation"
+_ICOSPHERE = "tangent_train.rendering.IcosphereRepresentation"
+
+_NOT_VIEWS = "icosphere", "perspective"
+"""Options of the configs of representations that are not views for networks of photos."""
+
+_VIEWS = "horizontal_wide"
+"""Views of panoramas for imported photo networks, see docs/results/real_panoramas.md."""
+
+_BASE_LEVEL = 1
+"""For networks trained on photos (paper, section 5: transfer uses b = 1)."""
+
+_OVERLAP = 0.25
+"""Minimum overlap of neighboring crops of a photo with feathering, as a share of their side."""
+
+_OVERSAMPLED = 2
+"""Photos are resized to at most 2 pixels per pixel of a crop before their borders are mirrored."""
+
+
+_MASK_ROWS = 360
+"""Rows of the mask of the area that panoramas show."""
+
+
+class SourceViews(NamedTuple):
+    """Sets of views that are rendered from one image.
+
+    Attributes:
+        image: The panorama or photo.
+        shape: Rows and columns to which it is resized first.
+        sets: Sets of views, each of which covers the whole image, or the area of a panorama.
+        rotation: ``(3, 3)`` rotation that aligns views of a panorama with gravity, or None.
+    """
+
+    image: InputImage
+    shape: tuple[int, int]
+    sets: Sequence[Views]
+    rotation: NDArray[np.float64] | None = None
+
+
+class PanoramaViews:
+    """Selects views of panoramas, by default as in training; scores of several sets are averaged.
+
+    Networks trained on photos get tangent images of base level 1, at the level that matches the
+    angular resolution of their crops.
+
+    Args:
+        loaded: The network.
+        levels: See `Levels`. All are rendered from a panorama of the highest level.
+        base_level: Base level b of tangent images; None as trained.
+        blend: Blending of overlapping views.
+        rotations: Number of rotations about the vertical to average over.
+        views: See `ViewChoice`.
+        fill: Colors outside the area of a partial panorama, in views that leave it; None as
+            trained.
+
+    Attributes:
+        representation: Representation of upright panoramas.
+        distortion_aware: See `EquirectRepresentation`; False for other representations.
+
+    Raises:
+        SettingError: The network does not support such views.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedNetwork,
+        levels: Levels = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+        rotations: int = 1,
+        views: ViewChoice = None,
+        fill: Fill | None = None,
+    ) -> None:
+        settings = panorama_settings(loaded, levels, base_level, views)
+        settings["rotations"] = rotations
+        if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
+            settings["blend"] = blend
+        self.representation = _built(loaded, settings)
+        self.image_size = self.representation.image_size
+        self.distortion_aware = getattr(self.representation, "distortion_aware", False)
+        self.blend = self.representation.blend
+        self._fill = fill or loaded.fill
+
+    def description(self, area: Sequence[float] | None = None) -> str:
+        """Return number and size of the views; of pinhole images also their angle and resolution.
+
+        Signals on an icosphere are described by their number of values.
+
+        Args:
+            area: Area that the panoramas show, see `check_area`; None for the whole sphere.
+        """
+        rows, columns = self.image_size
+        sets = self.representation.view_sets(PanoramaArea.on_canvas(area, _MASK_ROWS).valid)
+        count = sum(map(len, sets))
+        if rows == 1:  # signals on an icosphere
+            return f"{counted(count, 'signals')} of {columns} values"
+        text = f"{counted(count, 'views')} of {columns} × {rows}"
+        grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
+        tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
+        if not tangent:
+            needed = (views.grid for views in sets if isinstance(views, PinholeViews))
+            parts = list(dict.fromkeys(map(_described, needed)))
+            return f"{text} ({'; '.join(parts)})" if parts else text
+        parts = [f"level {level}: {_described(grid)}" for level, grid in tangent.items()]
+        if len(parts) > 1:
+            parts.append(f"levels={next(iter(tangent))} alone takes 1/{len(parts)} of the time")
+        base_level = next(iter(tangent.values())).base_level
+        return f"{text} at base level {base_level} ({'; '.join(parts)})"
+
+    def __call__(self, image: InputImage) -> list[SourceViews]:
+        """Return the sets of views of the valid pixels of one panorama."""
+        representation: Representation = self.representation
+        rotation = None
+        if image.area is not None:
+            image = replace(image, rgb=image.area.filled(image.rgb, self._fill))
+        if image.up is not None:
+            rotation = upright_rotation(image.up)
+            representation = representation.with_rotation(rotation)
+        rows = representation.erp_height
+        shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
+        return [SourceViews(image, shape, representation.view_sets(image.valid), rotation)]
+
+
+def _described(grid: PinholeGrid) -> str:
+    density = math.radians(1 / grid.pitch)
+    return f"{grid.width_deg:.0f}° wide, {density:.1f} pixels per degree in the middle"
+
+
+class PhotoViews:
+    """Selects crops of photos with the size and angular resolution of the training images.
+
+    Args:
+        loaded: The network.
+        levels: See `Levels`.
+        base_level: Base level b of tangent images whose size the crops get; None as trained.
+        blend: ``feather``: crops overlap by at least a quarter and are averaged.
+        rotations: 1; photos cannot be averaged over rotations.
+
+    Raises:
+        SettingError: The network does not support such crops, or `rotations` is not 1.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedNetwork,
+        levels: Levels = None,
+        base_level: int | None = None,
+        blend: Blend = "feather",
+        rotations: int = 1,
+    ) -> None:
+        if rotations != 1:
+            raise SettingError("rotations", found=rotations, expected="1 for photos")
+        if "elevation" in loaded.inputs:
+            expected = "a panorama: the elevation of pixels, which the network takes, is unknown"
+            raise SettingError("image", found="a photo", expected=expected)
+        self._crops = [
+            _photo_representation(loaded, level, base_level)
+            for level in level_list(levels, loaded.photo_level or loaded.level)
+        ]
+        self.image_size = max(crops.image_size for crops in self._crops)
+        self.blend: Blend = blend
+
+    def __call__(self, image: InputImage) -> list[SourceViews]:
+        """Return crops that cover the photo. Photos smaller than a crop are mirrored at borders."""
+        overlap = _OVERLAP if self.blend == "feather" else 0.0
+        return [_covered(image, crops, overlap) for crops in self._crops]
+
+
+def wide_levels(side: int) -> list[int]:
+    """Return the levels of wide tangent images for photo networks.
+
+    At level s and base level 0, 2^s pixels span 95.8°. The first level has the power of two nearest
+    to the side. The second is the next lower level, at which the same number of pixels spans twice
+    as much of the tangent plane. See docs/explanation/choosing_views.md.
+
+    Args:
+        side: Side of the network's images in pixels.
+
+    >>> wide_levels(512), wide_levels(640), wide_levels(384)
+    ([9, 8], [9, 8], [9, 8])
+    """
+    level = max(1, round(math.log2(side)))
+    return [level, level - 1]
+
+
+def images_of_side(side: int, level: int, base_level: int | None = None) -> dict[str, int]:
+    """Choose base level and side of tangent images: the fewest with a given side.
+
+    Args:
+        side: Side of the network's images in pixels.
+        level: Highest level s of the images.
+        base_level: Base level b; None for the fewest images.
+
+    Returns:
+        ``base_level`` and ``dim``, which differs from `side` only if images of that side would
+        leave gaps on the sphere.
+
+    >>> images_of_side(512, 9), images_of_side(512, 10)
+    ({'base_level': 0, 'dim': 512}, {'base_level': 1, 'dim': 512})
+    """
+    if base_level is None:  # a side of 2^(s−b−½) leaves no gaps
+        base_level = max(0, math.ceil(level - math.log2(side) - 0.5))
+    if not 0 <= base_level <= level:
+        return {"base_level": base_level, "dim": side}  # refused by `TangentGrid`
+    covers = side >= TangentGrid.least_dim(base_level, level)
+    return {"base_level": base_level, "dim": side if covers else 2 ** (level - base_level)}
+
+
+def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
+    """Return the settings of a representation of panoramas, without its level.
+
+    Args:
+        views: See `ViewChoice`.
+
+    Raises:
+        SettingError: There is no such option.
+    """
+    changes = {"option": views} if isinstance(views, str) else dict(views)
+    folder, option = config_folder() / "representation", changes.pop("option", None)
+    files = sorted(folder.glob("*.yaml"))
+    known = {file.stem: file for file in files if not file.stem.startswith(_NOT_VIEWS)}
+    if option not in known:
+        raise SettingError("views", found=views, expected=f"an option: {', '.join(known)}")
+    section: Any = OmegaConf.to_container(OmegaConf.load(known[option]))
+    bases = [name for name in section.pop("defaults", ()) if name != "_self_"]
+    inherited = view_settings(bases[0]) if bases else {}
+    return {**inherited, **section, **changes, "level": None}
+
+
+def photo_network_settings(
+    side: int, levels: Levels = None, base_level: int | None = None, views: ViewChoice = None
+) -> dict[str, Any]:
+    """Return the settings of the representation of panoramas for an imported photo network.
+
+    Args:
+        side: Side of the network's images in pixels.
+        levels: See `Levels`; None for `wide_levels` of tangent images, and for the first of these
+            of other views.
+        base_level: Base level b of tangent images; None for the fewest images.
+        views: See `ViewChoice`; None for `horizontal_wide`, or tangent images if levels or base
+            level are given.
+
+    Raises:
+        SettingError: The views do not have these settings.
+    """
+    is_default = levels is None and base_level is None
+    settings = view_settings(views or (_VIEWS if is_default else "tangent"))
+    is_tangent = settings["_target_"] == _TANGENT
+    chosen = (
+        wide_levels(side)[: 2 if is_tangent else 1] if levels is None else level_list(levels, 0)
+    )
+    settings["level"] = max(chosen)
+    if is_tangent:
+        if settings["dim"] is None and settings["crop_multiple"] is None:
+            settings |= images_of_side(side, settings["level"], base_level)
+        return settings | {"levels": chosen}
+    _check_single(chosen, base_level)
+    size = "rows" if settings["_target_"] == _EQUIRECT else "dim"
+    return settings | {size: side if settings[size] is None else settings[size]}
+
+
+def _check_single(levels: Sequence[int], base_level: int | None) -> None:
+    """Refuse settings that only tangent images have."""
+    if base_level is not None:
+        raise SettingError("base_level", found=base_level, expected="tangent images")
+    if len(levels) > 1:
+        raise SettingError(
+            "levels",
+            found=list(levels),
+            expected="one level, for a network that does not take tangent images",
+            remedy="Use views=tangent for tangent images.",
+        )
+
+
+def panorama_settings(
+    loaded: LoadedNetwork,
+    levels: Levels = None,
+    base_level: int | None = None,
+    views: ViewChoice = None,
+) -> dict[str, Any]:
+    """Return the settings of the representation of panoramas, see `PanoramaViews`.
+
+    Args:
+        loaded: The network.
+        levels: See `Levels`.
+        base_level: Base level b of tangent images; None as trained.
+        views: See `ViewChoice`.
+
+    Raises:
+        SettingError: The representation does not have these settings.
+    """
+    side, settings = loaded.photo_side, dict(loaded.representation)
+    if side is not None and views is not None:
+        return photo_network_settings(side, levels, base_level, views)
+    chosen = [loaded.level] if levels is None else level_list(levels, loaded.level)
+    level = max(chosen)
+    if views is not None:
+        settings = view_settings(views)
+    elif settings["_target_"] == PERSPECTIVE or (
+        base_level is not None and settings["_target_"] != _TANGENT
+    ):
+        settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
+    if level != loaded.level and views is None:
+        settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
+    settings["level"] = level
+    if settings["_target_"] != _TANGENT:
+        _check_single(chosen, base_level)
+        if side is not None and "dim" in settings:
+            settings["dim"] = settings["dim"] or side
+        return settings
+    if base_level not in (None, settings["base_level"]):
+        settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
+    if levels is not None:
+        settings["levels"] = chosen if len(chosen) > 1 else None
+    if side is not None:
+        dim = settings.get("dim")
+        # The network divides larger images.
+        settings |= (
+            images_of_side(side, level, base_level) if dim is None else {"dim": max(dim, side)}
+        )
+    return settings
+
+
+def _built(
+    loaded: LoadedNetwork, settings: dict[str, Any]
+) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
+    """Build the representation from settings.
+
+    Raises:
+        SettingError: The network does not support its image size.
+    """
+    built: Any = build_from_config(settings, "representation")
+    check_size(loaded, built.image_size)
+    return built
+
+
+def _photo_representation(
+    loaded: LoadedNetwork, level: int, base_level: int | None
+) -> PerspectiveRepresentation:
+    settings = loaded.representation
+    if settings["_target_"] == PERSPECTIVE and base_level is None:
+        half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
+        half_extent /= 2.0 ** (level - loaded.level)
+        size = loaded.image_size
+    else:
+        views = "tangent" if loaded.photo_level is not None else None
+        seen = _built(loaded, panorama_settings(loaded, level, base_level, views))
+        if not isinstance(seen, PinholeRepresentation):
+            return _photo_representation(loaded, level, _BASE_LEVEL)
+        size = seen.image_size
+        half_extent = min(grid.half_size[0] for grid in seen.grids)
+    check_size(loaded, size)
+    return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
+
+
+def check_size(loaded: LoadedNetwork, size: tuple[int, int]) -> None:
+    """Refuse image sizes that a network does not support.
+
+    Args:
+        loaded: The network.
+        size: Rows and columns of the images.
+
+    Raises:
+        SettingError: The network does not support the size.
+    """
+    if _fits(loaded, size):
+        return
+    expected = f"multiples of {loaded.size_multiple}, the network's stride"
+    remedy = "Choose other levels, or leave both as trained."
+    if loaded.fixed_size is not None:
+        size_in_file = width_height(loaded.fixed_size)
+        expected = f"at least {size_in_file}, the input size of the network's file"
+    if loaded.is_spherical:
+        expected = f"{width_height(loaded.image_size)}, the panorama or signal of the training"
+        remedy = "It labels whole panoramas: leave projection, views and base_level as trained too."
+    found = f"images of {width_height(size)}"
+    raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
+
+
+def _fits(loaded: LoadedNetwork, size: tuple[int, int]) -> bool:
+    """Return True if a network supports images of rows and columns."""
+    if loaded.is_spherical:
+        return size == loaded.image_size
+    if loaded.fixed_size is not None:
+        return all(n >= least for n, least in zip(size, loaded.fixed_size, strict=True))
+    return not any(side % loaded.size_multiple for side in size)
+
+
+def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:
+    """Return crops that cover a photo; its borders are mirrored where a crop is larger.
+
+    Args:
+        image: The photo. Its z-depth is converted to distance.
+        wanted: Common camera of the crops.
+        overlap: See `PhotoSampler.cover`.
+    """
+    matrix, size = np.array(image.camera_matrix), image.rgb.shape[:2]
+    depth = None if image.depth is None else distance_from_z_depth(image.depth, matrix)
+    pixel = 2 * math.tan(math.radians(wanted.fov_deg) / 2) / wanted.image_size[1]
+    per_pixel = pixel * np.diag(matrix)[[1, 0]]  # photo pixels per crop pixel, down and across
+    # Resized first: mirrored at full resolution, a photo of a tiny field of view fills the memory.
+    kept = np.minimum(1, _OVERSAMPLED / per_pixel)
+    rows, columns = (max(1, round(n * share)) for n, share in zip(size, kept, strict=True))
+    scale = np.array([columns / size[1], rows / size[0]])
+    least = np.ceil(wanted.image_size * per_pixel * scale[::-1] + 1e-6)
+    top, left = (math.ceil(max(0, a - b) / 2) for a, b in zip(least, (rows, columns), strict=True))
+    borders = (top, top, left, left, cv2.BORDER_REFLECT_101)
+    rgb = cv2.copyMakeBorder(resize(image.rgb, (rows, columns), "bilinear"), *borders)
+    if depth is not None:
+        depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
+    offset, factor = np.tile((left, top), 2), np.tile(scale, 2)
+    camera = np.diag([*np.diag(matrix)[:2] * scale, 1])
+    camera[:2, 2] = (matrix[:2, 2] + 0.5) * scale + (left, top) - 0.5
+    mirrored = InputImage(rgb, depth)
+    crops = wanted.of_camera(camera, mirrored.shape).cover(overlap)
+    in_photo = replace(crops, canvas_boxes=(crops.boxes - offset) / factor)
+    return SourceViews(mirrored, mirrored.shape, [in_photo])
