@@ -16,13 +16,17 @@ import OpenEXR
 from numpy.typing import NDArray
 from PIL import Image
 
-from datamodules.core.panoramas import ImageFiles
+from datamodules.core.images import ImageFiles
+from datamodules.core.label_map import read_label_map
 from datamodules.core.problems import Problems
 from datamodules.folder.cameras import read_folder_cameras as read_photo_cameras
-from datamodules.folder.classes import read_classes
 from datamodules.modelnet40.meshes import read_off
 from datamodules.stanford2d3ds.files import CLASSES
-from datamodules.stanford2d3ds.reader import LabelTable, read_camera_matrix, read_panorama_pose
+from datamodules.stanford2d3ds.panoramas import (
+    read_camera_matrix,
+    read_label_table,
+    read_panorama_pose,
+)
 from datamodules.zind.homes import list_home_panoramas
 from tangent_train.errors import DataError
 from tangent_train.geometry import TangentGrid, rotation_about
@@ -31,7 +35,7 @@ from tangent_train.io.gpano import read_area, read_up
 from tangent_train.io.pixel_files import read_depth_m, read_pixels
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp, xmp_packet
 from tests.datamodules.folder.folder_format import VALUES
-from tests.datamodules.zind.zind_format import SQUARE, Camera, write_home
+from tests.datamodules.zind_format import SQUARE, Camera, write_home
 
 _SHAPE = (8, 16)
 _RNG = np.random.default_rng(0)
@@ -62,7 +66,7 @@ def _table_seeds() -> list[bytes]:
 
 
 def _read_table(path: Path) -> None:
-    ids = LabelTable.from_json(path).class_ids
+    ids = np.array(list(read_label_table(path).labels.values()))
     assert 0 <= ids.min() <= ids.max() <= len(CLASSES)
 
 
@@ -88,7 +92,7 @@ def _class_seeds() -> list[bytes]:
 
 
 def _read_class_list(path: Path) -> None:
-    classes = read_classes(path)
+    classes = read_label_map(path)
     assert 1 <= len(classes.names) <= 255
     assert classes.decode(_RGB if classes.in_colors else _DEPTH * 0).shape == _SHAPE
 
