@@ -356,7 +356,7 @@ def test_photos_without_a_field_of_view_are_explained(network: Network, tmp_path
 
 def test_a_name_of_trusted_code_is_one_name(tmp_path: Path) -> None:
     content = torch.load(write_checkpoint(tmp_path / "net.ckpt"), weights_only=True)
-    content["config"]["network"] = {
+    content["tangent_train"]["settings"] = {
         "_target_": "tests.inference.trained.color_network",
         "channels": 3,
     }
