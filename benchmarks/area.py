@@ -12,6 +12,7 @@ from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import RGB_NORMALIZATION
 from models import UNet
 from tangent_train.checkpoints.loaded import LoadedNetwork
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
@@ -45,7 +46,7 @@ def area(quick: bool) -> Iterator[Table]:
         },
         image_size=(2**level, 2**level),
     )
-    predictor = Predictor(trained, PanoramaViews(trained))
+    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained))
     alternatives = [
         Alternative(of, partial(predictor.predict, image), of == PART)
         for of, image in images.items()

@@ -15,8 +15,8 @@ from datamodules.core.labels import DISTANCE
 from models import HuggingFaceDepthNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import equirect_directions
-from tangent_train.inference.depth import DepthPredictor
-from tangent_train.inference.engine import views_per_forward
+from tangent_train.heads import head_of
+from tangent_train.inference.engine import Predictor, views_per_forward
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews, photo_network_settings
 
@@ -56,7 +56,7 @@ def depth(quick: bool) -> Iterator[Table]:
     count = sum(map(len, chosen.representation.view_sets()))
     random = torch.rand(views_per_forward((side, side)), 3, side, side)
     network = HuggingFaceDepthNetwork({"model_type": "depth_anything"}).eval().requires_grad_(False)
-    run = partial(DepthPredictor(trained, chosen).predict, InputImage(rgb))
+    run = partial(Predictor(trained, head_of(trained), chosen).predict, InputImage(rgb))
     name, calls = f"the network, {count} views", count / len(random)
     alternatives = [
         Alternative(name, partial(network, random), scale=calls, rounds=3),

@@ -88,7 +88,7 @@ def _calls(settings: list[str], root: str, rows: int) -> tuple[Callable[[], obje
         batch = next(iter(data.train_dataloader()))
         images, labels = task.training_pairs(batch._replace(images=data.normalized(batch)))
         optimizer.zero_grad()
-        torch.autograd.backward(task.loss_sum((images,), labels) / task.loss_norm(labels))
+        torch.autograd.backward(task.loss_sum((images,), labels) / task.head.loss_norm(labels))
         optimizer.step()
 
     def evaluate() -> None:

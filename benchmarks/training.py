@@ -98,7 +98,7 @@ def step(quick: bool) -> Iterator[Table]:
     both networks must have the same weights.
     """
     small = ["level=5", "network=unet_small"] if quick else []
-    settings = ["data.batch_size=3", "task.class_weights=none", "optimizer=adam"]
+    settings = ["data.batch_size=3", "task.head.class_weights=none", "optimizer=adam"]
     settings += [
         "representation.random_rotation=none"
     ]  # with rotations, they would share cached tables

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from models.sphere_context import SphereContext as SphereContext
     from models.stem import widen_stem as widen_stem
     from models.tables import face_neighbors as face_neighbors
-    from models.tables import gnomonic_taps as gnomonic_taps
+    from models.tables import gnomonic_points as gnomonic_points
     from models.tables import hexagonal_rings as hexagonal_rings
     from models.tables import mapped_samples as mapped_samples
     from models.tables import mesh_operators as mesh_operators
@@ -48,7 +48,7 @@ _FILES = {
     "UNet": "unet",
     "ZonalClassifier": "zonal",
     "face_neighbors": "tables",
-    "gnomonic_taps": "tables",
+    "gnomonic_points": "tables",
     "hexagonal_rings": "tables",
     "initialize": "initialization",
     "make_distortion_aware": "distortion_aware",

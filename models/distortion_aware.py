@@ -28,7 +28,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
-from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz
+from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz
 
 _SAMPLES = 2**24
 """Most samples in memory at a time: taps of output pixels, times channels and images."""
@@ -123,7 +123,7 @@ def _row_taps(
     )
     pitch = math.tan(min(2 * math.pi / shape[1], _LARGEST_PITCH))
     dense = ((kernel[0] - 1) * dilation[0] + 1, (kernel[1] - 1) * dilation[1] + 1)
-    taps = gnomonic_taps_xyz(directions, dense, pitch).reshape(count, *dense, 3)
+    taps = gnomonic_points_xyz(directions, dense, pitch).reshape(count, *dense, 3)
     lonlat = xyz_to_lonlat(taps[:, :: dilation[0], :: dilation[1]])
     return lonlat_to_equirect(lonlat, shape) - (middle, 0)
 

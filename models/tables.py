@@ -10,7 +10,7 @@ from scipy import sparse
 
 from models.mapped import Table
 from tangent_train.geometry import icosphere, vertex_resolution
-from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
+from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions, locate
 
 
@@ -146,7 +146,7 @@ def vertex_parents(level: int) -> Table:
 
 
 @cache
-def gnomonic_taps(level: int) -> Table:
+def gnomonic_points(level: int) -> Table:
     """Return nine taps: a 3 × 3 grid on the tangent plane of each vertex, aligned to the north.
 
     Their distance on the plane is the tangent of the mean angle between neighboring vertices (Coors
@@ -157,7 +157,7 @@ def gnomonic_taps(level: int) -> Table:
         level: Level s of the icosphere.
     """
     pitch = float(np.tan(vertex_resolution(level)))
-    return mapped_samples(level, gnomonic_taps_xyz(icosphere_directions(level), 3, pitch))
+    return mapped_samples(level, gnomonic_points_xyz(icosphere_directions(level), 3, pitch))
 
 
 def mapped_samples(level: int, directions_xyz: NDArray[np.float64]) -> Table:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from studies.output import COLORS, Row, save, save_table
 from tangent_train.checkpoints.distances import distance_of, from_distance
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.inference.alignment import align, sample_views, sphere_points
+from tangent_train.heads.alignment import align_views, sample_views, sphere_points
 from tangent_train.io.pixel_files import read_depth_m
 from tangent_train.rendering import HorizontalRepresentation
 
@@ -94,7 +94,7 @@ def depth_alignment(
     ]
     row: Row = {"output": kind, "smooth error %": 100 * smooth_error}
     for mode in modes:
-        alignment, errors, first = align(samples, kind, mode), [], 0
+        alignment, errors, first = align_views(samples, kind, mode), [], 0
         for output, truth, part in zip(outputs, truths, views, strict=True):
             numbers, lengths = slice(first, first + len(part)), torch.from_numpy(part.ray_lengths())
             distance = distance_of(alignment.applied(output, numbers, lengths), kind)

@@ -3,51 +3,17 @@
 from __future__ import annotations
 
 import csv
-import errno
 import io
 import json
 import os
 import re
-import shutil
 import tempfile
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from tangent_train.errors import DataError, SettingError
-from tangent_train.imports import elsewhere
-
-_PREFIX = ".partial-"
-_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
-_PROBE = bytes(1 << 16)
-
-
-class NoRoomError(SettingError):
-    """A full disk, an exhausted quota, or a file above the size limit."""
-
-
-def no_room(path: Path, error: BaseException) -> NoRoomError | None:
-    """Return an error with a remedy if a file did not fit on the disk.
-
-    Args:
-        path: File that was written.
-        error: Raised error.
-
-    Returns:
-        Error with a remedy; None if `error` has another reason.
-    """
-    if not isinstance(error, OSError) or error.errno not in _FULL:
-        return None
-    folder = next((parent for parent in path.absolute().parents if parent.exists()), Path("/"))
-    return NoRoomError(
-        path,
-        found=f"{os.strerror(error.errno).lower()} ({shutil.disk_usage(folder).free / 1e9:.1f} GB "
-        "free)",
-        expected="room for the file",
-        remedy="Existing files are unchanged. Free some space, or write to another disk.",
-    )
+from tangent_train.errors import DataError
 
 
 @contextmanager
@@ -63,15 +29,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
     Yields:
         Path in the same folder with the same suffix, to be written by the block.
-
-    Raises:
-        NoRoomError: The disk is full.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, name = tempfile.mkstemp(dir=path.parent, prefix=_PREFIX, suffix=path.suffix)
-    except OSError as error:
-        raise no_room(path, error) or OSError(error.errno, error.strerror, str(path)) from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=".partial-", suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
     try:
@@ -80,12 +40,6 @@ def atomic_path(path: Path) -> Iterator[Path]:
         _sync(temporary)
         temporary.replace(path)
         _sync(path.parent)
-    except Exception as error:
-        known = isinstance(error, OSError) and error.errno is not None
-        full = no_room(path, error if known else _refused(temporary))
-        if full is None:
-            raise
-        raise full from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -130,17 +84,6 @@ def write_text(path: Path, content: str) -> None:
     write_bytes(path, content.encode(errors="backslashreplace"))
 
 
-def _refused(path: Path) -> OSError:
-    """Return the error that keeps a file from growing, which libraries do not report."""
-    try:
-        with path.open("ab") as file:
-            file.write(_PROBE)
-            file.flush()
-    except OSError as error:
-        return error
-    return OSError()
-
-
 def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     """Load tensors and plain values from a file of `torch.save`; nothing else is unpickled.
 
@@ -154,8 +97,7 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     """
     if not path.exists():
         raise DataError(path, found="no such file", expected=expected)
-    with elsewhere():
-        import torch
+    import torch
 
     try:
         content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
@@ -167,30 +109,6 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
             found = "a damaged file, or not a file of torch.save"
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    return content
-
-
-def parse_json(text: str | bytes) -> Any:
-    """Parse JSON; refuse text that is nested too deeply, or repeats a name in a mapping.
-
-    Args:
-        text: Text, or its bytes in UTF-8, UTF-16 or UTF-32.
-
-    Raises:
-        ValueError: The text is not JSON, or is refused.
-    """
-    try:
-        return json.loads(text, object_pairs_hook=_unique)
-    except RecursionError as error:
-        raise ValueError("its brackets are nested too deeply") from error
-
-
-def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Build a mapping; refuse repeated names, of which programs read different values."""
-    content = dict(pairs)
-    if len(content) < len(pairs):
-        ((name, _),) = Counter(name for name, _ in pairs).most_common(1)
-        raise ValueError(f"{name!r} is repeated")
     return content
 
 
@@ -209,13 +127,13 @@ def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> 
     from pydantic import TypeAdapter, ValidationError  # slow to import
 
     try:
-        content = parse_json(path.read_bytes())
+        content = json.loads(path.read_bytes())
         return content if kind is None else TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise DataError(path, found=error, expected=expected, remedy=remedy) from error
 
 
@@ -248,6 +166,21 @@ def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any] | Sequence
 
 def _cell(value: Any) -> Any:
     return f"'{value}" if isinstance(value, str) and value.startswith(_FORMULA) else value
+
+
+def check_new(path: Path, *, overwrite: bool) -> None:
+    """Refuse to replace an existing output file, unless the user wants it.
+
+    Raises:
+        SettingError: The file exists.
+    """
+    if path.exists() and not overwrite:
+        raise SettingError(
+            "output",
+            found=f"{path}, which exists",
+            expected="a path that does not exist yet",
+            remedy="Give another output, or overwrite=true.",
+        )
 
 
 def config_folder() -> Path:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from tangent_train.errors import SettingError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 
 MANIFEST = "manifest.json"
 
@@ -118,7 +118,7 @@ class Manifest:
         """Refuse a folder that was begun with other settings."""
         content: Any = None
         with suppress(ValueError):
-            content = parse_json(path.read_bytes())
+            content = json.loads(path.read_bytes())
         before = content if isinstance(content, dict) else {}
         for name in sorted(before.keys() | wanted.keys()):
             if before.get(name) != wanted.get(name):

@@ -33,7 +33,7 @@ def fed(quick: bool) -> Iterator[Table]:
     level, rooms = (5, 4) if quick else (10, 32)
     settings = ["experiment=paper/semseg_s10_b1_rgbd", f"level={level}", "network.weights=null"]
     settings += ["task.view_batch_size=null", "task.channels_last=true", "data.in_memory=false"]
-    settings += [f"task.class_weights={[1] * 13}"]
+    settings += [f"task.head.class_weights={[1] * 13}"]
     with tempfile.TemporaryDirectory() as root:
         settings.append(f"data.store={root}/store")
         data, task = built(settings, f"{root}/rooms", 2 ** (level + 1), rooms)

@@ -21,6 +21,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.cli.processes import command_line, run_process
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import TangentGrid, equirect_shape
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, view_scores, views_per_forward
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
@@ -78,7 +79,9 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
         Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))
     ]
     for blend in ("feather", "nearest"):
-        predictor = Predictor(trained, PanoramaViews(trained, blend=blend), DEVICE.type)
+        predictor = Predictor(
+            trained, head_of(trained), PanoramaViews(trained, blend=blend), DEVICE.type
+        )
         alternatives.append(
             Alternative(f"Predictor, {blend}", partial(labeled, predictor), is_ours=True)
         )

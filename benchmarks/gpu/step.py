@@ -15,7 +15,7 @@ from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, attempted, measure
 from models import FCNResNet, HuggingFaceNetwork, UNet
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks import SegmentationTask
+from tests.tasks.builders import segmentation_task
 
 PEAK_FLOPS = 989e12
 """Dense bf16 operations per second of an H100 or H200 SXM (NVIDIA's data sheets)."""
@@ -75,7 +75,7 @@ def _step(
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = tf32
     names = ("unknown", *map(str, range(NUM_CLASSES)))
     on_gpu = DEVICE.type == "cuda"
-    task = SegmentationTask(
+    task = segmentation_task(
         copy.deepcopy(network),
         TangentRepresentation(base_level=0, level=4),
         names,
@@ -91,7 +91,7 @@ def _step(
     def take() -> None:
         optimizer.zero_grad()
         with torch.autocast(DEVICE.type, torch.bfloat16, enabled=half and on_gpu):
-            loss = task.loss_sum((images,), labels) / task.loss_norm(labels)
+            loss = task.loss_sum((images,), labels) / task.head.loss_norm(labels)
         torch.autograd.backward(loss)
         optimizer.step()
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 
 
 def claim_folder(
@@ -34,7 +34,7 @@ def claim_folder(
     foreign = sorted(p.name for p in root.iterdir() if p.name[0] != ".") if root.is_dir() else []
     if path.exists():
         with suppress(ValueError, TypeError, KeyError):  # not a manifest
-            content = parse_json(path.read_bytes())
+            content = json.loads(path.read_bytes())
             found = {key: content[key] for key in about} | content["settings"]
         if found != wanted:
             other = [key for key in wanted if found.get(key) != wanted[key]]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from contextlib import contextmanager
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import NoRoomError
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -59,15 +59,15 @@ class Problems:
             file: Broken file, if the error does not name it first.
 
         Raises:
-            NoRoomError: The disk is full.
+            OSError: The disk is full.
         """
         try:
             yield
-        except NoRoomError:
-            raise
         except (DataError, SettingError) as error:
             self.add(error, item, file)
         except OSError as error:
+            if error.errno == errno.ENOSPC:
+                raise
             path = file if error.filename is None else Path(os.fsdecode(error.filename))
             found = error if error.errno is None else os.strerror(error.errno)
             expected = "a file or folder that can be read"

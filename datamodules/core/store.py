@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.files import atomic_path, parse_json
+from tangent_train.files import atomic_path
 
 _REMEDY = (
     "Run tangent-prepare with the same settings (data.store=… and all of data and representation): "
@@ -113,7 +113,7 @@ class Store:
 
         Raises:
             DataError: A file is broken.
-            NoRoomError: The disk is full.
+            OSError: The disk is full.
         """
         # Taken before the files are read, so that a change meanwhile is noticed later.
         made_from = _stamps(files)
@@ -149,7 +149,7 @@ class Store:
             size = record.offset + record.nbytes
             with path.open("rb") as file:
                 file.seek(size)
-                content = parse_json(file.read())
+                content = json.loads(file.read())
             checked = not whole or name in self._whole
             total = None if checked else _checksum(path, size)
             arrays = {key: np.asarray(record[key]) for key in record.dtype.names}

@@ -12,8 +12,8 @@ from lightning.pytorch.callbacks import Callback
 
 from tangent_train.errors import at_least
 from tangent_train.files import write_bytes
+from tangent_train.heads.pictures import evenly_spread
 from tangent_train.results.html import EncodedImage
-from tangent_train.results.pictures import evenly_spread
 
 
 class PredictionPanels(Callback):
@@ -43,7 +43,7 @@ class PredictionPanels(Callback):
         task: Any = pl_module
         source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
         chosen = evenly_spread(self.count, len(source))
-        predictions = zip(batch.index.tolist(), task.targets(batch), outputs, strict=True)
+        predictions = zip(batch.index.tolist(), task.true_labels(batch), outputs, strict=True)
         for index, target, prediction in predictions:
             if index in chosen:
                 self._write_panel(source, index, task, target, prediction)

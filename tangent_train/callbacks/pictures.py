@@ -9,7 +9,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
 from tangent_train.errors import at_least
-from tangent_train.results.pictures import evenly_spread
+from tangent_train.heads.pictures import evenly_spread
 
 _MOST_ROWS = 256
 """Larger images are reduced: a log contains the pictures of all validations."""
@@ -47,7 +47,7 @@ class ValidationPictures(Callback):
         task: Any = pl_module
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
         source, index = data.source("val"), int(batch.index[0])
-        labels = task.targets(batch)[0], outputs[0]
+        labels = task.true_labels(batch)[0], outputs[0]
         panel = task.picture(source.read(index), *labels, most_rows=_MOST_ROWS)
         if panel is None:
             return

@@ -13,6 +13,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.run import (
     Run,
     build_data,
+    build_head,
     build_task,
     check_fits,
     inputs_and_classes,
@@ -33,7 +34,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
-    loaded.check_predicts(get_class(settings.task["_target_"]).predicts, remedy)
+    loaded.check_predicts(get_class(settings.task["head"]["_target_"]).kind, remedy)
     settings = settings.model_copy(update=_of_network(settings, loaded))
     data, notes = build_data(settings), []
     if settings.label_map is not None:
@@ -43,7 +44,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
-    task = build_task(settings, data, loaded.network)
+    head = build_head(settings, data, loaded.depth_kind)
+    task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
     write_settings(folder, settings)
     run.test(run.trainer(), settings.checkpoint)

@@ -13,10 +13,11 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.cli.settings import check_new, check_unread
+from tangent_train.cli.settings import check_unread
 from tangent_train.config.settings import ImportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
+from tangent_train.files import check_new
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
@@ -59,7 +60,7 @@ def import_network(settings: ImportSettings) -> None:
     suffix = ".onnx" if settings.library == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
-    check_new(settings, output)
+    check_new(output, overwrite=settings.overwrite)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings)
         if network.depth_kind is None:

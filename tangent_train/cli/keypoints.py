@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -13,48 +13,38 @@ from typing import Any
 from rich.progress import track
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair, PanoramaPairs
-from tangent_train.config.build import build_from_config, check_fields
+from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import KeypointSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.files import read_json, write_bytes
+from tangent_train.files import write_bytes
 from tangent_train.io.pixel_files import read_image_size
 from tangent_train.keypoints.colmap import add_pair
-from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison, Row
+from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison
 from tangent_train.keypoints.report import KeypointReport, matches_png
 from tangent_train.keypoints.two_view import colmap
-
-_IMAGE_SETTINGS = ("left", "right", "input", "pairing")
+from tangent_train.manifest import Manifest
 
 
 def keypoints(settings: KeypointSettings) -> None:
     """Compare keypoints of panoramas and of tangent images on pairs, and write the scores.
 
-    Args:
-        settings: Settings of the command.
-
     Raises:
-        SettingError: A setting is missing or invalid.
+        SettingError: A setting is invalid, or the output was written with other settings.
         DataError: No pairs are found.
     """
-    of_comparer = {field.name: getattr(settings, field.name) for field in fields(Comparer)}
-    output, comparer = settings.output, Comparer(**of_comparer)
     colmap()  # refuses a missing pycolmap before minutes of work
+    of_comparer = {field.name: getattr(settings, field.name) for field in fields(Comparer)}
+    comparer, output = Comparer(**of_comparer), settings.output
     data, pairs = _pairs(settings)
-    names = {"export", *of_comparer}
-    content = settings.model_dump(mode="json", include=names) | {"data": data}
-    done = earlier_results(output, content)
+    content = {**of_comparer, "export": settings.export, "data": data}
+    manifest = Manifest.open(output, content)
     pairs.make_files()
-    pair_names = pairs.names[: settings.max_pairs]
-
-    def report() -> KeypointReport:
-        rows = [row for name in pairs.names for row in done.get(name, ())]
-        return KeypointReport(rows, comparer.representations, content, pairs.published)
-
-    missing = [(k, name) for k, name in enumerate(pair_names) if name not in done]
-    count = len(pair_names)
-    print_text(f"{count - len(missing)} of {count} pairs are done already")
-    for index, name in track(missing, "Comparing pairs", disable=not missing):
+    names, finished = pairs.names[: settings.max_pairs], manifest.finished
+    missing = manifest.missing(names)
+    print_text(f"{len(names) - len(missing)} of {len(names)} pairs are done already")
+    for name in track(missing, "Comparing pairs", disable=not missing):
+        index = names.index(name)
         try:
             pair = pairs.read(index)
             comparison = comparer.compare(pair)
@@ -63,65 +53,38 @@ def keypoints(settings: KeypointSettings) -> None:
         except (DataError, MemoryError) as error:  # a SettingError would concern all pairs
             print_text(f"Pair {name}: {error or 'not enough memory'}")
             continue
-        if index < settings.pictures:
-            for condition in comparison.images:
-                file = f"{index:03}_{file_name(name)}_{condition}.png"
-                write_bytes(output / "matches" / file, matches_png(comparison, condition))
-        done[name] = comparison.rows
-        report().write(output)
-    for table in report().means():
-        table.print()
-    print_text(f"Results are in {output}." if done else "There are no results.")
+        for condition in comparison.images if index < settings.pictures else ():
+            file = output / "matches" / f"{index:03}_{file_name(name)}_{condition}.png"
+            write_bytes(file, matches_png(comparison, condition))
+        manifest.finish(name, rows=comparison.rows)
+    rows = [row for name in pairs.names for row in finished.get(name, {}).get("rows", ())]
+    if rows:
+        report = KeypointReport(rows, comparer.representations, content, pairs.published)
+        report.write(output)
+        for table in report.means():
+            table.print()
+    print_text(f"Results are in {output}." if rows else "There are no results.")
     if settings.export:
         print_text(f"For COLMAP: {output / 'export'}, image_path {_root(pairs.files)}")
-    if failed := len(set(pair_names) - set(done)):
-        sys.exit(f"tangent-keypoints: {failed} of {count} pairs could not be used, see above")
+    if failed := manifest.missing(names):
+        sys.exit(f"tangent-keypoints: {len(failed)} of {len(names)} pairs failed, see above")
 
 
 def _pairs(settings: KeypointSettings) -> tuple[Any, PanoramaPairs]:
     """Return the settings of the pairs, and the pairs, from images or from a data set."""
-    images = {name: getattr(settings, name) for name in _IMAGE_SETTINGS}
-    if any(images[name] is not None for name in ("left", "right", "input")):
-        return settings.model_dump(mode="json", include=set(_IMAGE_SETTINGS)), ImagePairs(**images)
-    pairs = build_from_config(settings.data, "data")
+    given = (settings.left, settings.right, settings.input)
+    if any(path is not None for path in given):
+        left, right, images = (None if path is None else str(path) for path in given)
+        section = {"left": left, "right": right, "input": images, "pairing": settings.pairing}
+        return section, ImagePairs(**section)  # type: ignore[arg-type]
+    pairs = build_from_config(settings.data or {}, "data")
     if not isinstance(pairs, PanoramaPairs):
-        expected = "a data set of pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs"
-        raise SettingError("data", found=type(pairs).__name__, expected=expected)
+        raise SettingError(
+            "data",
+            found=type(pairs).__name__,
+            expected="a data set of pairs: synthrooms_pairs, stanford2d3ds_pairs or zind_pairs",
+        )
     return settings.data, pairs
-
-
-def earlier_results(output: Path, settings: Mapping[str, Any]) -> dict[str, list[Row]]:
-    """Return the scores of the finished pairs in a folder, by name.
-
-    Args:
-        output: Output folder.
-        settings: Settings that the scores depend on.
-
-    Raises:
-        DataError: ``results.json`` was not written by this command.
-        SettingError: The scores are of other settings, or the folder has only other files.
-    """
-    path, expected = output / "results.json", "results of tangent-keypoints"
-    if not path.exists():
-        if output.exists() and any(output.iterdir()):
-            found = f"{output} with other files"
-            raise SettingError("output", found=found, expected="a new or empty folder")
-        return {}
-    kinds = {"settings": dict, "rows": list[dict]}  # type: ignore[type-arg]
-    content = check_fields(path, read_json(path, expected), kinds, expected)
-    done: dict[str, list[Row]] = {}
-    for row in content["rows"]:
-        done.setdefault(str(row.get("pair")), []).append(row)
-    before = content["settings"]
-    for name, value in settings.items():
-        if before.get(name) != value:
-            raise SettingError(
-                name,
-                found=value,
-                expected=f"{before.get(name)}, with which the results in {output} were made",
-                remedy="Choose another output, or remove that folder.",
-            )
-    return done
 
 
 def _export(
@@ -141,8 +104,8 @@ def _export(
         images.append((file.absolute().relative_to(_root(files)).as_posix(), shape))
     for name, matched in comparison.matched[AS_GIVEN].items():
         path = folder / file_name(name) / "database.db"
-        keypoints = (matched.left, matched.right)
-        add_pair(path, images, keypoints, matched.matches, matched.geometry)
+        sides = (matched.left, matched.right)
+        add_pair(path, images, sides, matched.matches, matched.geometry)
 
 
 def _root(files: Sequence[Path]) -> Path:

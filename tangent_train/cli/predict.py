@@ -17,22 +17,23 @@ import numpy as np
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.input_files import Inputs, is_video
 from tangent_train.cli.jobs import Job, Shard, run_jobs
-from tangent_train.cli.predict_kinds import PREDICTIONS, Prediction
+from tangent_train.cli.predict_kinds import Prediction
 from tangent_train.cli.predict_shards import PredictionShard
 from tangent_train.cli.settings import check_unread
 from tangent_train.config.settings import PredictSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, counted
+from tangent_train.heads import PredictedImage
+from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.io.masks import Masks
 from tangent_train.io.tangent_folders import panorama_area
 from tangent_train.results.html import EncodedImage
-from tangent_train.results.pictures import evenly_spread
 from tangent_train.results.predictions import (
     Entry,
-    PredictedImage,
     PredictionFolder,
+    encode_prediction,
     is_result_in,
 )
 
@@ -65,11 +66,11 @@ def predict(settings: PredictSettings) -> None:
     inputs, shard = _inputs(settings), Shard.parse(settings.shard)
     trained = load_network(settings.checkpoint, settings.trust)
     views = _views(settings, trained)
-    prediction = PREDICTIONS[trained.predicts](settings, trained, views)
+    prediction = Prediction(settings, trained, views)
     if isinstance(views, PanoramaViews):
-        print_text(f"{prediction.announcement} in {views.description(settings.area)}.")
-    results = prediction.results
-    folder = PredictionFolder(settings.output, results, results.kinds(settings.write))
+        print_text(f"A panorama is predicted in {views.description(settings.area)}.")
+    head = prediction.head
+    folder = PredictionFolder(settings.output, head, head.file_kinds(settings.write))
     _check_videos(inputs, folder)
     names = inputs.names()
     shown: dict[str, Any] = {names[n]: None for n in evenly_spread(settings.report, len(names))}
@@ -92,7 +93,7 @@ def predict(settings: PredictSettings) -> None:
     if predicted := folder.predicted(entries):
         if pictures := images.pictures(inputs, {entry["name"] for entry in predicted}):
             folder.write_page(entries, pictures)
-        results.table(predicted).print()
+        folder.table(predicted).print()
         print_text(f"Results are in {settings.output}.")
     if failed := sum("error" in entry for entry in done):
         sys.exit(f"tangent-predict: {failed} of {len(done)} images could not be used, see above")
@@ -195,19 +196,19 @@ class _Images:
         is_counted = np.array(True)
         if image.area is not None:
             is_counted = image.cut(self.masks.read(job.item, image.area)) > 0
-            unknown = pixels.dtype.type(self.folder.results.unknown)
+            unknown = pixels.dtype.type(self.folder.head.unknown)
             predicted = predicted._replace(pixels=np.where(is_counted, pixels, unknown))
         folder = self.folder.of_frames if is_video(job.path) else self.folder
-        folder.results.write(folder.files(job.item), predicted)
+        folder.head.write(folder.files(job.item), predicted)
         rows, columns = pixels.shape
         entry: Entry = {"rows": rows, "columns": columns}
         if is_video(job.path):
             entry["frame"] = int(job.item.rpartition("/")[2])
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
-        entry[folder.results.summary] = folder.results.summarize(predicted, is_counted)
+        entry[folder.head.summary] = folder.head.summarize(predicted, is_counted)
         if job.item in self.shown:
-            self.shown[job.item] = folder.results.encode(job.item, predicted)
+            self.shown[job.item] = encode_prediction(folder.head, job.item, predicted)
         return entry
 
     def pictures(self, inputs: Inputs, used: Set[str]) -> list[EncodedImage]:
@@ -220,12 +221,12 @@ class _Images:
         count, names = self.settings.report, [name for name in inputs.names() if name in used]
         wanted = [names[number] for number in evenly_spread(count, len(names))]
         earlier = {name for name in wanted if self.shown.get(name) is None}
-        results = self.folder.results
+        head = self.folder.head
         for job in inputs.missing(set(inputs.names()) - earlier):
-            file = self.folder.files(job.item).get(results.source)
+            file = self.folder.files(job.item).get(head.source)
             if file is not None and not job.error:
-                predicted = PredictedImage(self.read(job), results.read(file))
-                self.shown[job.item] = results.encode(job.item, predicted)
+                predicted = PredictedImage(self.read(job), head.read(file))
+                self.shown[job.item] = encode_prediction(head, job.item, predicted)
         encoded = {name: picture for name, picture in self.shown.items() if picture is not None}
         available = [name for name in dict.fromkeys((*wanted, *self.shown)) if name in encoded]
         return [encoded[name] for name in names if name in available[:count]]
@@ -257,7 +258,7 @@ def _inputs(settings: PredictSettings) -> Inputs:
 
 
 def _check_videos(inputs: Inputs, folder: PredictionFolder) -> None:
-    source, pictures = folder.results.source, {*folder.kinds}.difference(folder.of_frames.kinds)
+    source, pictures = folder.head.source, {*folder.kinds}.difference(folder.of_frames.kinds)
     if inputs.videos and pictures and source not in folder.kinds:
         raise SettingError(
             "write",

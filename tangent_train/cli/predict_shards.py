@@ -11,7 +11,7 @@ from typing import Any
 
 from tangent_train.cli.jobs import Shard
 from tangent_train.errors import SettingError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 from tangent_train.results.predictions import Entry
 
 
@@ -112,7 +112,7 @@ class PredictionShard:
 def _read(path: Path) -> dict[str, Any]:
     """Return the content of a shard's file; empty if it is missing or broken."""
     try:
-        content = parse_json(path.read_bytes())
+        content = json.loads(path.read_bytes())
     except (OSError, ValueError):
         return {}
     return content if isinstance(content, dict) else {}

@@ -64,9 +64,11 @@ def with_pretrained_network(
             )
         changes["network"] = section = without_weights(description.trainable_settings())
         _print(f"Network of {path}: {section['_target_']} (another: network=…)")
-    if description.depth_kind is not None and settings.task.get("depth_kind", "") is None:
-        changes["task"] = settings.task | {"depth_kind": description.depth_kind}
-        _print(f"Output of the network: {description.depth_kind} (another: task.depth_kind=…)")
+    head = settings.task["head"]
+    if description.depth_kind is not None and head.get("depth_kind", "") is None:
+        changes["task"] = settings.task | {"head": head | {"depth_kind": description.depth_kind}}
+        kind = description.depth_kind
+        _print(f"Output of the network: {kind} (another: task.head.depth_kind=…)")
     normalization = _normalization(description, settings.data)
     if normalization is not None:
         changes["data"] = settings.data | {"normalization": normalization}
@@ -126,7 +128,7 @@ def _normalization(
 def _heads(run: Run) -> set[str]:
     """Return the names of the tensors whose shape depends on the number of classes."""
     section, data = run.settings.network, run.data
-    outputs = run.task.num_outputs(data.num_classes)
+    outputs = run.task.head.num_outputs
     more = completed_settings(section, data.in_channels, outputs + 1, restored=True)
     larger = build_from_config(more, "network").state_dict()
     tensors = run.task.network.state_dict()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sysconfig
@@ -12,7 +13,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
@@ -46,7 +46,7 @@ def run_job(command: str) -> float | None:
         found = f"a run that ended with status {status}"
         raise DataError(folder, found=found, expected="a finished run")
     file = folder / OBJECTIVE_FILE
-    return float(parse_json(file.read_bytes())["best"]) if file.is_file() else None
+    return float(json.loads(file.read_bytes())["best"]) if file.is_file() else None
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:

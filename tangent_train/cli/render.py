@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.reader import class_masks
-from tangent_train.cli.settings import check_new
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
+from tangent_train.files import check_new
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
 from tangent_train.inference.representations import view_settings
 from tangent_train.io.camera_files import (
@@ -47,9 +47,6 @@ from tangent_train.rendering.figure import tangent_figure
 def render(settings: RenderSettings) -> None:
     """Render panoramas to tangent images, or results for tangent images to panoramas.
 
-    Args:
-        settings: Settings of the command.
-
     Raises:
         DataError: No files to render are found.
         SettingError: A setting is invalid, or the output was written with other settings.
@@ -64,8 +61,7 @@ def render(settings: RenderSettings) -> None:
         )
     if settings.output is None and settings.figure is None:
         raise SettingError("output", found="null", expected="a folder, or with back= a file")
-    content = settings.model_dump(mode="json", exclude=set(_NOT_CONTENT))
-    _MODES[modes[0]](settings, content)
+    _MODES[modes[0]](settings, settings.model_dump(mode="json", exclude=_NOT_CONTENT))
 
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
@@ -147,7 +143,7 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     names = inputs.names
     if len(names) > 1:
         raise SettingError("figure", found=f"{len(names)} panoramas", expected="one panorama")
-    check_new(settings, path)
+    check_new(path, overwrite=settings.overwrite)
     (job,) = inputs.jobs(names)
     image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
     grid, _, _ = _views(settings, image.shape[0])
@@ -192,7 +188,7 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
 def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     """Write the poses of the panoramas from a model of COLMAP."""
     model, output = settings.poses or Path(), settings.output or Path()
-    check_new(settings, output)
+    check_new(output, overwrite=settings.overwrite)
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = panorama_poses(model, rig)
     write_poses(output, poses)
@@ -216,7 +212,7 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
 
     single = root if root.is_file() else root / CAMERAS_FILE
     if single.is_file():
-        check_new(settings, output)
+        check_new(output, overwrite=settings.overwrite)
         write(back, single, output)
         print_text(f"Written: {output}")
         return
@@ -243,5 +239,5 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
 
 _MODES = {"input": _render_views, "back": _render_back, "poses": _write_poses}
 
-_NOT_CONTENT = ("figure", "output", "overwrite")
+_NOT_CONTENT = {"figure", "output", "overwrite"}
 """Settings that do not change the files in an output folder."""

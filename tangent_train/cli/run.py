@@ -116,13 +116,13 @@ class Run:
             trainer: Trainer of the run.
             checkpoint: File of the network's weights, for the report.
         """
-        by_classes = self.task.predicts == PIXEL_CLASSES  # else upright=auto is by the image alone
+        by_classes = self.task.head.kind == PIXEL_CLASSES  # else upright=auto is by the image alone
         if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(NetworkJudge(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        result = self.task.evaluation_result(self.task.result, noun) if tested else None
+        result = self.task.evaluation_result(noun) if tested else None
         if result and result.images == total:
             result = replace(result, groups=self._groups(trainer.world_size))
             self._report(result, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
@@ -140,7 +140,7 @@ class Run:
                 places[group].append(place)
         return [
             {"group": group, "images": len(some)}
-            | plain_scores(self.task.scores_of(self.task.result, some))
+            | plain_scores(self.task.head.scores_of(self.task.result, some))
             for group, some in sorted(places.items())
         ]
 
@@ -149,11 +149,11 @@ class Run:
         if self.loaded is not None:
             return self.loaded
         data, module, settings = self.data, self.task.network, self.settings
-        channels, outputs = data.in_channels, self.task.num_outputs(data.num_classes)
+        channels, outputs = data.in_channels, self.task.head.num_outputs
         multiple, fixed = declared_sizes(module)
         return LoadedNetwork(
             module=module,
-            predicts=self.task.predicts,
+            predicts=self.task.head.kind,
             class_names=data.class_names,
             inputs=getattr(data, "inputs", ()),
             normalization=data.normalization,
@@ -162,7 +162,7 @@ class Run:
             image_size=data.representation.image_size,
             size_multiple=multiple,
             fixed_size=fixed,
-            depth_kind=self.task.depth_kind,
+            depth_kind=getattr(self.task.head, "depth_kind", None),
             fill=getattr(data, "fill", None) or "mean",
             settings=completed_settings(settings.network, channels, outputs, restored=True),
         )
@@ -176,7 +176,7 @@ class Run:
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         result = replace(
             result,
-            protocol={**self.data.facts, **self.task.facts},
+            protocol={**self.data.facts, **self.task.head.facts},
             checkpoint=name,
             label_map=self.plain_settings().get("label_map"),
             folds=getattr(self.data, "folds", ()),
@@ -191,7 +191,7 @@ class Run:
             f"Evaluation of {checkpoint.name}",
             tables=[*tables, *([confusion_table(result)] if result.confusion else [])],
             images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
-            class_names=self.task.class_names,
+            class_names=self.task.head.class_names,
             notes=[*summary, *notes],
         )
         for line in (*self.notes, *summary):
@@ -218,22 +218,22 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
         SettingError: A setting, or a combination of settings, is invalid.
     """
     data = build_data(settings)
-    outputs = _task_class(settings).num_outputs(data.num_classes)
+    head = build_head(settings, data)
     # Pretrained weights are not fetched if a checkpoint replaces them.
     restored = getattr(settings, "resume", None) is not None
-    section = completed_settings(settings.network, data.in_channels, outputs, restored=restored)
+    section = completed_settings(settings.network, data.in_channels, head.num_outputs, restored=restored)
     if file is None:
         network = build_from_config(section, "network")
     else:
         network = build_from_file(section, "network", file, trust)
-    return data, build_task(settings, data, network)
+    return data, build_task(settings, data, network, head)
 
 
 def open_data(settings: RunSettings) -> Any:
     """Build the data module of a run; images have distances as labels if the task needs them."""
     representation = build_from_config(settings.representation, "representation")
     is_images = issubclass(get_class(settings.data["_target_"]), ImageDataModule)
-    has_distances = is_images and _task_class(settings).labels == DISTANCE
+    has_distances = is_images and _head_class(settings).labels == DISTANCE
     given = {"labels": DISTANCE} if has_distances else {}
     return build_from_config(settings.data, "data", representation=representation, **given)
 
@@ -245,17 +245,24 @@ def build_data(settings: RunSettings) -> Any:
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=type(data).__name__, expected=expected)
     data.check_classes()
-    task = _task_class(settings)
-    if task.labels != data.labels:
+    needed = _head_class(settings).labels
+    if needed != data.labels:
         raise SettingError(
             "task",
-            found=f"{task.__name__}, which needs {task.labels}",
+            found=f"a task for {needed}",
             expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
         )
     return data
 
 
-def build_task(settings: RunSettings, data: Any, network: nn.Module) -> Any:
+def build_head(settings: RunSettings, data: Any, depth_kind: str | None = None) -> Any:
+    """Build the head of a run; `depth_kind` is that of a network from a file."""
+    given = {} if depth_kind is None else {"depth_kind": depth_kind}
+    section = settings.task["head"]
+    return build_from_config(section, "task.head", class_names=data.class_names, **given)
+
+
+def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) -> Any:
     """Build the task of a run."""
     scheduler = None
     if settings.scheduler is not None:
@@ -263,18 +270,18 @@ def build_task(settings: RunSettings, data: Any, network: nn.Module) -> Any:
         timing = {n: section.pop(n) for n in ("interval", "frequency", "monitor") if n in section}
         scheduler = Schedule(build_from_config(section, "scheduler"), **timing)
     return build_from_config(
-        settings.task,
+        {name: value for name, value in settings.task.items() if name != "head"},
         "task",
         network=network,
         representation=data.representation,
-        class_names=data.class_names,
+        head=head,
         optimizer=build_from_config(settings.optimizer, "optimizer"),
         scheduler=scheduler,
     )
 
 
-def _task_class(settings: RunSettings) -> Any:
-    return get_class(settings.task["_target_"])
+def _head_class(settings: RunSettings) -> Any:
+    return get_class(settings.task["head"]["_target_"])
 
 
 def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
@@ -327,7 +334,7 @@ def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
     built = []
     for name, section in (settings.callbacks or {}).items():
         monitor = section.get("monitor") or task.monitor
-        known = {"monitor": monitor, "mode": task.mode_of(monitor)}
+        known = {"monitor": monitor, "mode": task.head.mode_of(monitor)}
         built.append(build_from_config(_filled(section, known), f"callbacks.{name}"))
     return built
 

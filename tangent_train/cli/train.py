@@ -51,7 +51,7 @@ def train(settings: TrainSettings) -> float | None:
     rank_zero_only(write_settings)(folder, settings)
     checkpoints = folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
-    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.mode_of(run.task.monitor))
+    best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
     trainer = run.trainer([last, best])
     if settings.ema is not None:  # the first callback: the saved average has the last step
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings.ema)

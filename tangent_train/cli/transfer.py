@@ -214,7 +214,7 @@ def _views(config: Any, loaded: LoadedNetwork | None) -> Iterator[tuple[str, dic
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
-    sets the level of the stage; names such as ``task.align`` change the task. Distortion-aware
+    sets the level of the stage; names such as ``task.head.align`` change the task. Distortion-aware
     views of a network that does not allow them are left out.
     """
     if config.study_levels:

@@ -28,7 +28,13 @@ from typing import Any, Literal, NoReturn, Union, get_args, get_origin, get_type
 from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.imports import offline
 
-_HOMES = ("datamodules", "models", "tangent_train.rendering", "tangent_train.tasks")
+_HOMES = (
+    "datamodules",
+    "models",
+    "tangent_train.rendering",
+    "tangent_train.tasks",
+    "tangent_train.heads",
+)
 """Packages whose registered public names may be in files."""
 
 _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]{0,99})?", re.ASCII)

@@ -26,7 +26,7 @@ _VIEWS = "tangent_train.rendering.representations"
 
 _FUNCTIONS = (
     *("models.stem.widen_stem", "timm.models._factory.create_model"),
-    *("models.tables.face_neighbors", "models.tables.gnomonic_taps"),
+    *("models.tables.face_neighbors", "models.tables.gnomonic_points"),
     *("models.tables.hexagonal_rings", "models.tables.mapped_samples"),
     "models.tables.mesh_operators",
 )

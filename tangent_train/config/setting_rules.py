@@ -28,11 +28,11 @@ _RULES = (
     # Reports compute means over these.
     ("report", "data.fold data.seed seed"),
     # Settings of the evaluation, which follows the resumed training.
-    ("resume", "data.test_rotation task.absent_class"),
-    ("resume", "task.align task.alignment task.alignment_in task.clip"),
+    ("resume", "data.test_rotation task.head.absent_class"),
+    ("resume", "task.head.align task.head.alignment task.head.alignment_in task.head.clip"),
     ("resume", "representation.blend representation.levels representation.rotations"),
     # Settings of the training: an evaluation does not depend on these.
-    ("evaluation", "callbacks optimizer scheduler task.backbone_lr_factor task.loss"),
+    ("evaluation", "callbacks optimizer scheduler task.backbone_lr_factor task.head.loss"),
     ("resume evaluation", "task.view_batch_size trainer.devices trainer.num_nodes"),
     ("resume evaluation", "trainer.max_epochs trainer.max_steps"),
     # A resumed run may be longer, or run on other devices, but takes the same steps.

@@ -148,7 +148,7 @@ class RenderSettings(ImageSettings):
     output: Path | None = None
     """folder for the tangent images; with back=, the file of the panorama"""
     overwrite: bool = False
-    """true: replace earlier results"""
+    """true: replace an existing file (of figure=, poses=, or back= of one panorama)"""
     views: Views = None
     """views: tangent | horizontal | horizontal_economy | cubemap, or 'views={option: horizontal,
     fov: 110}'; null = tangent"""

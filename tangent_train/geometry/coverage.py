@@ -1,4 +1,4 @@
-"""Find directions that no image shows."""
+"""The images that show the sphere, or the valid pixels of a panorama."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry.cells import cell_borders
-from tangent_train.geometry.equirect import equirect_directions
+from tangent_train.geometry.equirect import equirect_directions, equirect_solid_angles
 from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import xyz_to_lonlat
-from tangent_train.geometry.valid_views import valid_cells
+from tangent_train.geometry.sphere import lonlat_to_xyz, xyz_to_lonlat
 
-_ROWS = 360
-"""Rows of the panorama whose pixels are tested where no closed form is known."""
+_ROWS = 180
+_COARSE_ROWS = 60
+_STEP_DEG = 0.5
+"""Distance of the directions in which images are tested to cover the whole sphere."""
 
 _TOGETHER = 2**15
-"""Number of directions that are tested at once."""
+_ROUNDING = 1e-6
 
 _Mask = tuple[tuple[int, int], bytes] | None
-"""Shape and content of a mask of valid pixels, as a key; None for the sphere."""
+"""Shape and content of a mask of valid cells, as a key of caches; None for the sphere."""
 
 
 def check_coverage(
@@ -43,7 +43,7 @@ def check_coverage(
     Raises:
         SettingError: A direction is more than half a pixel outside the outermost pixel centers.
     """
-    missed = _uncovered((*grids,), _mask(valid), by_owners)
+    missed = _missed((*grids,), _mask(valid), by_owners, -_ROUNDING)
     if missed is None:
         return
     longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
@@ -58,55 +58,125 @@ def check_coverage(
 
 
 def overlaps(grid: PinholeGrid, valid: NDArray[np.bool_] | None = None) -> bool:
-    """Return True if the interior of some image contains each direction, except single points.
+    """Return True if the interior of some image contains each direction.
 
     Args:
         grid: Images that cover the valid pixels.
         valid: ``(H, W)`` pixels to test; None for the sphere.
     """
-    borders = cell_borders(grid.centers_xyz)
-    if valid is None and borders is not None and _uncovered((grid,), None, by_owners=True) is None:
-        cells, _, middles = borders
-        return bool(grid.shown(middles, on_edge=False)[np.arange(len(cells)), cells].all())
-    return _tested([grid], _mask(valid), by_owners=False, on_edge=False) is None
-
-
-def _mask(valid: NDArray[np.bool_] | None) -> _Mask:
-    if valid is None:
-        return None
-    cells = valid_cells(valid, _ROWS)
-    return (cells.shape[0], cells.shape[1]), cells.tobytes()
+    return _missed((grid,), _mask(valid), False, _ROUNDING) is None
 
 
 @lru_cache(maxsize=64)
-def _uncovered(
-    grids: tuple[PinholeGrid, ...], mask: _Mask, by_owners: bool
+def _missed(
+    grids: tuple[PinholeGrid, ...], mask: _Mask, by_owners: bool, least: float
 ) -> NDArray[np.float64] | None:
-    """Return a direction that is not covered; None if all are."""
-    grid = grids[0]
-    borders = cell_borders(grid.centers_xyz) if len(grids) == 1 and mask is None else None
-    if borders is not None:
-        cells, corners, _ = borders
-        missed = ~grid.shown(corners)[np.arange(len(cells)), cells]
-        if not missed.any():
-            return None
-        if by_owners:
-            return np.asarray(corners[missed.argmax()])
-    return _tested(grids, mask, by_owners, on_edge=True)
-
-
-def _tested(
-    grids: Sequence[PinholeGrid], mask: _Mask, by_owners: bool, on_edge: bool
-) -> NDArray[np.float64] | None:
-    """Return a missed direction of a dense set; None if the images show all."""
-    shape, content = mask or ((_ROWS, 2 * _ROWS), b"\1" * (2 * _ROWS**2))
-    directions = equirect_directions(shape)[np.frombuffer(content, np.bool_).reshape(shape)]
+    """Return a direction that is not inside any image by at least a sine; None if all are."""
+    if mask is None:
+        angles = np.meshgrid(np.arange(-180, 180, _STEP_DEG), np.arange(-90, 91, _STEP_DEG))
+        directions = lonlat_to_xyz(np.radians(np.stack(angles, axis=-1))).reshape(-1, 3)
+    else:
+        directions = equirect_directions(mask[0])[np.frombuffer(mask[1], np.bool_).reshape(mask[0])]
     for tested in np.split(directions, range(_TOGETHER, len(directions), _TOGETHER)):
-        shown = np.concatenate([grid.shown(tested, on_edge=on_edge) for grid in grids], axis=1)
+        insets = np.concatenate([grid.insets(tested) for grid in grids])
         if by_owners:
-            shown = np.take_along_axis(shown, grids[0].owners(tested)[:, None], axis=1)
-        missed = ~shown.any(axis=1)
-        if missed.any():
+            inset = np.take_along_axis(insets, grids[0].owners(tested)[None], axis=0)[0]
+        else:
+            inset = insets.max(axis=0)
+        missed = np.flatnonzero(inset < least)
+        if len(missed):
             # The middle of the missed ones lies well inside the gap.
-            return np.asarray(tested[np.flatnonzero(missed)[missed.sum() // 2]])
+            return np.asarray(tested[missed[len(missed) // 2]])
     return None
+
+
+def _mask(valid: NDArray[np.bool_] | None, rows: int = 2 * _ROWS) -> _Mask:
+    """Return a mask of at most some rows, whose cells contain a valid pixel."""
+    if valid is None:
+        return None
+    if valid.shape[0] > rows:
+        for axis, count in enumerate((rows, 2 * rows)):
+            starts = np.arange(count) * valid.shape[axis] // count
+            valid = np.logical_or.reduceat(valid, starts, axis=axis)
+    return (valid.shape[0], valid.shape[1]), valid.tobytes()
+
+
+def needed_views(
+    grids: Sequence[PinholeGrid], valid: NDArray[np.bool_], *, by_owners: bool = False
+) -> list[NDArray[np.int64]]:
+    """Return the images that are needed to see all valid pixels.
+
+    These are all images with a valid pixel in their center, and further images until all valid
+    pixels are seen. Images that see few valid pixels are left out first.
+
+    Args:
+        grids: Images that together see all valid pixels.
+        valid: ``(H, W)`` valid pixels of a panorama.
+        by_owners: True if every direction must lie in the image with the nearest center; False if
+            it may lie in any image.
+
+    Returns:
+        Indices of images of each grid.
+    """
+    return _needed((*grids,), _mask(valid, _ROWS), by_owners, valid.shape[0] <= _ROWS)
+
+
+def best_views(grid: PinholeGrid, valid: NDArray[np.bool_], count: int) -> NDArray[np.int64]:
+    """Return the indices of the images that see most of the valid pixels.
+
+    Args:
+        grid: The images.
+        valid: ``(H, W)`` valid pixels of a panorama.
+        count: Number of images.
+    """
+    _, directions, angles = _cells(_mask(valid, _COARSE_ROWS))
+    seen = (grid.insets(directions) >= 0) @ angles
+    return np.sort(np.argsort(-seen, kind="stable")[:count])
+
+
+def is_valid(valid: NDArray[np.bool_], directions_xyz: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return ``(n,)`` True for directions ``(n, 3)`` in a valid pixel of a panorama ``(H, W)``."""
+    (height, width), (longitude, latitude) = valid.shape, xyz_to_lonlat(directions_xyz).T
+    row = ((0.5 - latitude / math.pi) * height).astype(int).clip(0, height - 1)
+    return np.asarray(valid[row, ((longitude / math.tau + 0.5) * width).astype(int) % width])
+
+
+def _cells(
+    mask: _Mask,
+) -> tuple[NDArray[np.bool_], NDArray[np.float64], NDArray[np.float64]]:
+    """Return a mask, and the directions ``(n, 3)`` and solid angles ``(n,)`` of its cells."""
+    shape, content = mask or ((1, 1), b"\1")
+    cells = np.frombuffer(content, np.bool_).reshape(shape)
+    angles = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)
+    return cells, equirect_directions(shape)[cells], angles[cells]
+
+
+@lru_cache(maxsize=64)
+def _needed(
+    grids: tuple[PinholeGrid, ...], mask: _Mask, by_owners: bool, is_exact: bool
+) -> list[NDArray[np.int64]]:
+    """See `needed_views`; cached, because all panoramas of a data set have the same mask."""
+    cells, directions, angles = _cells(mask)
+    insets = np.concatenate([grid.insets(directions) for grid in grids])
+    centers = np.concatenate([grid.centers_xyz for grid in grids])
+    # Pixels between the centers of coarse cells are seen too: images are convex, and the margin is
+    # more than half of the diagonal of a cell.
+    margin = -_ROUNDING if by_owners or is_exact else math.sin(0.75 * math.pi / len(cells))
+    inner, seen = insets >= margin, insets >= -_ROUNDING
+    nearness = (centers @ directions.T).astype(np.float32)
+    owner = nearness.argmax(axis=0)
+    kept, central = np.ones(len(centers), np.bool_), is_valid(cells, centers)
+    for image in np.argsort(seen @ angles, kind="stable"):
+        if central[image]:
+            continue
+        kept[image] = False
+        affected = np.flatnonzero(owner == image if by_owners else seen[image])
+        covered = inner[np.ix_(kept, affected)].any(axis=0)
+        if by_owners:
+            others = np.where(kept[:, None], nearness[:, affected], -2.0).argmax(axis=0)
+            covered = kept[others] & inner[others, affected]
+        kept[image] = not covered.all()
+        if by_owners and not kept[image]:
+            owner[affected] = others
+    ends = np.cumsum([grid.num_images for grid in grids])
+    return [np.flatnonzero(part) for part in np.split(kept, ends[:-1])]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from tangent_train.errors import at_least
-from tangent_train.geometry.pinhole_grid import SquareGrid
+from tangent_train.geometry.pinhole_grid import PinholeGrid
 
 _X, _Y, _Z = np.eye(3)
 
@@ -23,8 +21,7 @@ _FACES = [  # right, down, forward
 _AXES = np.array(_FACES).swapaxes(1, 2)
 
 
-@dataclass(frozen=True, eq=False, init=False)
-class CubeGrid(SquareGrid):
+class CubeGrid(PinholeGrid):
     """The six faces of a cube around the center, pinhole images of 90°, or more with a margin.
 
     The faces are in this order: front (+x, the middle of the panorama), right (+y), back (−x),
@@ -53,18 +50,9 @@ class CubeGrid(SquareGrid):
     (6, 0.0625, 0.96875)
     """
 
-    size: tuple[int, int]
-    rotation: NDArray[np.float64] | None
-
     def __init__(self, dim: int, rotation: ArrayLike | None = None, margin: int = 0) -> None:
         margin = at_least("margin", margin, 0)
         dim = at_least("dim", dim, 2 + 2 * margin)
-        self._set(rotation, size=(dim, dim), pitch=2 / (dim - 2 * margin))
-
-    @property
-    def is_overlapping(self) -> bool:
-        """True if there is a margin. Without one, neighbors meet at their outer edges."""
-        return self.dim * self.pitch > 2
-
-    def _resting_axes(self) -> NDArray[np.float64]:
-        return _AXES
+        pitch = 2 / (dim - 2 * margin)
+        # Without a margin, neighbors meet at their outer edges.
+        super().__init__(_AXES, (dim, dim), pitch, rotation, is_overlapping=margin > 0)

@@ -4,34 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 
 _WIDEST_DEG = 170.0
 _MOST_VIEWS = 360  # of a ring
-_SAME = 1 - 1e-12
 
 
-class Ring(NamedTuple):
-    """Views that are evenly spaced around the vertical.
-
-    Attributes:
-        pitch_deg: Latitude of their centers in degrees.
-        views: Number of views; the first center has longitude 0.
-    """
-
-    pitch_deg: float
-    views: int
-
-
-@dataclass(frozen=True, eq=False, init=False)
 class RingGrid(PinholeGrid):
     """Horizontal views in rings: cameras that are yawed and pitched, but not rolled.
 
@@ -59,10 +43,6 @@ class RingGrid(PinholeGrid):
     (6, True)
     """
 
-    rings: tuple[Ring, ...]
-    size: tuple[int, int]
-    rotation: NDArray[np.float64] | None
-
     def __init__(
         self,
         rings: Sequence[Mapping[str, float]],
@@ -74,49 +54,27 @@ class RingGrid(PinholeGrid):
         by_owners: bool = True,
         is_complete: bool = True,
     ) -> None:
-        checked = checked_rings(rings)
-        rows, columns = (at_least("dim", side, 2) for side in size)
+        if min(size) < 2:
+            raise SettingError("dim", found=size, expected="2 or more rows and columns")
         across, down = half_extents(fov_deg)
-        pitch = max(2 * across / columns, 2 * down / rows)
-        axes = np.concatenate([_axes(ring) for ring in checked])
+        pitch = max(2 * across / size[1], 2 * down / size[0])
+        axes = np.concatenate([_axes(ring) for ring in rings])
         nearness = axes[..., 2] @ axes[..., 2].T - np.eye(len(axes))
-        if nearness.max() > _SAME:
+        if nearness.max() > 1 - 1e-12:
             raise SettingError(
                 "rings",
                 found="two views of the same direction",
                 expected="views of different directions",
                 remedy="Give each pitch once, with one view at 90 and -90.",
             )
-        resting = PinholeGrid(axes, (rows, columns), pitch)
+        super().__init__(axes, (size[0], size[1]), pitch, rotation)
+        resting = self.with_rotation(None)
         if is_complete:
             check_coverage([resting], valid, by_owners=by_owners)
-        overlapping = not is_complete or overlaps(resting, valid)
-        super().__init__(axes, resting.size, pitch, rotation, is_overlapping=overlapping)
-        vars(self).update(rings=checked)
+            self.is_overlapping = overlaps(resting, valid)
 
 
-def checked_rings(rings: Sequence[Mapping[str, float]]) -> tuple[Ring, ...]:
-    """Return rings from settings.
-
-    Raises:
-        SettingError: There are no rings, or one is invalid.
-    """
-    checked = []
-    for ring in rings:
-        pitch: Any = ring.get("pitch")
-        views: Any = ring.get("views")
-        is_pitch = isinstance(pitch, int | float) and abs(pitch) <= 90
-        is_count = isinstance(views, int) and 1 <= views <= _MOST_VIEWS
-        if set(ring) != {"pitch", "views"} or not (is_pitch and is_count):
-            expected = f"{{pitch: -90 to 90, views: 1 to {_MOST_VIEWS}}}"
-            raise SettingError("rings", found=dict(ring), expected=expected)
-        checked.append(Ring(float(ring["pitch"]), int(ring["views"])))
-    if not checked:
-        raise SettingError("rings", found="[]", expected="one ring or more")
-    return tuple(checked)
-
-
-def half_extents(fov_deg: tuple[float, float]) -> tuple[float, float]:
+def half_extents(fov_deg: Sequence[float]) -> tuple[float, float]:
     """Return half the width and height of an image, in focal lengths.
 
     Raises:
@@ -129,11 +87,15 @@ def half_extents(fov_deg: tuple[float, float]) -> tuple[float, float]:
     return across, down
 
 
-def _axes(ring: Ring) -> NDArray[np.float64]:
-    """Return ``(n, 3, 3)`` camera axes of the views of a ring."""
-    longitudes = 2 * math.pi / ring.views * np.arange(ring.views)
-    sin, cos = math.sin(math.radians(ring.pitch_deg)), math.cos(math.radians(ring.pitch_deg))
-    x, y, zero = np.cos(longitudes), np.sin(longitudes), np.zeros(ring.views)
+def _axes(ring: Mapping[str, float]) -> NDArray[np.float64]:
+    """Return ``(n, 3, 3)`` camera axes of the views of a ring; the first has longitude 0."""
+    pitch, views = ring.get("pitch", math.nan), ring.get("views", 0)
+    if set(ring) != {"pitch", "views"} or not (abs(pitch) <= 90 and 1 <= views <= _MOST_VIEWS):
+        expected = f"{{pitch: -90 to 90, views: 1 to {_MOST_VIEWS}}}"
+        raise SettingError("rings", found=dict(ring), expected=expected)
+    longitudes = 2 * math.pi / views * np.arange(views)
+    sin, cos = math.sin(math.radians(pitch)), math.cos(math.radians(pitch))
+    x, y, zero = np.cos(longitudes), np.sin(longitudes), np.zeros_like(longitudes)
     right = np.stack([-y, x, zero], axis=-1)
     down = np.stack([sin * x, sin * y, zero - cos], axis=-1)
     forward = np.stack([cos * x, cos * y, zero + sin], axis=-1)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError, width_height
-from tangent_train.geometry.icosphere import MAX_LEVEL, icosphere
+from tangent_train.geometry.icosphere import icosphere
 
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
@@ -38,28 +38,6 @@ def icosphere_count(level: int, elements: IcosphereElements = "vertices") -> int
     return 10 * 4**level + 2 if elements == "vertices" else 20 * 4**level
 
 
-def icosphere_level(count: int) -> tuple[int, IcosphereElements] | None:
-    """Return the level of a signal and what it is on, from its number of values; or None.
-
-    >>> icosphere_level(10242), icosphere_level(80), icosphere_level(81)
-    ((5, 'vertices'), (1, 'faces'), None)
-    """
-    kinds: tuple[IcosphereElements, ...] = "vertices", "faces"
-    known = {
-        icosphere_count(s, elements): (s, elements)
-        for s in range(MAX_LEVEL + 1)
-        for elements in kinds
-    }
-    return known.get(count)
-
-
-def _described(rows: int, count: int) -> str:
-    known = icosphere_level(count) if rows == 1 else None
-    if known is None:
-        return f"an image of {width_height((rows, count))} pixels"
-    return f"a signal on the {count} {known[1]} of the icosphere of level {known[0]}"
-
-
 def check_signal(shape: Sequence[int], count: int) -> None:
     """Refuse the input of a network that is not a signal of its icosphere.
 
@@ -70,12 +48,11 @@ def check_signal(shape: Sequence[int], count: int) -> None:
     Raises:
         SettingError: The input is another image or signal.
     """
-    rows, values = shape[-2:]
-    if (rows, values) != (1, count):
+    if tuple(shape[-2:]) != (1, count):
         raise SettingError(
             "input of the network",
-            found=_described(rows, values),
-            expected=_described(1, count),
+            found=f"an image of {width_height(shape[-2:])}",
+            expected=f"a signal of {count} values, an image of {width_height((1, count))}",
             remedy="Set representation=icosphere, with this level and representation.elements.",
         )
 

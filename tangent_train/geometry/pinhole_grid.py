@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 from functools import cached_property
@@ -17,8 +18,8 @@ from tangent_train.geometry.sphere import checked_rotation
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
 
-_ROUNDING = 1e-9
-"""Tolerance at the edges of images, in focal lengths."""
+_AT_ONCE = 2**24
+"""Number of products of directions and images that are held at once."""
 
 
 class PinholeGrid:
@@ -35,15 +36,11 @@ class PinholeGrid:
         size: Rows h and columns w of the images.
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
-        is_overlapping: See the property.
+        is_overlapping: True if every direction is inside an image, not only on its outer edge.
 
     Raises:
         SettingError: The rotation is not a rotation.
     """
-
-    size: tuple[int, int]
-    pitch: float
-    rotation: NDArray[np.float64] | None
 
     def __init__(
         self,
@@ -54,7 +51,16 @@ class PinholeGrid:
         *,
         is_overlapping: bool = True,
     ) -> None:
-        self._set(rotation, size=size, pitch=pitch, _axes=axes, _is_overlapping=is_overlapping)
+        self._axes = axes
+        self.size = size
+        self.pitch = pitch
+        self.rotation = None if rotation is None else checked_rotation(rotation)
+        self.is_overlapping = is_overlapping
+
+    @property
+    def num_images(self) -> int:
+        """Number N of images."""
+        return len(self._axes)
 
     @cached_property
     def neighbors(self) -> NDArray[np.int32]:
@@ -62,28 +68,7 @@ class PinholeGrid:
 
         Stepping repeatedly to the neighbor with the nearest center ends at the owner.
         """
-        return cell_neighbors(self._resting_axes()[..., 2])
-
-    @property
-    def is_overlapping(self) -> bool:
-        """True if every direction is inside an image, not only on its outer edge."""
-        overlapping: bool = vars(self)["_is_overlapping"]
-        return overlapping
-
-    def _resting_axes(self) -> NDArray[np.float64]:
-        """Return ``(N, 3, 3)`` camera axes before the rotation."""
-        axes: NDArray[np.float64] = vars(self)["_axes"]
-        return axes
-
-    def _set(self, rotation: ArrayLike | None, **values: Any) -> None:
-        """Set the attributes of a new grid."""
-        checked = None if rotation is None else checked_rotation(rotation)
-        vars(self).update(values, rotation=checked)
-
-    @property
-    def num_images(self) -> int:
-        """Number N of images."""
-        return len(self._resting_axes())
+        return cell_neighbors(self._axes[..., 2])
 
     def with_rotation(self, rotation: ArrayLike | None) -> Self:
         """Return the same images under another rotation.
@@ -91,12 +76,13 @@ class PinholeGrid:
         Raises:
             SettingError: The matrix is not a rotation.
         """
-        return self._changed(rotation)
+        return self._changed(rotation=None if rotation is None else checked_rotation(rotation))
 
     def widened(self, margin: int) -> Self:
         """Return the same images with more pixels on every side, at the same pitch."""
         rows, columns = self.size
-        return self._changed(self.rotation, size=(rows + 2 * margin, columns + 2 * margin))
+        size = rows + 2 * margin, columns + 2 * margin
+        return self._changed(size=size, is_overlapping=self.is_overlapping or margin > 0)
 
     def resized(self, size: tuple[int, int]) -> Self:
         """Return the same images at another resolution: their outer edges agree.
@@ -113,7 +99,7 @@ class PinholeGrid:
         if min(size) < 2 or height * columns != width * rows:
             expected = f"2 pixels or more, in the ratio of {width_height(self.size)}"
             raise SettingError("size", found=width_height(size), expected=expected)
-        return self._changed(self.rotation, size=size, pitch=self.pitch * columns / width)
+        return self._changed(size=size, pitch=self.pitch * columns / width)
 
     def subset(self, faces: Faces) -> PinholeGrid:
         """Return some of the images; the nearest among them owns a direction.
@@ -124,19 +110,23 @@ class PinholeGrid:
         Raises:
             SettingError: A face is out of range.
         """
-        axes, overlapping = self._resting_axes()[self.face_indices(faces)], self.is_overlapping
-        return PinholeGrid(axes, self.size, self.pitch, self.rotation, is_overlapping=overlapping)
+        axes, is_overlapping = self._axes[self.face_indices(faces)], self.is_overlapping
+        return PinholeGrid(
+            axes, self.size, self.pitch, self.rotation, is_overlapping=is_overlapping
+        )
 
-    def _changed(self, rotation: ArrayLike | None, **values: Any) -> Self:
+    def _changed(self, **values: Any) -> Self:
         """Return this grid with other values, without its cached properties."""
-        other = object.__new__(type(self))
-        kept = {
-            name: value
-            for name, value in vars(self).items()
-            if not isinstance(getattr(type(self), name, None), cached_property)
-        }
-        other._set(**{**kept, "rotation": rotation, **values})
+        other = copy.copy(self)
+        for name in ("neighbors", "world_from_camera", "_key"):
+            vars(other).pop(name, None)
+        vars(other).update(values)
         return other
+
+    @property
+    def dim(self) -> int:
+        """Side d of square images in pixels."""
+        return self.size[0]
 
     @property
     def half_size(self) -> tuple[float, float]:
@@ -145,10 +135,14 @@ class PinholeGrid:
         return columns * self.pitch / 2, rows * self.pitch / 2
 
     @property
-    def plane_positions(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Positions y of rows ``(h,)`` and x of columns ``(w,)`` on the image plane."""
-        rows, columns = (np.arange(side, dtype=np.float64) - (side - 1) / 2 for side in self.size)
-        return rows * self.pitch, columns * self.pitch
+    def half_extent(self) -> float:
+        """Half extent h = (d−1)/2·p: position of the outermost pixel centers on the image plane."""
+        return (self.dim - 1) / 2 * self.pitch
+
+    @property
+    def fov_deg(self) -> float:
+        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
+        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))
 
     @property
     def width_deg(self) -> float:
@@ -161,22 +155,19 @@ class PinholeGrid:
         y, x = ((side - 1) / 2 for side in self.size)
         return np.array([[1 / self.pitch, 0, x], [0, 1 / self.pitch, y], [0, 0, 1]])
 
-    @cached_property
+    @property
     def centers_xyz(self) -> NDArray[np.float64]:
         """``(N, 3)`` directions of the images' centers."""
         return self.world_from_camera[..., 2]
 
     @cached_property
     def world_from_camera(self) -> NDArray[np.float64]:
-        """``(N, 3, 3)`` camera axes (x right, y down, z forward) as columns.
+        """``(N, 3, 3)`` camera axes (x right, y down, z forward) as columns, read-only.
 
         The determinant is −1, because the sphere frame is mirrored (see `tangent_train.geometry`);
         ``FLIP_Y @ world_from_camera`` are proper rotations in a right-handed room.
         """
-        axes = self._resting_axes()
-        if self.rotation is not None:
-            axes = self.rotation @ axes
-        axes = axes.copy()
+        axes = self._axes.copy() if self.rotation is None else self.rotation @ self._axes
         axes.setflags(write=False)
         return axes
 
@@ -192,8 +183,8 @@ class PinholeGrid:
         Raises:
             SettingError: A face is out of range.
         """
-        down, right = self.plane_positions
-        x, y = np.meshgrid(right, down)
+        rows, columns = ((np.arange(side) - (side - 1) / 2) * self.pitch for side in self.size)
+        x, y = np.meshgrid(columns, rows)
         rays = np.stack([x, y, np.ones_like(x)], axis=-1)
         rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
         axes = self.world_from_camera[self.face_indices(faces)]
@@ -208,9 +199,9 @@ class PinholeGrid:
         if faces is None:
             return np.arange(self.num_images)
         indices = np.atleast_1d(np.asarray(faces))
-        whole = indices.size == 0 or indices.dtype.kind in "iu"
+        is_whole = indices.size == 0 or indices.dtype.kind in "iu"
         outside = (indices < 0) | (indices >= self.num_images)
-        if not whole or indices.ndim != 1 or outside.any():
+        if not is_whole or indices.ndim != 1 or outside.any():
             raise SettingError("faces", found=faces, expected=f"indices 0 to {self.num_images - 1}")
         return indices.astype(np.int64)
 
@@ -226,7 +217,7 @@ class PinholeGrid:
         directions = np.asarray(directions_xyz, np.float64)
         flat = directions.reshape(-1, 3)
         owner = np.empty(len(flat), np.int64)
-        step = max(1, 2**24 // self.num_images)
+        step = max(1, _AT_ONCE // self.num_images)
         for start in range(0, len(flat), step):
             part = slice(start, start + step)
             owner[part] = (flat[part] @ self.centers_xyz.T).argmax(axis=1)
@@ -250,49 +241,35 @@ class PinholeGrid:
         plane = np.stack([x / depth, y / depth], axis=-1)
         return plane / self.pitch + self.camera_matrix[:2, 2]
 
-    def shown(self, directions_xyz: ArrayLike, *, on_edge: bool = True) -> NDArray[np.bool_]:
-        """Return the images that show directions, between their outer pixel edges.
+    def insets(self, directions_xyz: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Return how far directions are inside the images.
 
         Args:
-            directions_xyz: ``(n, 3)`` vectors of any length.
-            on_edge: True to include directions on the edges.
+            directions_xyz: ``(n, 3)`` unit vectors.
 
         Returns:
-            ``(n, N)`` mask.
+            ``(N, n)`` sines of the angles from the nearest outer edges; negative outside an image.
         """
-        x, y, z = np.moveaxis(np.asarray(directions_xyz) @ self.world_from_camera, -1, 0)
-        (across, down), beyond = self.half_size, _ROUNDING if on_edge else -_ROUNDING
-        inside = np.maximum(np.abs(x) - across * z, np.abs(y) - down * z) < beyond * z
-        return np.asarray(inside & (z > 0)).T
+        across, down = self.half_size
+        insets = np.empty((self.num_images, len(directions_xyz)), np.float32)
+        step = max(1, _AT_ONCE // max(1, len(directions_xyz)))
+        for start in range(0, self.num_images, step):
+            x, y, z = np.moveaxis(
+                directions_xyz @ self.world_from_camera[start : start + step], -1, 0
+            )
+            insets[start : start + step] = np.minimum(
+                (across * z - np.abs(x)) / math.hypot(1, across),
+                (down * z - np.abs(y)) / math.hypot(1, down),
+            )
+        return insets
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
         rotation = None if self.rotation is None else self.rotation.tobytes()
-        axes = vars(self).get("_axes")
-        fixed = None if axes is None else axes.tobytes()
-        return type(self), self.num_images, self.size, self.pitch, rotation, fixed
+        return self._axes.tobytes(), self.size, self.pitch, rotation, self.is_overlapping
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, PinholeGrid) and self._key == other._key
 
     def __hash__(self) -> int:
         return hash(self._key)
-
-
-class SquareGrid(PinholeGrid):
-    """Square images with sides of d pixels."""
-
-    @property
-    def dim(self) -> int:
-        """Side d in pixels."""
-        return self.size[0]
-
-    @property
-    def half_extent(self) -> float:
-        """Half extent h = (d−1)/2·p: position of the outermost pixel centers on the image plane."""
-        return (self.dim - 1) / 2 * self.pitch
-
-    @property
-    def fov_deg(self) -> float:
-        """Angle between adjacent corners in degrees: acos(1 / (1 + 2h²)) (paper, table of FOV)."""
-        return math.degrees(math.acos(1 / (1 + 2 * self.half_extent**2)))

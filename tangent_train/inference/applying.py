@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least
-from tangent_train.inference.depth import combine_depth
+from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_choice, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
@@ -170,7 +170,7 @@ def _distance(
     align: Align,
 ) -> NDArray[np.float32]:
     """Return the distances ``(H, W)`` of aligned and blended depth."""
-    views, outputs = PinholeViews(grid), []
+    views, mosaic = PinholeViews(grid), AlignedMosaic(shape, kind, blend, align)
     for faces, results in parts:
         if (channels := math.prod(results.shape[3:])) != 1 or results.dtype.kind != "f":
             raise SettingError(
@@ -179,15 +179,15 @@ def _distance(
                 expected="one float per pixel, which is depth, with align=",
             )
         depth = torch.from_numpy(results.astype(np.float32)).reshape(-1, 1, *grid.size)
-        outputs.append((views[faces[0] : faces[-1] + 1], depth))
-    found = combine_depth(outputs, shape, kind, blend, align)
-    if not found.distance.isfinite().any():
+        mosaic.add(depth, views[faces[0] : faces[-1] + 1])
+    distance = mosaic.distances()
+    if not distance.isfinite().any():
         raise SettingError(
             "result of the function",
             found=f"no depth that {kind} with align={align} can use",
             expected="finite depth, larger than 0",
         )
-    return found.distance.numpy()
+    return distance.numpy()
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:

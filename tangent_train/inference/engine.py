@@ -10,9 +10,6 @@ from __future__ import annotations
 
 import inspect
 import math
-import weakref
-from collections import deque
-from contextlib import suppress
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +22,6 @@ from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import ClassScoreNetwork, network_for_views, plain_scores
 from tangent_train.errors import SettingError, at_least
-from tangent_train.rendering.mosaic import ScoreMosaic
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import sphere_rays
 
@@ -37,6 +33,7 @@ if TYPE_CHECKING:
 
     from datamodules.core.inputs import Input
     from tangent_train.checkpoints.loaded import LoadedNetwork
+    from tangent_train.heads import Head
     from tangent_train.inference.images import InputImage
     from tangent_train.inference.representations import PanoramaViews, PhotoViews
     from tangent_train.rendering import Interpolation
@@ -205,16 +202,17 @@ class RenderedViews:
         return lambda part: self(views[part])
 
 
-class ViewPredictor:
-    """Passes the views of whole panoramas or photos to a network, a few at a time.
+class Predictor:
+    """Predicts whole panoramas or photos: passes their views to a network, a few at a time.
 
     Args:
-        trained: The network; it is moved to the device.
+        loaded: The network; it is moved to the device.
+        head: The meaning of its output, see `head_of`.
         view_sets: Selects the views of an image.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
         view_batch_size: Number of views per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
-            a panorama at once, and their scores are kept in memory.
+            a panorama at once, and their outputs are kept in memory.
 
     Attributes:
         device: Device of the network, the views and the mosaic.
@@ -225,7 +223,8 @@ class ViewPredictor:
 
     def __init__(
         self,
-        trained: LoadedNetwork,
+        loaded: LoadedNetwork,
+        head: Head,
         view_sets: PanoramaViews | PhotoViews,
         device: str = "cpu",
         view_batch_size: int | None = None,
@@ -234,7 +233,7 @@ class ViewPredictor:
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
             self.device = torch.zeros(1, device=device).device  # refuses a missing device
-            trained.network.to(self.device).to(memory_format=torch.channels_last)
+            loaded.network.to(self.device).to(memory_format=torch.channels_last)
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
             raise SettingError(
                 "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
@@ -243,99 +242,53 @@ class ViewPredictor:
         if view_batch_size is not None:
             self._per_forward = at_least("view_batch_size", view_batch_size, 1)
         aware = getattr(view_sets, "distortion_aware", None)
-        network: Any = network_for_views(trained.network, aware)
+        network: Any = network_for_views(loaded.network, aware)
         self._sees_rays = sees_rays(network)
         if self._sees_rays:
             network = partial(network, view_batch_size=self._per_forward)
-        self._network, self._trained, self._view_sets = network, trained, view_sets
+        self.head = head
+        self._network, self._loaded, self._view_sets = network, loaded, view_sets
 
-    def _sets(self, image: InputImage) -> list[ViewSet]:
-        """Return the sets of views of an image."""
-        sets: list[ViewSet] = []
-        for shown, shape, views, rotation in self._view_sets(image):
-            rendered = RenderedViews(self._trained, shown, shape, self.device)
-            rays: Iterable[Tensor | None] = [None] * len(views)
-            if self._sees_rays:
-                rays = upright_rays(views, rotation, self.device)
-            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
-        return sets
-
-    def _scored(
-        self, sets: Sequence[ViewSet], progress: Callable[[float], object]
-    ) -> Iterator[tuple[Views, Tensor]]:
-        """Yield views with their scores; call `progress` with the share of them."""
-        count = sum(len(views) for views, _, _ in sets)
-        for views, scores in scored_views(self._network, sets, self._per_forward):
-            yield views, scores
-            progress(len(views) / count)
-
-
-class Predictor(ViewPredictor):
-    """Predicts the class scores of whole panoramas or photos.
-
-    Args:
-        trained: See `ViewPredictor`.
-        view_sets: Selects the views of an image.
-        device: See `ViewPredictor`.
-        view_batch_size: See `ViewPredictor`.
-        min_confidence: Pixels with a lower confidence, from 0 to 1, are unknown.
-
-    Raises:
-        SettingError: See `ViewPredictor`; or `min_confidence` is not between 0 and 1.
-    """
-
-    def __init__(
-        self,
-        trained: LoadedNetwork,
-        view_sets: PanoramaViews | PhotoViews,
-        device: str = "cpu",
-        view_batch_size: int | None = None,
-        min_confidence: float = 0.0,
-    ) -> None:
-        if not 0 <= min_confidence <= 1:
-            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
-        super().__init__(trained, view_sets, device, view_batch_size)
-        self._min_confidence = min_confidence
-        self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
-
+    @torch.no_grad()
     def predict(
         self,
         image: InputImage,
         progress: Callable[[float], object] = lambda share: None,
         *,
-        probabilities: bool = False,
-    ) -> ScoreMosaic:
-        """Predict the scores of one image at its own resolution.
+        averaged: bool = False,
+    ) -> Any:
+        """Predict one image at its own resolution.
 
         Args:
             image: A panorama or photo.
             progress: Called with the share of the image that was predicted since the last call.
-            probabilities: True if `ScoreMosaic.probabilities` is needed.
+            averaged: True if more than the pixels is needed: probabilities or confidences.
 
         Returns:
-            The scores. Score k belongs to label k + 1; the last score may belong to no class, see
-            `LoadedNetwork.groups`.
+            The mosaic of the head, see `Head.mosaic`.
         """
         sets = self._sets(image)
-        mosaic = self._mosaic(image.shape, averaged=probabilities or len(sets) > 1)
-        for views, scores in self._scored(sets, progress):
-            mosaic.add(scores, views)
+        mosaic = self.head.mosaic(
+            image.shape,
+            self._view_sets.blend,
+            averaged=averaged or len(sets) > 1,
+            device=self.device,
+            valid=image.valid,
+            camera_matrix=image.camera_matrix,
+        )
+        count = sum(len(views) for views, _, _ in sets)
+        for views, outputs in scored_views(self._network, sets, self._per_forward):
+            mosaic.add(outputs, views)
+            progress(len(views) / count)
         return mosaic
 
-    def _mosaic(self, shape: tuple[int, int], *, averaged: bool) -> ScoreMosaic:
-        """Return an empty mosaic, which reuses the memory of an earlier one if possible."""
-        spare = None
-        with suppress(IndexError):
-            spare = self._spare.pop()
-        mosaic = ScoreMosaic(
-            shape,
-            self._trained.network.num_scores,
-            self._view_sets.blend,
-            averaged=averaged,
-            min_confidence=self._min_confidence,
-            device=self.device,
-            spare=spare,
-        )
-        if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
-            weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
-        return mosaic
+    def _sets(self, image: InputImage) -> list[ViewSet]:
+        """Return the sets of views of an image."""
+        sets: list[ViewSet] = []
+        for shown, shape, views, rotation in self._view_sets(image):
+            rendered = RenderedViews(self._loaded, shown, shape, self.device)
+            rays: Iterable[Tensor | None] = [None] * len(views)
+            if self._sees_rays:
+                rays = upright_rays(views, rotation, self.device)
+            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
+        return sets

@@ -18,7 +18,7 @@ from datamodules.core.panoramas import meters_to_steps
 from tangent_train.checkpoints.kinds import Align
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError, width_height
-from tangent_train.inference.depth import DepthPredictor
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import (
     InputImage,
@@ -97,25 +97,24 @@ def load(
     check_choice("blend", blend, get_args(Blend))
     check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
-    trained = original
+    loaded = original
     if label_map is None:
         _check_unset("unmapped", unmapped, "unknown", "without label_map")
     else:
-        trained = map_classes(original, load_label_map(label_map), unmapped).trained
-    chosen = trained, levels, base_level, blend, rotations
+        loaded = map_classes(original, load_label_map(label_map), unmapped).trained
+    chosen = loaded, levels, base_level, blend, rotations
     how = device, view_batch_size
-    predictor: Any
-    if trained.predicts == DISTANCE:
+    if loaded.predicts == DISTANCE:
         _check_unset("min_confidence", min_confidence, 0, "for depth networks")
-        predictor = partial(DepthPredictor, align=align)
+        head = head_of(loaded, align=align)
     else:
         _check_unset("align", align, None, "for networks of classes")
-        predictor = partial(Predictor, min_confidence=min_confidence)
-    panoramas = predictor(trained, PanoramaViews(*chosen, views, fill), *how)
+        head = head_of(loaded, min_confidence=min_confidence)
+    panoramas = Predictor(loaded, head, PanoramaViews(*chosen, views, fill), *how)
     return Network(
-        trained,
+        loaded,
         panoramas,
-        lambda: predictor(trained, PhotoViews(*chosen), *how),
+        lambda: Predictor(loaded, head, PhotoViews(*chosen), *how),
         NetworkJudge(original, panoramas.device),
     )
 
@@ -148,8 +147,8 @@ class Network:
     def __init__(
         self,
         trained: LoadedNetwork,
-        panoramas: Predictor | DepthPredictor,
-        photos: Callable[[], Predictor | DepthPredictor],
+        panoramas: Predictor,
+        photos: Callable[[], Predictor],
         judge: NetworkJudge,
     ) -> None:
         self.trained = trained
@@ -210,7 +209,7 @@ class Network:
         self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         how: dict[str, Any] = {"depth": depth, "fov": fov, "area": area, "upright": upright}
         mosaic, read = self._predict(image, max_tilt_deg=max_tilt_deg, mask=mask, **how)
-        labels = _cut(self.trained.labels(mosaic.labels()), image, read, mask, 0)
+        labels = _cut(mosaic.pixels().cpu().numpy(), image, read, mask, 0)
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
         return labels
@@ -251,8 +250,7 @@ class Network:
                 remedy="Use pose for files with GPano tags, or a network of classes to align it.",
             )
         found, read = self._predict(image, fov=fov, area=area, upright=upright, mask=mask)
-        depth = found.depth(read.camera_matrix)
-        depth = _cut(depth.cpu().numpy(), image, read, mask, np.nan)
+        depth = _cut(found.pixels().cpu().numpy(), image, read, mask, np.nan)
         return torch.from_numpy(depth).to(image.device) if isinstance(image, Tensor) else depth
 
     def scores(self, image: Picture, **settings: Any) -> Any:
@@ -275,7 +273,7 @@ class Network:
         if settings.get("mask") is not None:
             expected = "None for scores: they are not masked"
             raise SettingError("mask", found="one", expected=expected)
-        mosaic, read = self._predict(image, probabilities=True, **settings)
+        mosaic, read = self._predict(image, averaged=True, **settings)
         scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
         if read.area is not None:
             scores = torch.from_numpy(np.ascontiguousarray(read.area.cut(scores.cpu().numpy())))

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from tangent_train.errors import DataError
-from tangent_train.files import parse_json, write_text
+from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
 CAMERAS_FILE = "cameras.json"
@@ -268,7 +268,7 @@ def read_rig(path: Path) -> RigFile:
         DataError: The file is missing, or another program wrote it.
     """
     try:
-        (rig,) = parse_json(path.read_bytes())
+        (rig,) = json.loads(path.read_bytes())
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
             axes = {
                 str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])

@@ -19,7 +19,7 @@ from tangent_train.geometry import (
     nearest_level,
     random_rotation,
 )
-from tangent_train.geometry.valid_views import is_valid
+from tangent_train.geometry.coverage import is_valid
 from tangent_train.keypoints import (
     SphericalKeypoints,
     TwoView,

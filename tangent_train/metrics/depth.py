@@ -74,13 +74,15 @@ class DepthProtocol:
     clip: bool = False
 
     def __post_init__(self) -> None:
-        check_choice("task.alignment", self.alignment, get_args(Alignment))
-        check_choice("task.alignment_in", self.alignment_in, get_args(Quantity))
+        check_choice("task.head.alignment", self.alignment, get_args(Alignment))
+        check_choice("task.head.alignment_in", self.alignment_in, get_args(Quantity))
         if self.min_distance < 0:
-            raise SettingError("task.min_distance", found=self.min_distance, expected="0 or more")
+            raise SettingError(
+                "task.head.min_distance", found=self.min_distance, expected="0 or more"
+            )
         if self.max_distance is not None and self.max_distance <= self.min_distance:
-            expected = f"more than task.min_distance={self.min_distance}, or null"
-            raise SettingError("task.max_distance", found=self.max_distance, expected=expected)
+            expected = f"more than task.head.min_distance={self.min_distance}, or null"
+            raise SettingError("task.head.max_distance", found=self.max_distance, expected=expected)
 
     @property
     def facts(self) -> dict[str, str]:

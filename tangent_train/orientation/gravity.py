@@ -21,14 +21,14 @@ from tangent_train.orientation.manhattan import (
     segment_weights,
 )
 
-Judge = Callable[[NDArray[np.float64]], NDArray[np.float64]]
+UpLikelihood = Callable[[NDArray[np.float64]], NDArray[np.float64]]
 """Maps directions ``(n, 3)`` to log-likelihoods ``(n,)`` of being up, up to a constant."""
 
 _EVEN_CHANCE = 3.1  # significance at which half of the frames are right
 _STEEPNESS = 3.0
 _ACCEPTED = 0.5
 _HOPELESS = 1 / 400
-"""Directions less likely than the best by this factor are not passed to the judge, to save time."""
+"""Directions less likely than the best by this factor are not passed on, to save time."""
 _LEAST_ROWS = 64
 """In panoramas with fewer rows, noise is mistaken for a room."""
 _DISTINCT = np.cos(np.radians(6))
@@ -58,7 +58,7 @@ _ODD = np.array([-3.8, -7.0, 0.35])
 
 
 def estimate_up(
-    rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0, judge: Judge | None = None
+    rgb: NDArray[np.uint8], max_tilt_deg: float = 60.0, likelihood: UpLikelihood | None = None
 ) -> NDArray[np.float64] | None:
     """Estimate the direction of up from the straight edges of rooms and buildings.
 
@@ -66,7 +66,7 @@ def estimate_up(
     The frame that most edges follow (Coughlan and Yuille, "Manhattan World", ICCV 1999) provides
     these axes to a fraction of a degree. If only one axis is within `max_tilt_deg` of the
     panorama's own vertical, it is up. If several are, one is selected by the appearance of rooms
-    (see `up_probabilities`), and by `judge` if it is given. By appearance alone, one in six
+    (see `up_probabilities`), and by `likelihood` if it is given. By appearance alone, one in six
     randomly rotated SynthRooms gets a wrong axis.
 
     Estimates with a probability below one half are rejected, for example in nature, noise and
@@ -78,7 +78,7 @@ def estimate_up(
         max_tilt_deg: Maximum angle of up from ``(0, 0, 1)``, above 0; 180 for all orientations.
             Choose it slightly above the camera's tilt: with a larger value, another axis of the
             room may be taken for up.
-        judge: Other evidence about directions, such as the confidence of a network
+        likelihood: Other evidence about directions, such as the confidence of a network
             (`tangent_train.inference.judge`). It is called at most once, for the likely directions
             of the best frame.
 
@@ -95,7 +95,7 @@ def estimate_up(
     segments = find_line_segments(rgb)
     frames = find_manhattan_frames(segments)
     lowest = math.cos(math.radians(max_tilt_deg)) - 1e-9
-    directions, chances = _candidates(rgb, segments, frames, lowest, judge)
+    directions, chances = _candidates(rgb, segments, frames, lowest, likelihood)
     best = int(chances.argmax()) if len(chances) else None
     return None if best is None or chances[best] < _ACCEPTED else directions[best]
 
@@ -105,7 +105,7 @@ def _candidates(
     segments: LineSegments,
     frames: list[ManhattanFrame],
     lowest: float,
-    judge: Judge | None,
+    likelihood: UpLikelihood | None,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return possible directions of up ``(n, 3)`` and their probabilities ``(n,)``."""
     # A logit model over all frames and "no frame"; frames with the same vertical add up.
@@ -121,8 +121,8 @@ def _candidates(
         if inside.sum() > 1:
             shares = up_probabilities(rgb, segments, frame.axes_xyz)[inside]
             likely = shares > _HOPELESS * shares.max()
-            if judge is not None and frame is frames[0] and likely.sum() > 1:
-                evidence = judge(axes[inside][likely])
+            if likelihood is not None and frame is frames[0] and likely.sum() > 1:
+                evidence = likelihood(axes[inside][likely])
                 shares[likely] *= np.exp(evidence - evidence.max())
                 shares[~likely] = 0
         for axis, share in zip(axes[inside], odd * shares / shares.sum(), strict=True):

@@ -77,7 +77,7 @@ def import_network(
 
     Raises:
         SettingError: A setting is invalid, or the names do not fit the scores.
-        NoRoomError: The disk is full.
+        OSError: The disk is full.
     """
     multiple, only_size = declared_sizes(network.module)
     if image_size is not None and only_size not in (None, image_size):

@@ -17,11 +17,6 @@ Blend = Literal["nearest", "feather"]
 """``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
 images that cover a pixel, with weights that fall to 0 at the borders of the images."""
 
-_MOST_COLORS = 4
-"""Largest number of channels of a color image."""
-
-_COLOR_DIMENSIONS = 3
-
 
 def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
     """Raise SettingError unless the interpolation exists and can be combined with the blend."""
@@ -74,30 +69,7 @@ def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> N
     if not fits or 0 in image.shape[-2:]:
         expected = "(H, W) or (H, W, C)" if array else "(..., C, H, W)"
         raise SettingError("panorama", found=f"shape {tuple(image.shape)}", expected=expected)
-    _check_layout(image)
     _check_numbers("panorama", image, interpolation)
-
-
-def _check_layout(image: Tensor | NDArray[np.generic]) -> None:
-    """Raise SettingError if the channels are certainly on the wrong axis.
-
-    Rows or columns taken for channels need gigabytes for a panorama of 2048 × 4096 pixels.
-    """
-    if isinstance(image, Tensor):
-        wrong = image.shape[-1] <= _MOST_COLORS < image.shape[-2]
-        found, expected = "a tensor", "(..., C, H, W), channels before rows and columns"
-        remedy = ".permute(2, 0, 1) turns (H, W, C) into (C, H, W)."
-    else:
-        channels, height, width = image.shape if image.ndim == _COLOR_DIMENSIONS else (0, 0, 0)
-        tiny = height == 2 * channels  # may also be a panorama of 1 to 4 rows with many channels
-        wrong = channels <= _MOST_COLORS < height and width == 2 * height and not tiny
-        found, expected = "an array", "(H, W) or (H, W, C), channels last"
-        remedy = ".transpose(1, 2, 0) turns (C, H, W) into (H, W, C)."
-    if wrong:
-        shape = tuple(image.shape)
-        raise SettingError(
-            "panorama", found=f"{found} of shape {shape}", expected=expected, remedy=remedy
-        )
 
 
 def check_images(

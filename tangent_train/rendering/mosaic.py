@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 
 from tangent_train.rendering.checks import Blend, blend_of
-from tangent_train.rendering.numba_sums import NumbaSums
+from tangent_train.rendering.numba_sums import NO_SUMS, NumbaSums
 from tangent_train.rendering.torch_sums import TorchSums, fits_on
 
 if TYPE_CHECKING:
@@ -78,9 +78,9 @@ class Mosaic:
             self._backend = NumbaSums(shape, channels, spare, **settings)
 
     @property
-    def sums(self) -> NDArray[np.float32] | Tensor:
-        """The sums in the layout of the backend."""
-        return self._backend.sums
+    def sums(self) -> NDArray[np.float32]:
+        """Sums on the CPU, see `NumbaSums`; empty if they are not kept or on another device."""
+        return self._backend.sums if isinstance(self._backend, NumbaSums) else NO_SUMS
 
     def add(self, values: Tensor, views: Views) -> None:
         """Add some views of a set; each view of the set must be added once.

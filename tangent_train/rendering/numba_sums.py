@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from tangent_train.rendering.representations.views import Views
 
-_NO_SUMS: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
+NO_SUMS: NDArray[np.float32] = np.empty((0, 0, 0), np.float32)
 _NO_LABELS: NDArray[np.uint8] = np.empty((0, 0), np.uint8)
 
 _IN_MEMORY_BYTES = 2**31
@@ -50,7 +50,7 @@ class NumbaSums:
         self._shape, self._channels, self._softmax = shape, channels, softmax
         self._labels: NDArray[Any] = np.zeros(shape, np.uint8 if channels < 256 else np.uint16)
         self._owned: tuple[object, NDArray[np.integer]] = None, kernels.NO_OWNERS
-        self.sums = _zeros((*shape, kernels.padded(channels)), spare) if averaged else _NO_SUMS
+        self.sums = _zeros((*shape, kernels.padded(channels)), spare) if averaged else NO_SUMS
 
     def add(self, values: Tensor, images: Views, *, is_feathered: bool) -> None:
         """Add some images.
@@ -71,7 +71,7 @@ class NumbaSums:
         if len(self.sums):
             arguments = kernels.add_images, array, geometry, self._softmax, self.sums, _NO_LABELS
         elif is_feathered:
-            arguments = kernels.add_images, array, geometry, False, _NO_SUMS, self._labels
+            arguments = kernels.add_images, array, geometry, False, NO_SUMS, self._labels
         else:
             arguments = kernels.label_images, array, geometry, self._labels
         over_rows(arguments[0], *self._shape, *arguments[1:])

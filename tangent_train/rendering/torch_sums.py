@@ -68,11 +68,6 @@ class TorchSums:
         self._labels = torch.zeros(pixels, dtype=torch.int32, device=device)
         self._owned: tuple[object, Tensor, NDArray[np.int64]] | None = None
 
-    @property
-    def sums(self) -> Tensor:
-        """``(K, H, W)``; ``(0, H, W)`` if they are not kept."""
-        return self._sums.unflatten(1, self._shape)
-
     def add(self, values: Tensor, images: Views, *, is_feathered: bool) -> None:
         """Add some images, see `NumbaSums.add`.
 
@@ -147,7 +142,7 @@ class TorchSums:
     def rows(self, rows: slice | NDArray[np.intp]) -> Tensor:
         """Return the sums ``(h, W, K)`` of some rows."""
         index = rows if isinstance(rows, slice) else rows.tolist()
-        return self.sums[:, index].movedim(0, -1)
+        return self._sums.unflatten(1, self._shape)[:, index].movedim(0, -1)
 
     def labels(self, min_confidence: float) -> Tensor:
         """Return ``(H, W)`` indices of the best classes; K where the confidence is too low."""

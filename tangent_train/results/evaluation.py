@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
+from tangent_train.heads import Head
 from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.metrics.segmentation import BAND_EDGES_DEG
 from tangent_train.results.evaluation_result import RESULTS_FILE, EvaluationResult, plain_scores
@@ -24,6 +25,29 @@ _OTHER_COLUMNS = {
     "taken_for_share": "%",
 }
 """Titles of the columns per class that are not scores."""
+
+
+def evaluation_result(head: Head, result: Any, noun: str, images: int) -> EvaluationResult:
+    """Return the result of an evaluation.
+
+    Args:
+        head: Head that the scores come from.
+        result: Value of its metric.
+        noun: Plural name of the images: panoramas, photos, shapes.
+        images: Number of images.
+    """
+    means, of_classes, bands, confusion = head.scores(result)
+    has_classes = confusion is not None
+    return EvaluationResult(
+        noun,
+        images,
+        head.columns,
+        {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
+        classes=class_entries(of_classes, confusion, head.class_names) if has_classes else (),
+        latitude_bands=latitude_entries(bands) if bands else (),
+        confusion=confusion.tolist() if has_classes else (),
+        intervals=head.intervals(result),
+    )
 
 
 def class_entries(

@@ -3,20 +3,15 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
-
-import numpy as np
+from typing import TYPE_CHECKING, Any
 
 from datamodules.folder.classes import UNKNOWN_NAME
 from tangent_train.errors import SettingError, counted
-from tangent_train.files import csv_text, parse_json, write_text
-from tangent_train.geometry import equirect_solid_angles, ray_lengths
+from tangent_train.files import csv_text, write_text
 from tangent_train.io.image_files import composed
 from tangent_train.io.videos import write_video
 from tangent_train.results.html import EncodedImage, encode_image, write_report
@@ -27,10 +22,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tangent_train.inference.images import InputImage
-
-    Painter = Callable[[NDArray[np.uint8], NDArray[Any]], NDArray[np.uint8]]
-    """Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
+    from tangent_train.heads.base import Head, Painter, PredictedImage
 
 _SUMMARY = "summary.json"
 _FILES = (_SUMMARY, "classes.json", "summary.csv", "report.html", "shards")
@@ -62,115 +54,18 @@ def is_result_in(output: Path) -> Callable[[Path], bool]:
     return is_result
 
 
-class PredictedImage(NamedTuple):
-    """An image with its predicted pixels.
-
-    Attributes:
-        image: Photo, or image of the whole sphere.
-        pixels: Prediction ``(h, w)`` for the area of the image; see `ImageResults`.
-        facts: Further facts about the prediction, for its summary.
-    """
-
-    image: InputImage
-    pixels: NDArray[Any]
-    facts: Mapping[str, Any] = MappingProxyType({})
-
-
-def solid_angles(predicted: PredictedImage) -> NDArray[np.floating]:
-    """Return the relative solid angles ``(h, w)`` of the pixels.
-
-    A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
-    """
-    image, shape = predicted.image, predicted.pixels.shape
-    if image.camera_matrix is not None:
-        return ray_lengths(image.camera_matrix, shape) ** -3.0
-    of_rows = equirect_solid_angles(image.shape)[:, None]
-    if image.area is not None:
-        of_rows = of_rows[image.area.places()[0]]
-    return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory
-
-
-class ImageResults(ABC):
-    """Files, pictures and summary of the predictions of one kind of network.
-
-    Attributes:
-        summary: Name of the summary of an image in its `Entry`.
-        suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
-            predicted pixels, from which pictures are made. All but the last are usual.
-        unknown: Value of unknown pixels.
-        columns: Names in the summary of an image that ``summary.csv`` lists.
-        class_names: Names of the labels; empty without classes.
-        is_metric: False for depth that is known up to a scale.
-    """
-
-    summary: ClassVar[str]
-    suffixes: Mapping[str, str]
-    unknown: ClassVar[float]
-    columns: Sequence[str]
-    class_names: Sequence[str] = ()
-    is_metric: bool = True
-
-    def kinds(self, write: Sequence[str] | None) -> Sequence[str]:
-        """Return the kinds of output of the setting `write`.
-
-        Raises:
-            SettingError: A kind belongs to other networks.
-        """
-        if foreign := set(write or ()).difference(self.suffixes):
-            raise SettingError(
-                "write",
-                found=", ".join(sorted(foreign)),
-                expected=f"{', '.join(self.suffixes)} for a network that predicts {self.source}",
-            )
-        return list(self.suffixes)[:-1] if write is None else write
-
-    @property
-    def source(self) -> str:
-        """Kind of output that holds the predicted pixels."""
-        return next(iter(self.suffixes))
-
-    @abstractmethod
-    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
-        """Write the files of one image by kind, except for those written while predicting."""
-
-    @abstractmethod
-    def read(self, file: Path) -> NDArray[Any]:
-        """Read the predicted pixels from a file that `write` wrote."""
-
-    @abstractmethod
-    def painter(self, kind: str, entries: Sequence[Entry]) -> Painter:
-        """Return a function that paints the frames of a video.
-
-        Args:
-            kind: ``color`` or ``overlay``.
-            entries: Entries of all frames of the video.
-        """
-
-    @abstractmethod
-    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
-        """Return the summary of one image.
-
-        Args:
-            predicted: Image with its prediction.
-            is_counted: Mask ``(h, w)``, or of any shape that fits, that is True for counted pixels.
-        """
-
-    @abstractmethod
-    def table(self, entries: Sequence[Entry]) -> Table:
-        """Return a table of the summaries of all images."""
-
-    def encode(self, name: str, predicted: PredictedImage) -> EncodedImage:
-        """Compress an image for the report, to 0.1 to a few megabytes."""
-        image, pixels, _ = predicted
-        return encode_image(
-            name,
-            image.rgb,
-            len(self.class_names),
-            prediction=pixels if image.area is None else image.area.place(pixels),
-            is_metric=self.is_metric,
-            camera_matrix=image.camera_matrix,
-            sphere=image.camera_matrix is None,
-        )
+def encode_prediction(head: Head, name: str, predicted: PredictedImage) -> EncodedImage:
+    """Compress an image for the report, to 0.1 to a few megabytes."""
+    image, pixels, _ = predicted
+    return encode_image(
+        name,
+        image.rgb,
+        len(head.class_names),
+        prediction=pixels if image.area is None else image.area.place(pixels),
+        is_metric=head.is_metric,
+        camera_matrix=image.camera_matrix,
+        sphere=image.camera_matrix is None,
+    )
 
 
 @dataclass(frozen=True)
@@ -179,17 +74,17 @@ class PredictionFolder:
 
     Attributes:
         path: Folder.
-        results: Files of the kind of network.
+        head: Formats of the files.
         kinds: Kinds of output to write.
     """
 
     path: Path
-    results: ImageResults
+    head: Head
     kinds: Sequence[str]
 
     def files(self, name: str) -> dict[str, Path]:
         """Return the files of one image by kind."""
-        suffixes = self.results.suffixes
+        suffixes = self.head.suffixes
         return {kind: self.path / kind / f"{name}{suffixes[kind]}" for kind in self.kinds}
 
     def check(self, *, resume: bool) -> None:
@@ -201,7 +96,7 @@ class PredictionFolder:
         Raises:
             SettingError: The folder has earlier results.
         """
-        names = (*self.results.suffixes, *_FILES)
+        names = (*self.head.suffixes, *_FILES)
         existing = [path for name in names if (path := self.path / name).exists()]
         if existing:
             without, keep = "a folder without earlier results", " resume=true to keep them,"
@@ -228,7 +123,7 @@ class PredictionFolder:
             SettingError: Earlier predictions have other settings.
         """
         try:
-            content = parse_json((summary or self.path / _SUMMARY).read_bytes())
+            content = json.loads((summary or self.path / _SUMMARY).read_bytes())
             entries = {entry["name"]: entry for entry in self.predicted(content["images"])}
             changed = [f"{n}={v}" for n, v in settings.items() if v != content[n]]
         except (OSError, ValueError, KeyError, TypeError):
@@ -244,7 +139,7 @@ class PredictionFolder:
 
     def predicted(self, entries: Sequence[Entry]) -> list[Entry]:
         """Return the entries of predicted images, without those of errors."""
-        return [entry for entry in entries if self.results.summary in entry]
+        return [entry for entry in entries if self.head.summary in entry]
 
     def _is_complete(self, name: str, entry: Entry) -> bool:
         folder = self.of_frames if "frame" in entry else self
@@ -280,13 +175,14 @@ class PredictionFolder:
         """
 
         def painted(paint: Painter, number: int, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-            file = self.of_frames.files(frame_name(name, number))[self.results.source]
-            return paint(rgb, self.results.read(file))
+            file = self.of_frames.files(frame_name(name, number))[self.head.source]
+            return paint(rgb, self.head.read(file))
 
         for kind in _PICTURES:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and (again or not file.exists()):
-                paint = self.results.painter(kind, entries)
+                summaries = [e[self.head.summary] for e in entries]
+                paint = self.head.painter(kind, summaries)
                 write_video(file, path, size, partial(painted, paint), every)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
@@ -301,10 +197,10 @@ class PredictionFolder:
         """
         content = {**settings, "images": entries}
         write_text(self.path / _SUMMARY, json.dumps(content, indent=1) + "\n")
-        if self.results.class_names:
-            write_text(self.path / "classes.json", _labels_by_name(self.results.class_names))
-        columns, names = ("file", "rows", "columns"), dict.fromkeys(self.results.columns)
-        summaries = (entry.get(self.results.summary, {}) for entry in entries)
+        if self.head.class_names:
+            write_text(self.path / "classes.json", _labels_by_name(self.head.class_names))
+        columns, names = ("file", "rows", "columns"), dict.fromkeys(self.head.summary_columns)
+        summaries = (entry.get(self.head.summary, {}) for entry in entries)
         rows = [
             [*map(entry.get, columns), *map(summary.get, names), entry.get("error")]
             for entry, summary in zip(entries, summaries, strict=True)
@@ -318,6 +214,11 @@ class PredictionFolder:
         with suppress(OSError):  # the folder has other files
             self.path.rmdir()
 
+    def table(self, entries: Sequence[Entry]) -> Table:
+        """Return a table of the predicted images."""
+        summaries = [entry[self.head.summary] for entry in self.predicted(entries)]
+        return Table(*self.head.table(summaries))
+
     def write_page(self, entries: Sequence[Entry], shown: Sequence[EncodedImage]) -> None:
         """Write ``report.html``.
 
@@ -325,7 +226,7 @@ class PredictionFolder:
             entries: Entries of all images.
             shown: Compressed images for the viewer.
         """
-        tables = [self.results.table(self.predicted(entries))]
+        tables = [self.table(entries)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
         if failed:
             title, columns = "Images that could not be used", ("image", "error")
@@ -335,7 +236,7 @@ class PredictionFolder:
             "Predictions",
             tables=tables,
             images=shown,
-            class_names=self.results.class_names,
+            class_names=self.head.class_names,
             notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
         )
 

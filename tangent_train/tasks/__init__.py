@@ -1,8 +1,8 @@
-"""Tasks: loss, metrics and optimization of a network, which is an argument."""
+"""Tasks: training and evaluation of a network and its head."""
 
-from tangent_train.tasks.classification import ClassificationTask
-from tangent_train.tasks.depth import DepthTask
+from tangent_train.tasks.base import Task
+from tangent_train.tasks.pixels import PixelTask
 from tangent_train.tasks.schedules import warmup_cosine
-from tangent_train.tasks.segmentation import SegmentationTask
+from tangent_train.tasks.shapes import ShapeTask
 
-__all__ = ["ClassificationTask", "DepthTask", "SegmentationTask", "warmup_cosine"]
+__all__ = ["PixelTask", "ShapeTask", "Task", "warmup_cosine"]

@@ -5,33 +5,29 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, Self
 
 import lightning
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
-from torchmetrics import Metric, SumMetric
+from torchmetrics import SumMetric
 
-from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.scores import network_for_views
-from tangent_train.errors import SettingError, at_least
-from tangent_train.metrics.score_columns import ScoreColumn
-from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
+from tangent_train.errors import at_least
+from tangent_train.heads import Head
+from tangent_train.heads.base import RGB
+from tangent_train.heads.pictures import shown_arrays
+from tangent_train.results.evaluation import evaluation_result
+from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.html.page import EncodedImage, encode_image
-from tangent_train.tasks.divergence import check_weights, refuse_loss
+from tangent_train.tasks.divergence import refuse_loss
 from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
 
 Part = tuple[tuple[Tensor, ...], Tensor]
-"""Inputs of the network, and their labels."""
-
-RGB = NDArray[np.uint8]
-"""A picture ``(H, W, 3)``."""
+"""Inputs of the network, and their targets."""
 
 
 class Task(lightning.LightningModule, ABC):
@@ -44,12 +40,11 @@ class Task(lightning.LightningModule, ABC):
     Args:
         network: Network to train.
         representation: Representation of the network's images.
-        class_names: Names of the classes.
+        head: The meaning of the network's output: loss, scores, pictures.
         optimizer: Function that builds the optimizer from parameters; None for a task that is only
             evaluated.
         scheduler: `Schedule`, or a function that builds a learning rate scheduler from the
             optimizer, stepped every epoch; None for a constant rate.
-        label_smoothing: Fraction of the target that is spread over all classes.
         view_batch_size: Largest number of images per forward pass in training, which bounds
             memory; None for the whole batch. Batch normalization uses one chunk at a time; chunks
             are even.
@@ -60,13 +55,8 @@ class Task(lightning.LightningModule, ABC):
         backbone_lr_factor: Factor of the learning rate of parameters that are not `fresh`.
 
     Attributes:
-        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
-        predicts: Kind of predictions, e.g. `PIXEL_CLASSES`, for commands that read a checkpoint.
         monitor: Score on the validation split that selects the best epoch.
-        depth_kind: Kind of the network's output, if it predicts distances; else None.
-        takes: Input and output of a network for this task, for messages.
-        columns: Names and units of the scores over a split, in the order of the tables.
-        metric: Metric of a split, see `build_metric`.
+        metric: Metric of a split, see `Head.build_metric`.
         result: Value of `metric` after the last evaluation.
         evaluated: Number of images or shapes in that evaluation.
         fresh: Names of the network's tensors that were not loaded from the file of ``init_from``;
@@ -76,12 +66,6 @@ class Task(lightning.LightningModule, ABC):
         SettingError: A setting is invalid.
     """
 
-    labels: ClassVar[str] = PIXEL_CLASSES
-    predicts: ClassVar[str] = ""
-    monitor: ClassVar[str]
-    takes: ClassVar[str]
-    columns: ClassVar[Mapping[str, ScoreColumn]]
-    depth_kind: DepthKind | None = None
     result: Any
     evaluated: int
 
@@ -89,10 +73,9 @@ class Task(lightning.LightningModule, ABC):
         self,
         network: nn.Module,
         representation: Any,
-        class_names: Sequence[str],
+        head: Head,
         optimizer: Callable[..., Optimizer] | None,
         scheduler: Schedule | Callable[..., LRScheduler] | None = None,
-        label_smoothing: float = 0.0,
         view_batch_size: int | None = None,
         channels_last: bool = False,
         compile: Mapping[str, Any] | None = None,  # noqa: A002 - torch's own word
@@ -100,63 +83,31 @@ class Task(lightning.LightningModule, ABC):
         backbone_lr_factor: float = 1.0,
     ) -> None:
         super().__init__()
-        if not 0 <= label_smoothing < 1:
-            raise SettingError("task.label_smoothing", found=label_smoothing, expected="0 to 1")
         if view_batch_size is not None:
             at_least("task.view_batch_size", view_batch_size, 1)
-        if not (isinstance(backbone_lr_factor, int | float) and 0 < backbone_lr_factor < math.inf):
-            raise SettingError(
-                "task.backbone_lr_factor",
-                found=backbone_lr_factor,
-                expected="a number greater than 0",
-                remedy="To train parts not at all, use task.frozen=[…].",
-            )
         self.memory_format = torch.channels_last if channels_last else torch.contiguous_format
         network = network_for_views(network, getattr(representation, "distortion_aware", None))
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
             self.network.compile(**compile)  # in place: names of tensors stay as they are
         self.representation = representation
-        self.class_names = tuple(class_names)
+        self.head = head
         self.make_optimizer: Any = optimizer
         is_complete = scheduler is None or isinstance(scheduler, Schedule)
         self.schedule: Any = scheduler if is_complete else Schedule(scheduler)  # type: ignore[arg-type]
-        self.label_smoothing = label_smoothing
         self.view_batch_size = view_batch_size
         self.backbone_lr_factor = backbone_lr_factor
         self.fresh: Collection[str] | None = None
         # A tuple: in a `ModuleList`, their tensors would have second names.
         self._frozen = tuple(freeze(self.network, frozen))
-        self.metric: Any = self.build_metric()
+        self.monitor = f"val/{head.main_score}"
+        self.metric: Any = head.build_metric()
         self._counted = SumMetric()
         # The validation loss and its norm, without the check for NaN, for which the host waits for
         # a GPU. (A `MeanMetric` without this check ignores weights.)
         self._losses: Any = nn.ModuleList(SumMetric(nan_strategy="disable") for _ in range(2))
         self._pending: tuple[Tensor, Any, Any] | None = None
         self._step_norm: Any = None
-        self._trained_length: Mapping[str, int] | None = None
-
-    @staticmethod
-    def num_outputs(num_classes: int) -> int:
-        """Return the number of outputs of a network whose ``num_classes`` is null.
-
-        By default, there is one output for each class.
-
-        Args:
-            num_classes: Number of classes of the data.
-        """
-        return num_classes
-
-    @classmethod
-    def mode_of(cls, monitor: str) -> Literal["max", "min"]:
-        """Return ``min`` for a loss and for errors, see `ScoreColumn.better`; else ``max``.
-
-        Args:
-            monitor: Name of a logged value, e.g. ``val/miou``.
-        """
-        heading = cls.columns.get(monitor.partition("/")[2])
-        is_error = heading is not None and heading.better == "lower"
-        return "min" if is_error or monitor.endswith("loss") else "max"
 
     @abstractmethod
     def example(self, channels: int) -> Tensor:
@@ -164,101 +115,27 @@ class Task(lightning.LightningModule, ABC):
 
     @abstractmethod
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Return the inputs of the network and their labels, with a common first dimension."""
-
-    @abstractmethod
-    def loss_sum(self, inputs: tuple[Tensor, ...], labels: Tensor) -> Tensor:
-        """Return the sum of the losses of inputs."""
-
-    @abstractmethod
-    def loss_norm(self, labels: Tensor) -> Tensor:
-        """Return the number that the sum of the losses is divided by."""
+        """Return the inputs of the network and their targets, with a common first dimension."""
 
     @abstractmethod
     def evaluate(self, batch: Any) -> Tensor:
         """Add the predictions for a batch to `metric` and return them."""
 
-    @abstractmethod
-    def build_metric(self) -> Metric:
-        """Build the metric of a split, whose state is summed over all processes."""
+    def loss_sum(self, inputs: tuple[Tensor, ...], targets: Tensor) -> Tensor:
+        """Return the sum of the losses of inputs."""
+        return self.head.loss_sum(self(*inputs), targets)
 
-    @abstractmethod
-    def logged_scores(self, result: Any) -> dict[str, float]:
-        """Return scores over the whole split by name, the main score first.
+    def true_labels(self, batch: Any) -> Tensor:
+        """Return the true labels of an evaluated batch, one item per prediction."""
+        labels: Tensor = batch.target
+        return labels
 
-        A score ``miou`` is logged as ``val/miou`` and ``test/miou``.
-
-        Args:
-            result: Value of `metric`.
-        """
-
-    def class_scores(self, result: Any) -> dict[str, float]:
-        """Return scores of classes by name, e.g. ``iou/wall``; NaN for absent classes.
-
-        Args:
-            result: Value of `metric`.
-        """
-        return {}
-
-    def evaluation_result(self, result: Any, noun: str) -> EvaluationResult:
-        """Return the last evaluation: `logged_scores` under their `columns`.
-
-        Args:
-            result: Value of `metric`.
-            noun: Plural name of the images: panoramas, photos, shapes.
-        """
-        scores = plain_scores(self.logged_scores(result))
-        means = scores | {name: None for name in self.columns if name not in scores}
-        return EvaluationResult(noun, self.evaluated, self.columns, means)
+    # Training
 
     @property
-    def facts(self) -> dict[str, str]:
-        """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
-        return {}
-
-    def scores_of(self, result: Any, places: Sequence[int]) -> dict[str, float]:
-        """Return scores over some of the evaluated images by name; by default, none.
-
-        Args:
-            result: Value of `metric`.
-            places: Places of the images in the order of the evaluation.
-        """
-        return {}
-
-    def targets(self, batch: Any) -> Tensor:
-        """Return the true labels of an evaluated batch, one item per prediction."""
-        targets: Tensor = batch.target
-        return targets
-
-    def picture(
-        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
-    ) -> RGB | None:
-        """Draw one prediction, for `panels` and loggers; None if the task draws no pictures.
-
-        Args:
-            image: `Panorama` or `Photo`.
-            target: True labels of the image, one item of `targets`.
-            prediction: Prediction for the image, one item of the result of `evaluate`.
-            most_rows: Largest number of rows of the image in the picture; None for all.
-
-        Returns:
-            uint8 RGB ``(H, W, 3)``.
-        """
-        return None
-
-    def report_image(
-        self, name: str, image: Any, target: Tensor, prediction: Tensor
-    ) -> EncodedImage | None:
-        """Return an image for the report's viewer, by default the picture of the prediction.
-
-        Args:
-            name: Name of the image.
-            image: See `picture`.
-            target: See `picture`.
-            prediction: See `picture`.
-        """
-        picture = self.picture(image, target, prediction)
-        return None if picture is None else encode_image(name, picture, 0, sphere=False)
+    def inputs_per_sample(self) -> int:
+        """Number of the network's inputs for a sample of a training step."""
+        return 1
 
     def empty_step(self, channels: int, samples: int) -> Tensor:
         """Return empty inputs of a training step on the device ``meta``, which takes no memory.
@@ -270,17 +147,12 @@ class Task(lightning.LightningModule, ABC):
         example = self.example(channels).to("meta")
         return example.expand(samples * self.inputs_per_sample, *example.shape[1:])
 
-    @property
-    def inputs_per_sample(self) -> int:
-        """Number of the network's inputs for a sample of a training step."""
-        return 1
-
     def training_parts(self, batch: Any) -> list[Part]:
         """Divide a batch into parts, see `chunks`."""
-        inputs, labels = self.training_pairs(batch)
+        inputs, targets = self.training_pairs(batch)
         chunks = self.chunks(inputs)
-        chunk_labels = torch.tensor_split(labels, len(chunks))
-        return [((chunk,), labels) for chunk, labels in zip(chunks, chunk_labels, strict=True)]
+        of_chunks = torch.tensor_split(targets, len(chunks))
+        return [((chunk,), part) for chunk, part in zip(chunks, of_chunks, strict=True)]
 
     def chunks(self, inputs: Tensor) -> tuple[Tensor, ...]:
         """Divide inputs into even chunks of at most `view_batch_size` images, at least one input.
@@ -293,27 +165,10 @@ class Task(lightning.LightningModule, ABC):
         size = max(1, self.view_batch_size // inputs.shape[1:-3].numel())
         return torch.tensor_split(inputs, -(-len(inputs) // size))
 
-    def on_train_start(self) -> None:
-        """Refuse to resume a schedule that was made for another length of training.
-
-        Raises:
-            SettingError: The length has changed.
-        """
-        before, now, schedule = self._trained_length, self._length(), self.schedule
-        if before is None or schedule is None:
-            return
-        unit = schedule.interval
-        if before[unit] == now[unit]:
-            return
-        if schedule.has_length_of_training or schedule.ends_at(before[unit], self.make_optimizer):
-            others = ", trainer.devices and data.…_per_step" * (unit == "step")
-            raise SettingError(
-                f"trainer.max_epochs, trainer.max_steps{others}",
-                found=f"{now[unit]} training {unit}s",
-                expected=f"{before[unit]}, which the schedule of the resumed run was made for",
-                remedy="Resume with the same values. To train for longer, start a new run, with a "
-                "new schedule, from the weights: init_from=<run>/checkpoints/last.ckpt",
-            )
+    def setup(self, stage: str) -> None:
+        """Take settings of the loss from the data before training; a checkpoint contains them."""
+        if stage == "fit" and not self.trainer.ckpt_path:
+            self.head.read_data(self.trainer.datamodule)  # type: ignore[attr-defined]
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
         """Add to the gradient of a step over all chunks, accumulated batches and processes.
@@ -324,11 +179,14 @@ class Task(lightning.LightningModule, ABC):
 
         With `trainer.accumulate_grad_batches`, the gradients are those of the batches so far:
         before another batch is added, they are scaled by the ratio of the old norm to the new one.
+
+        Lightning's manual optimization would be longer: it has no accumulation, gradient clipping
+        or scheduler steps, and exchanges gradients after each part.
         """
         *parts, last = self.training_parts(batch)
         strategy = self.trainer.strategy
         # The mean over processes, because gradients are averaged too.
-        norm: Any = sum(self.loss_norm(labels) for _, labels in (*parts, last))
+        norm: Any = sum(self.head.loss_norm(targets) for _, targets in (*parts, last))
         norm = strategy.reduce(norm, reduce_op="mean").clamp(min=torch.finfo(norm.dtype).tiny)
         if batch_idx % self.trainer.accumulate_grad_batches == 0:
             self.trainer.optimizers[0].zero_grad()
@@ -373,6 +231,9 @@ class Task(lightning.LightningModule, ABC):
         # A value on the CPU: the progress bar reads it every step, and would wait for a GPU.
         self.log("train/loss", loss, prog_bar=True)
 
+    def optimizer_zero_grad(self, *_: Any) -> None:
+        """Do nothing: `training_step` clears the gradients before its first part."""
+
     def train(self, mode: bool = True) -> Self:
         """Switch between training and evaluation; frozen modules stay in evaluation mode."""
         super().train(mode)
@@ -381,35 +242,26 @@ class Task(lightning.LightningModule, ABC):
         return self
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Check the weights, see `check_weights`; store `fresh` and the length of the training."""
-        check_weights(self)
-        checkpoint["length"] = self._length()
+        """Store `fresh`."""
         if self.fresh is not None:
             checkpoint["fresh"] = sorted(self.fresh)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Restore `fresh`, before the optimizer is built, and the length of the training."""
-        length = checkpoint["length"]
-        self._trained_length = {unit: int(length[unit]) for unit in ("step", "epoch")}
+        """Restore `fresh`, before the optimizer is built."""
         fresh = checkpoint.get("fresh")
         self.fresh = None if fresh is None else frozenset(map(str, fresh))
 
-    def optimizer_zero_grad(self, *_: Any) -> None:
-        """Do nothing: `training_step` clears the gradients before its first part."""
+    # Evaluation
 
     @property
     def is_tested(self) -> bool:
         """True during a test, in which no loss is computed."""
         return self._trainer is not None and self._trainer.testing
 
-    def add_validation_loss(self, loss: Tensor, labels: Tensor) -> None:
-        """Add to ``val/loss``, which is normalized like the training loss.
-
-        Args:
-            loss: Sum of losses.
-            labels: Labels that the losses were computed from, see `loss_norm`.
-        """
-        for total, value in zip(self._losses, (loss, self.loss_norm(labels)), strict=True):
+    def add_validation_loss(self, outputs: Tensor, targets: Tensor) -> None:
+        """Add to ``val/loss``, which is normalized like the training loss."""
+        values = self.head.loss_sum(outputs, targets), self.head.loss_norm(targets)
+        for total, value in zip(self._losses, values, strict=True):
             total.update(value)
 
     def validation_step(self, batch: Any, batch_idx: int) -> Tensor:
@@ -419,101 +271,80 @@ class Task(lightning.LightningModule, ABC):
         return predictions
 
     def on_validation_epoch_end(self) -> None:
-        """Log the scores of the validation or test split.
-
-        Raises:
-            SettingError: A score has no heading, or a monitored value is not logged.
-        """
+        """Log the scores of the validation or test split."""
         stage = "test" if self.is_tested else "val"
         self.result, self.evaluated = self.metric.compute(), int(self._counted.compute())
         self.metric.reset()
         self._counted.reset()
-        # A process without images takes part too; a task without a loss logs none.
-        if not self.is_tested and (self._losses[0].update_called or self.trainer.world_size > 1):
+        # A process without images takes part too.
+        if not self.is_tested:
             loss, norm = (total.compute() for total in self._losses)
             self.log("val/loss", loss / norm, sync_dist=True)
             for total in self._losses:
                 total.reset()
-        scores = self.logged_scores(self.result)
-        if scores.keys() - self.columns.keys():
-            name = f"columns of {type(self).__name__}"
-            raise SettingError(name, found=[*self.columns], expected=f"those of {[*scores]}")
+        scores = self.head.scores(self.result)
         # All processes have the same scores, which the mean over processes does not change.
-        for name, score in scores.items():
+        for name, score in scores.means.items():
             key = f"{stage}/{name}"
             self.log(key, score, prog_bar=key == self.monitor, sync_dist=True)
-        of_classes = self.class_scores(self.result)
-        for name, score in of_classes.items():
-            if not math.isnan(score):
-                self.log(f"{stage}_{name}", score, sync_dist=True)
-        if not self.is_tested:
-            self._check_monitors(
-                {*self.trainer.callback_metrics, *(f"val_{n}" for n in of_classes)}
-            )
-
-    def _check_monitors(self, logged: Collection[str]) -> None:
-        """Refuse monitored validation values that are not logged, before a callback reads them."""
-        monitors = [
-            (f"monitor of {type(callback).__name__}", getattr(callback, "monitor", None))
-            for callback in self.trainer.callbacks  # type: ignore[attr-defined]
-            if getattr(callback, "strict", True)
-        ]
-        monitors += [
-            ("scheduler.monitor", config.monitor)
-            for config in self.trainer.lr_scheduler_configs
-            if isinstance(config.scheduler, ReduceLROnPlateau)
-        ]
-        for name, monitor in monitors:
-            if str(monitor).startswith("val") and monitor not in logged:
-                raise SettingError(
-                    name,
-                    found=monitor,
-                    expected=f"one of {', '.join(sorted(logged))}",
-                    remedy="Your own callback can log it in on_validation_epoch_end.",
-                )
+        of_class = next(filter(None, (self.head.columns[n].of_class for n in scores.means)), None)
+        if of_class is not None:
+            values = scores.of_classes[of_class].tolist()
+            names = self.head.class_names[-len(values) :]
+            for name, score in zip(names, values, strict=True):
+                if not math.isnan(score):
+                    self.log(f"{stage}_{of_class}/{name}", score, sync_dist=True)
 
     test_step = validation_step
     on_test_epoch_end = on_validation_epoch_end
 
-    def on_train_epoch_end(self) -> None:
-        """Step `ReduceLROnPlateau` before the checkpoint of the epoch is saved.
+    def evaluation_result(self, noun: str) -> EvaluationResult:
+        """Return the last evaluation.
 
-        Lightning would step it afterwards, so that the checkpoint would not contain the step.
-
-        Raises:
-            SettingError: The monitored value is not logged.
+        Args:
+            noun: Plural name of the images: panoramas, photos, shapes.
         """
-        for config in self.trainer.lr_scheduler_configs:
-            is_due = (self.current_epoch + 1) % config.frequency == 0
-            if not (is_due and isinstance(config.scheduler, ReduceLROnPlateau)):
-                continue
-            logged = self.trainer.callback_metrics
-            if config.monitor not in logged:
-                raise SettingError(
-                    "scheduler.monitor",
-                    found=f"{config.monitor} after epoch {self.current_epoch + 1}",
-                    expected=f"one of {', '.join(logged)}",
-                    remedy="For a score: scheduler.frequency=${trainer.check_val_every_n_epoch}",
-                )
-            config.scheduler.step(logged[str(config.monitor)])
+        return evaluation_result(self.head, self.result, noun, self.evaluated)
 
-    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
-        """Step schedulers as Lightning does, except for `ReduceLROnPlateau`."""
-        if not isinstance(scheduler, ReduceLROnPlateau):
-            super().lr_scheduler_step(scheduler, metric)
+    def picture(
+        self, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+    ) -> RGB | None:
+        """Draw one prediction, for `panels` and loggers; None if the head draws no pictures.
+
+        Args:
+            image: `Panorama` or `Photo`.
+            target: True labels of the image, one item of `true_labels`.
+            prediction: Prediction for the image, one item of the result of `evaluate`.
+            most_rows: Largest number of rows of the image in the picture; None for all.
+        """
+        if not target.ndim:
+            return None
+        truth = self.head.truth(target)
+        shown = shown_arrays(image, truth, prediction, self.representation, most_rows)
+        return self.head.panel(*shown)
+
+    def report_image(
+        self, name: str, image: Any, target: Tensor, prediction: Tensor
+    ) -> EncodedImage:
+        """Return an image with its true and predicted pixels for the report's viewer.
+
+        Args:
+            name: Name of the image.
+            image: See `picture`.
+            target: See `picture`.
+            prediction: See `picture`.
+        """
+        truth, note = self.head.truth(target), self.head.note(prediction, self.head.truth(target))
+        rgb, true, shown = shown_arrays(image, truth, prediction, self.representation, cut=False)
+        count, sphere = len(self.head.class_names), target.ndim == 2
+        return encode_image(
+            name, rgb, count, prediction=shown, truth=true, sphere=sphere, note=note
+        )
+
+    # Optimizer and schedule
 
     def configure_optimizers(self) -> Any:
-        """Build the optimizer, and the scheduler if there is one.
-
-        Raises:
-            SettingError: The schedule ends before the training.
-        """
-        if self.schedule is not None:
-            self.schedule.check_length(self._length())
-        return self.optimization(self._length)
-
-    def optimization(self, length: Callable[[], Mapping[str, int]]) -> Any:
-        """Build optimizer and scheduler for a length of the training, see `Schedule.configure`."""
+        """Build the optimizer, and the scheduler if there is one."""
         factor = self.backbone_lr_factor
         trained = {n: p for n, p in self.network.named_parameters() if p.requires_grad}
         if factor == 1:
@@ -526,32 +357,20 @@ class Task(lightning.LightningModule, ABC):
             group["lr"] *= group_factor
         if self.schedule is None:
             return optimizer
-        configured = self.schedule.configure(optimizer, length, factors, self.monitor, self.mode_of)
-        return {"optimizer": optimizer, "lr_scheduler": configured}
+        built = self.schedule.configure(optimizer, self.trainer, factors, self.monitor, self.head)
+        return {"optimizer": optimizer, "lr_scheduler": built}
 
-    def _length(self) -> dict[str, int]:
-        """Return the planned steps and epochs of the training; −1 without an end."""
-        trainer = self.trainer
-        steps = trainer.estimated_stepping_batches
-        per_epoch = trainer.num_training_batches / trainer.accumulate_grad_batches
-        per_epoch = math.ceil(per_epoch) if math.isfinite(per_epoch) else per_epoch
-        if not math.isfinite(steps):
-            return {"step": -1, "epoch": -1}
-        return {"step": int(steps), "epoch": math.ceil(steps / max(per_epoch, 1))}
+    def on_train_epoch_end(self) -> None:
+        """Step `ReduceLROnPlateau` before the checkpoint of the epoch is saved.
 
-    def checked_scores(self, scores: Any, expected: tuple[int, ...]) -> Tensor:
-        """Return the network's scores if they have the expected shape.
-
-        Raises:
-            SettingError: The scores have another shape.
+        Lightning would step it afterwards, so that the checkpoint would not contain the step.
         """
-        found = tuple(scores.shape) if isinstance(scores, Tensor) else type(scores).__name__
-        if found != expected:
-            raise SettingError(
-                "scores of the network",
-                found=found,
-                expected=expected,
-                remedy="Set network.num_classes to the number of classes, or to null.",
-            )
-        checked: Tensor = scores
-        return checked
+        for config in self.trainer.lr_scheduler_configs:
+            is_due = (self.current_epoch + 1) % config.frequency == 0
+            if is_due and isinstance(config.scheduler, ReduceLROnPlateau):
+                config.scheduler.step(self.trainer.callback_metrics[str(config.monitor)])
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """Step schedulers as Lightning does, except for `ReduceLROnPlateau`."""
+        if not isinstance(scheduler, ReduceLROnPlateau):
+            super().lr_scheduler_step(scheduler, metric)

@@ -1,4 +1,4 @@
-"""Stop a diverged training before its weights or its last good checkpoint are overwritten."""
+"""Stop a diverged training before its weights are changed."""
 
 from __future__ import annotations
 
@@ -23,60 +23,35 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     Raises:
         SettingError: Always.
     """
-    broken = _not_finite(task)
     reason = "from finite images and weights"
     if not batch.images.isfinite().all():
         reason = "from images with NaN or infinite values"
-    elif broken:
+    elif broken := _not_finite(task):
         reason = f"from weights that were not finite before: {_some(broken)}"
     trainer: Any = task.trainer
     names = [trainer.datamodule.source("train").name(k) for k in batch.index.tolist()]
+    half = str(trainer.precision).startswith("16")
+    precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
     raise SettingError(
         f"loss of step {trainer.global_step} (epoch {trainer.current_epoch}, {_some(names)})",
         found=f"{loss}, {reason}",
         expected="a finite number",
-        remedy=_remedy(trainer),
+        remedy=f"Try, in a new run, {precision}a smaller optimizer.lr or "
+        "trainer.gradient_clip_val=1.",
     )
-
-
-def check_weights(task: lightning.LightningModule) -> None:
-    """Refuse to overwrite a good checkpoint with an unusable one.
-
-    Args:
-        task: Task whose weights are to be saved.
-
-    Raises:
-        SettingError: A weight or a running statistic is NaN, or a weight is infinite.
-    """
-    broken = _not_finite(task)
-    if broken:
-        trainer = task.trainer
-        raise SettingError(
-            f"weights after step {trainer.global_step} (epoch {trainer.current_epoch})",
-            found=f"NaN or infinite values in {_some(broken)}",
-            expected="finite numbers; the last checkpoint is kept",
-            remedy=_remedy(trainer),
-        )
 
 
 def _not_finite(task: lightning.LightningModule) -> list[str]:
     """Return the names of tensors with NaN or infinite weights; buffers may hold infinities."""
 
-    def broken(tensor: Tensor) -> bool:
+    def is_broken(tensor: Tensor) -> bool:
         return not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all()
 
     tensors = (*task.named_parameters(), *task.named_buffers())
-    return [name for name, tensor in tensors if broken(tensor)]
+    return [name for name, tensor in tensors if is_broken(tensor)]
 
 
 def _some(names: list[str]) -> str:
     """Return the first names of a list, and the number of the others."""
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _remedy(trainer: lightning.Trainer) -> str:
-    """Return settings to try."""
-    half = str(trainer.precision).startswith("16")
-    precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
-    return f"Try, in a new run, {precision}a smaller optimizer.lr or trainer.gradient_clip_val=1."

@@ -24,31 +24,23 @@ def freeze(network: nn.Module, names: Iterable[str]) -> list[nn.Module]:
         Frozen modules, in evaluation mode, which keeps their batch statistics unchanged.
 
     Raises:
-        SettingError: A part does not exist, or nothing is left to train.
+        SettingError: A part does not exist.
     """
     modules, parameters = dict(network.named_modules()), dict(network.named_parameters())
-    del modules[""]
     frozen = []
     for name in names:
-        if name not in modules and name not in parameters:
-            siblings = [n for n in (*modules, *parameters) if _parent(n) == _parent(name)]
-            examples = ", ".join(siblings or dict(network.named_children()))
+        if name in parameters:
+            parameters[name].requires_grad_(False)
+        elif name and name in modules:
+            frozen.append(modules[name].requires_grad_(False).eval())
+        else:
+            examples = ", ".join(child for child, _ in network.named_children())
             raise SettingError(
                 "task.frozen",
                 found=name or "an empty name",
                 expected=f"modules or parameters, such as {examples}",
             )
-        if name in modules:
-            frozen.append(modules[name].requires_grad_(False).eval())
-        else:
-            parameters[name].requires_grad_(False)
-    if parameters and not any(parameter.requires_grad for parameter in parameters.values()):
-        raise SettingError("task.frozen", found="the whole network", expected="parts of it")
     return frozen
-
-
-def _parent(name: str) -> str:
-    return name.rpartition(".")[0]
 
 
 def groups_of(parameters: Mapping[str, Tensor], fresh: Collection[str]) -> list[dict[str, Any]]:

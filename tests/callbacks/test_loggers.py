@@ -25,11 +25,12 @@ from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
+from tangent_train.heads.pictures import prediction_panel
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.results.pictures import prediction_panel
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.decoded import decoded
 from tests.running import composed_settings
+from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import Shapes, shape_task
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
@@ -60,7 +61,7 @@ def _fit(folder: Path, data: Any, task: Any, *overrides: str) -> None:
 @pytest.fixture(scope="module")
 def trained(
     stanford_root: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[Path, SegmentationTask, Stanford2D3DS]:
+) -> tuple[Path, PixelTask, Stanford2D3DS]:
     """Two epochs of panoramas with all loggers."""
     folder = tmp_path_factory.mktemp("trained")
     # Validation: 3 panoramas of 2 rooms.
@@ -68,7 +69,7 @@ def trained(
     data = Stanford2D3DS(stanford_root, TANGENT, batch_size=2, **split)
     torch.manual_seed(0)
     sgd = partial(torch.optim.SGD, lr=0.1)
-    task = SegmentationTask(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
+    task = segmentation_task(nn.Conv2d(4, 13, 1), TANGENT, data.class_names, sgd)
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("MLFLOW_TRACKING_URI", raising=False)
         _fit(folder, data, task, "logger=many")
@@ -133,7 +134,7 @@ def _without_epochs(scalars: Scalars) -> Scalars:
 
 
 def test_all_loggers_hold_the_same_scalars_and_pictures(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder = trained[0]
     expected, pictures = _of_tensorboard(folder)
@@ -157,7 +158,7 @@ def test_all_loggers_hold_the_same_scalars_and_pictures(
 
 
 def test_hyperparameters_name_and_group_are_logged_once(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder = trained[0]
     run = _of_mlflow(folder)[2]
@@ -170,7 +171,7 @@ def test_hyperparameters_name_and_group_are_logged_once(
 
 
 def test_the_same_images_are_shown_after_every_validation(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     shown, source = _of_tensorboard(folder)[1], data.source("val")
@@ -182,13 +183,13 @@ def test_the_same_images_are_shown_after_every_validation(
         normalization: Any = data.normalization
         inputs = render_inputs(panorama, TANGENT.view_sets()[0], data.inputs)
         images = normalize(inputs, normalization, data.inputs)
-        labels = task.predict_labels(images, (32, 64)).numpy()
+        labels = predict_labels(task, images, (32, 64)).numpy()
         expected = prediction_panel(panorama.rgb, panorama.labels, labels, data.class_names)
         np.testing.assert_array_equal(shown[tag][-1], expected)
 
 
 def test_figures_of_every_class_are_those_of_numpy(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     scalars = _of_csv(folder)
@@ -205,7 +206,7 @@ def test_figures_of_every_class_are_those_of_numpy(
 
 
 def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
-    trained: tuple[Path, SegmentationTask, Stanford2D3DS],
+    trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
     total, norm, source = 0.0, 0.0, data.source("val")
@@ -216,7 +217,7 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
         with torch.no_grad():
             scores = task.network(normalize(inputs, normalization, data.inputs)).double()
         labels = views.render(panorama.labels, "nearest").astype(np.int64)
-        weights = np.insert(task.class_weights.double().numpy(), 0, 0)[labels]
+        weights = np.insert(task.head.class_weights.double().numpy(), 0, 0)[labels]
         chosen = scores.log_softmax(1).gather(1, torch.tensor(labels).clamp(min=1)[:, None] - 1)
         total -= float((chosen[:, 0].numpy() * weights).sum())
         norm += float(weights.sum())
@@ -227,7 +228,7 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     task: Any = shape_task()
     _fit(tmp_path, Shapes(), task, "logger=csv", "validation_images=0")
     scalars = _of_csv(tmp_path)
-    of_classes = [scalars[f"val_accuracy/{name}"] for name in task.class_names]
+    of_classes = [scalars[f"val_accuracy/{name}"] for name in task.head.class_names]
     assert [step for step, _ in of_classes[0]] == VALIDATIONS
     mean = np.mean([values[-1][1] for values in of_classes])
     assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.tasks import SegmentationTask
 from tests.decoded import decoded
+from tests.tasks.builders import segmentation_task
 
 NAMES = ("unknown", "wall", "floor")
 SHAPE = (8, 16)
@@ -37,7 +37,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     panels = PredictionPanels(tmp_path, 4)
     trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
     representation: Any = None
-    task = SegmentationTask(nn.Identity(), representation, NAMES, partial(torch.optim.SGD, lr=1))
+    task = segmentation_task(nn.Identity(), representation, NAMES, partial(torch.optim.SGD, lr=1))
     for first in range(0, 10, 2):
         target = torch.ones((2, *SHAPE), dtype=torch.uint8)
         prediction = target.clone().long()

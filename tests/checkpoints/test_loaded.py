@@ -47,7 +47,7 @@ def test_a_network_computes_what_its_task_does(
     assert not any(module.training for module in trained.network.modules())
     assert trained.image_size == size
     assert (trained.size_multiple, trained.fixed_size) == (multiple, None)
-    assert trained.class_names == task.class_names
+    assert trained.class_names == task.head.class_names
     assert trained.fill == ("edge" if "+data.fill=edge" in overrides else "mean")
     assert trained.level == (5 if "level=5" in overrides else 4)
     assert trained.normalization.channels == 2 + len(trained.inputs)

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from omegaconf import OmegaConf
 
 from tangent_train.cli.render import render
-from tangent_train.files import config_folder
+from tangent_train.config.settings import validate
 from tangent_train.geometry import equirect_directions
 
 Refused = Callable[..., str]
@@ -20,13 +19,8 @@ Refused = Callable[..., str]
 
 def render_with(**settings: Any) -> None:
     """Run the command; other settings have their defaults."""
-    config = OmegaConf.load(config_folder() / "render.yaml")
-    texts = {
-        key: str(value) if isinstance(value, Path) else value for key, value in settings.items()
-    }
-    assert not texts.keys() - set(config)
-    plain: Any = OmegaConf.to_container(OmegaConf.merge(config, texts), resolve=True)
-    render(plain)
+    texts = {name: str(v) if isinstance(v, Path) else v for name, v in settings.items()}
+    render(validate("render", texts))
 
 
 def smooth(height: int = 64) -> NDArray[np.uint8]:

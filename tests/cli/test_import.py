@@ -20,6 +20,7 @@ from models import UNet
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import (
@@ -64,7 +65,9 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255], [110, 90, 110]], np.uint8)
     rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
-    scores = Predictor(trained, PanoramaViews(trained, levels=(7,))).predict(InputImage(rgb))
+    scores = Predictor(trained, head_of(trained), PanoramaViews(trained, levels=(7,))).predict(
+        InputImage(rgb)
+    )
     labels = trained.labels(scores.labels())
     scores_by_hand = rgb / 255 @ WEIGHT.T + BIAS
     expected = (
@@ -90,7 +93,7 @@ def test_a_file_for_images_that_are_not_square(
         run("import", *OF_ONNX, "output=other.onnx", "image_size=[64,65]")
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8)
     rgb = colors[[0, 1, 2, 1]].repeat(32, axis=0)[None].repeat(64, axis=0)
-    mosaic = Predictor(trained, PanoramaViews(trained)).predict(InputImage(rgb))
+    mosaic = Predictor(trained, head_of(trained), PanoramaViews(trained)).predict(InputImage(rgb))
     labels = trained.labels(mosaic.labels())
     expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
     middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks

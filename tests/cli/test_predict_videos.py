@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tangent_train.heads.pictures import colorize_distance
 from tangent_train.io.palette import class_colors
 from tangent_train.io.videos import read_frames
-from tangent_train.results.pictures import colorize_distance
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import hide_start, read_png
 from tests.inference.trained import CLASS_NAMES, sphere, write_depth_checkpoint

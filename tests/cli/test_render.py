@@ -344,7 +344,7 @@ _IN = {"input": "in", "output": "tan"}
             {**_IN, "interpolation": "nearest", "format": "jpg"},
             "found jpg; .* other formats change pix",
         ),
-        ({"input": "in", "back": "tan", "output": "a.png"}, "found input and back; expected"),
+        ({"input": "in", "back": "in", "output": "a.png"}, "found input and back; expected"),
         ({"back": "in", "output": "a.png"}, r"no cameras\.json"),
     ],
 )

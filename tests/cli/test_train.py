@@ -19,7 +19,7 @@ from datamodules import SynthRooms
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import build_callbacks, build_loggers
-from tangent_train.tasks.segmentation import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import Capture, Patch, composed_settings, run_python
 from tests.tasks.shapes import shape_task
@@ -85,9 +85,9 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
     rooms: str, tmp_path: Path, run: Run, monkeypatch: Patch
 ) -> None:
     weights: list[dict[str, torch.Tensor]] = []
-    step = SegmentationTask.training_step
+    step = PixelTask.training_step
 
-    def kept(task: SegmentationTask, *arguments: Any) -> Any:
+    def kept(task: PixelTask, *arguments: Any) -> Any:
         weights.append({n: p.detach().double().clone() for n, p in task.named_parameters()})
         if len(weights) == 4:
             raise CutError
@@ -96,7 +96,7 @@ def test_a_checkpoint_within_an_epoch_holds_the_average_with_its_last_step(
     class CutError(Exception):
         pass
 
-    monkeypatch.setattr(SegmentationTask, "training_step", kept)
+    monkeypatch.setattr(PixelTask, "training_step", kept)
     typed = ("ema=0.7", "checkpoint_every_n_steps=1", "data.batch_size=1")
     with pytest.raises(CutError):
         run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
@@ -154,7 +154,7 @@ def test_an_incomplete_test_leaves_no_results(
     [
         (["+data.rot=x"], "unexpected keyword argument 'rot'|found rot for"),
         (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
-        (["task=classification"], "task: found ClassificationTask, which needs image_class"),
+        (["task=classification"], "task: found a task for image_class"),
         (["data=zind_pairs"], "data: found .*|expected labeled images"),
         (["network._target_=models.Absent"], "Absent"),
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
@@ -176,15 +176,15 @@ def test_an_early_stop_is_at_the_same_epoch_after_a_resume(
     settings += ["logger=csv", "callbacks=early_stopping", "callbacks.early_stopping.patience=3"]
     settings += ["callbacks.early_stopping.min_delta=0.01"]
     run("train", *settings, "hydra.run.dir=whole")
-    start = SegmentationTask.on_train_epoch_start
+    start = PixelTask.on_train_epoch_start
 
-    def interrupt(task: SegmentationTask) -> None:
+    def interrupt(task: PixelTask) -> None:
         if task.current_epoch == 2:
             raise RuntimeError("interrupted")
         start(task)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SegmentationTask, "on_train_epoch_start", interrupt)
+        patch.setattr(PixelTask, "on_train_epoch_start", interrupt)
         with pytest.raises(RuntimeError, match="interrupted"):
             run("train", *settings, "hydra.run.dir=cut")
     for _ in range(2):  # the second time, its training is over

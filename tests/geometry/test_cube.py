@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid, TangentGrid, rotation_about
+from tangent_train.geometry import CubeGrid, rotation_about
 from tests.geometry.directions import random_directions
 
 ROTATION = rotation_about((1, 2, -3), 1.1)
@@ -31,14 +31,6 @@ def test_the_outer_corners_of_the_pixels_are_the_corners_of_the_cube(face: int, 
     first, last = -0.5, dim - 0.5
     expected = [(first, first), (last, first), (first, last), (last, last)]  # column, row
     np.testing.assert_allclose(grid.project(CORNERS[face], face), expected, atol=1e-12)
-
-
-def test_numpy_integers_are_accepted() -> None:
-    grid = CubeGrid(np.int64(9), margin=np.int32(1))  # type: ignore[arg-type]
-    assert (type(grid.dim), grid.pitch) == (int, 2 / 7)
-    for dim in (True, 9.0):
-        with pytest.raises(SettingError, match="dim: "):
-            CubeGrid(dim)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("rotation", [None, ROTATION])
@@ -68,24 +60,3 @@ def test_a_margin_shows_what_is_beyond_the_face() -> None:
     for margin in (-1, 7, 0.5):
         with pytest.raises(SettingError, match=r"margin: found|dim: found 14; expected .* 16 or"):
             CubeGrid(14, margin=margin)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    "grid", [CubeGrid(5, ROTATION.T), CubeGrid(9, ROTATION.T, 2), TangentGrid(0, 4, 20, ROTATION.T)]
-)
-def test_a_rotation_replaces_that_of_the_grid(grid: CubeGrid | TangentGrid) -> None:
-    rotated = grid.with_rotation(ROTATION)
-    assert type(rotated) is type(grid)
-    assert rotated != grid
-    assert rotated.with_rotation(ROTATION.T) == grid
-    plain = grid.with_rotation(None)
-    assert (plain.rotation, plain.dim) == (None, grid.dim)
-    np.testing.assert_allclose(
-        rotated.directions([2]), plain.directions([2]) @ ROTATION.T, atol=1e-14
-    )
-
-
-@pytest.mark.parametrize("dim", [1, -4, 8.0, "8", True])
-def test_impossible_sides_are_refused(dim: int) -> None:
-    with pytest.raises(SettingError, match=r"dim: found .*; expected an integer of 2 or more"):
-        CubeGrid(dim)

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, vertex_resolution
 from tests.rendering import reference
 
@@ -26,9 +25,3 @@ def test_subdivision_is_trimeshs_loop_subdivision(level: int) -> None:
 @pytest.mark.parametrize("level", [-1, 0, 1, 2, 3])
 def test_vertex_resolution_is_the_papers_double_mean(level: int) -> None:
     assert vertex_resolution(level) == pytest.approx(reference.vertex_resolution(level), rel=1e-12)
-
-
-@pytest.mark.parametrize("level", [-1, 9])
-def test_impossible_levels_are_refused(level: int) -> None:
-    with pytest.raises(SettingError, match=f"icosphere level: found {level}; expected 0 to 8"):
-        icosphere(level)

@@ -6,15 +6,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere
 from tangent_train.geometry.icosphere_signals import (
     IcosphereElements,
-    check_signal,
     faces_of_vertices,
     icosphere_count,
     icosphere_directions,
-    icosphere_level,
     locate,
     nearest_vertices,
     sampling_points,
@@ -53,7 +50,6 @@ def test_nearest_vertices_and_faces_around_vertices() -> None:
 @pytest.mark.parametrize("elements", ["vertices", "faces"])
 def test_directions_are_nested(elements: IcosphereElements) -> None:
     coarse, fine = icosphere_directions(2, elements), icosphere_directions(3, elements)
-    assert icosphere_level(len(fine)) == (3, elements)
     assert len(fine) == icosphere_count(3, elements)
     np.testing.assert_allclose(np.linalg.norm(fine, axis=1), 1, rtol=1e-15)
     same = fine[: len(coarse)] if elements == "vertices" else fine[3::4]
@@ -85,18 +81,3 @@ def test_means_over_cells_are_integrals(elements: IcosphereElements) -> None:
     error_of_centers = function(icosphere_directions(1, elements)).T - expected
     # Level 1 is coarse: a rule with one point per triangle has a sixth of the error of one point.
     assert (error**2).mean() < 0.2**2 * (error_of_centers**2).mean()
-
-
-def test_other_inputs_of_a_network_are_refused_with_the_remedy() -> None:
-    check_signal((2, 3, 1, 642), 642)
-    check_signal((2, 3, 1, 320), 320)
-    expected = "expected a signal on the 642 vertices of the icosphere of level 3. Set rep"
-    for shape, found in (
-        ((2, 3, 16, 32), "an image of 32 × 16"),
-        ((2, 3, 1, 643), "an image of 643 × 1"),
-        ((2, 3, 1, 162), "a signal on the 162 vertices of the icosphere of level 2"),
-        ((2, 3, 1, 1280), "a signal on the 1280 faces of the icosphere of level 3"),
-    ):
-        with pytest.raises(SettingError, match=found) as caught:
-            check_signal(shape, 642)
-        assert expected in str(caught.value)

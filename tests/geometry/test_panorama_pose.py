@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation, xyz_to_lonlat
 
 
@@ -42,24 +41,3 @@ def test_relative_poses_are_those_of_homogeneous_matrices(mirrored: bool) -> Non
     np.testing.assert_allclose(rotation, expected[:3, :3], atol=1e-12)
     np.testing.assert_allclose(shift_m, expected[:3, 3], atol=1e-12)
     assert np.linalg.det(rotation) == pytest.approx(1)
-
-
-@pytest.mark.parametrize(
-    ("matrix", "location_m", "message"),
-    [
-        (np.eye(3) * 2, np.zeros(3), "3×3 rotation matrix"),
-        (np.eye(4), np.zeros(3), "3×3 rotation matrix"),
-        (np.eye(3), np.zeros(2), r"location_m: found \[0.0, 0.0\]; expected 3 finite"),
-        (np.eye(3), np.array([0, np.inf, 0]), "expected 3 finite numbers"),
-    ],
-)
-def test_invalid_poses_are_refused(
-    matrix: NDArray[np.float64], location_m: NDArray[np.float64], message: str
-) -> None:
-    with pytest.raises(SettingError, match=message):
-        PanoramaPose(matrix, location_m)
-
-
-def test_relative_poses_need_the_same_world() -> None:
-    with pytest.raises(SettingError, match="same world"):
-        posed(1, mirrored=True).relative_to(posed(1, mirrored=False))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation
-from tangent_train.geometry.equirect import area_mask, check_area
+from tangent_train.geometry.equirect import area_mask
 from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,
@@ -79,7 +79,7 @@ def test_views_see_every_valid_pixel(
     shown = []
     for of_set in sets:
         grid: Any = of_set.grid
-        seen = grid.widened(1).shown(directions)
+        seen = grid.widened(1).insets(directions).T >= -1e-9
         if views.blend == "nearest" or not grid.is_overlapping:
             seen = np.take_along_axis(seen, grid.owners(directions)[:, None], axis=1)
         shown.append(seen.any(axis=1))
@@ -124,9 +124,3 @@ def test_horizontal_views_of_an_area_are_refused_for_more_than_that() -> None:
     for valid in (None, _valid((-180, 180, -60, 30)), _valid(STRIP, 0)):
         with pytest.raises(SettingError, match=r"8 views that miss .* the (area|sphere)"):
             row.view_sets(valid)
-
-
-@pytest.mark.parametrize("angles", [(0, 90, 10), (0, 0, -10, 10), (0, 90, 20, 10), (0, 190, 0, 9)])
-def test_other_angles_are_refused(angles: tuple[float, ...]) -> None:
-    with pytest.raises(SettingError, match="south below north"):
-        check_area(angles)

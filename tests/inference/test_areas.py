@@ -15,14 +15,15 @@ from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
 from datamodules.core.samples import valid_mask
 from tangent_train.config.build import build_from_config
+from tangent_train.geometry.coverage import is_valid
 from tangent_train.geometry.equirect import area_mask
-from tangent_train.geometry.valid_views import is_valid
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks.segmentation import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.inference.trained import (
     CUBE,
@@ -34,6 +35,7 @@ from tests.inference.trained import (
     trained_network,
 )
 from tests.models.sphere_networks import awake, small_context
+from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import quiet_trainer
 
 SGD = functools.partial(torch.optim.SGD, lr=1.0)
@@ -72,13 +74,13 @@ def write_both(root: Path, angles: tuple[float, ...] = AREA) -> tuple[Path, Path
     return root / "whole", root / "part"
 
 
-def _task(kind: str, network: nn.Module | None = None) -> SegmentationTask:
+def _task(kind: str, network: nn.Module | None = None) -> PixelTask:
     made = build_from_config(KINDS[kind], "representation")
     inner = network or color_network(kernel=1)
-    return SegmentationTask(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
+    return segmentation_task(inner, made, ("unknown", "dark", "green", "bright"), SGD).eval()
 
 
-def _data(root: Path, task: SegmentationTask, **settings: Any) -> FolderPanoramas:
+def _data(root: Path, task: PixelTask, **settings: Any) -> FolderPanoramas:
     area = AREA if root.name == "part" else None
     chosen: Any = {"area": area, "fill": "edge", "val_fraction": 0, "seed": 3, **settings}
     return FolderPanoramas(root, task.representation, **chosen)
@@ -92,10 +94,11 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
     for root in write_both(tmp_path):
         task = _task(kind)
         data = _data(root, task, test_rotation=rotation)
-        metric = task.build_metric()
+        metric = task.head.build_metric()
         for plain in data.test_dataloader():
             batch: Any = data.on_after_batch_transfer(plain, 0)
-            predicted = task.predict_labels(
+            predicted = predict_labels(
+                task,
                 batch.images[0],
                 tuple(batch.target[0].shape),
                 batch.rotation[0].numpy(),
@@ -138,7 +141,8 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     zenith = None if up is None else np.array(up) / np.linalg.norm(up)
     data.source("test")._kept = [panorama._replace(up=zenith)] * 2
     batch: Any = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
-    expected = task.predict_labels(
+    expected = predict_labels(
+        task,
         batch.images[0],
         tuple(batch.target[0].shape),
         batch.rotation[0].numpy(),
@@ -150,7 +154,7 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         views = PanoramaViews(trained, None, None, views.blend, 2)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)
-    labels = Predictor(trained, views).predict(image).labels()
+    labels = Predictor(trained, head_of(trained), views).predict(image).labels()
     cut = data.canvas.cut
     assert len(np.unique(cut(labels.numpy()))) > 1
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
@@ -197,7 +201,7 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
         assert batch.images.shape[:2] == (2, len(needed))
         images, labels = task.training_pairs(batch)
         losses.append(
-            float(task.loss_sum((images,), labels).detach()) / float(task.loss_norm(labels))
+            float(task.loss_sum((images,), labels).detach()) / float(task.head.loss_norm(labels))
         )
         weights = data.class_weights("log")
     assert capsys.readouterr().out == "", (

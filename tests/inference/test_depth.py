@@ -28,8 +28,10 @@ from tangent_train.geometry import (
     rotation_about,
 )
 from tangent_train.geometry.equirect import area_mask
+from tangent_train.heads import head_of
+from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.inference.applying import apply
-from tangent_train.inference.depth import DepthPredictor, combine_depth
+from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.network import Network
 from tangent_train.inference.representations import PanoramaViews, PhotoViews, view_settings
@@ -71,6 +73,16 @@ def _true_depth(representation: dict[str, Any], kind: DepthKind) -> list[tuple[A
     return found
 
 
+def _combined(
+    outputs: Any, shape: Any, kind: DepthKind, blend: Any, align: Any = None, **settings: Any
+) -> NDArray[np.float32]:
+    mosaic = AlignedMosaic(shape, kind, blend, align, **settings)
+    for views, depth in outputs:
+        mosaic.add(depth, views)
+    distances: NDArray[np.float32] = mosaic.distances().numpy()
+    return distances
+
+
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
@@ -90,14 +102,14 @@ def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind)
         scaled.append((views, depth + logs if kind == "log_distance" else depth * logs.exp()))
     single = sum(len(views) for views, _ in outputs) == 1
     for blend in ("nearest", "feather"):
-        found = combine_depth(scaled, SHAPE, kind, blend, "scale")
-        assert (found.distance.dtype, found.distance.shape) == (torch.float32, SHAPE)
-        ratio = found.distance.numpy() / _truth()
+        found = _combined(scaled, SHAPE, kind, blend, "scale")
+        assert (found.dtype, found.shape) == (np.float32, SHAPE)
+        ratio = found / _truth()
         np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02 if single else 0.01)
-    plain = combine_depth(scaled, SHAPE, kind, "feather", "none").distance.numpy() / _truth()
+    plain = _combined(scaled, SHAPE, kind, "feather", "none") / _truth()
     assert name in ("equirectangular", "icosphere") or np.ptp(plain / np.median(plain)) > 0.1
     if is_metric(kind):
-        exact = combine_depth(outputs, SHAPE, kind, "feather").distance.numpy()
+        exact = _combined(outputs, SHAPE, kind, "feather")
         np.testing.assert_allclose(exact, _truth(), rtol=0.02)
 
 
@@ -111,9 +123,9 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
         (SHAPE, area_mask((-60, 100, -20, 70), SHAPE)),
         ((32, 64), None),  # fewer pixels than directions
     ):
-        found = combine_depth(outputs, shape, "relative_disparity", "nearest", "none", valid=valid)
+        found = _combined(outputs, shape, "relative_disparity", "nearest", "none", valid=valid)
         inside = np.ones(shape, bool) if valid is None else valid
-        values: Any = found.distance.numpy()[inside]
+        values: Any = found[inside]
         weight = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)[inside]
         assert weight[values < 1].sum() / weight.sum() == pytest.approx(0.5, abs=0.015)
 
@@ -124,7 +136,7 @@ def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
     for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, depth.where(up < 1 / 3, depth / 1e4)))
-    found = combine_depth(outputs, SHAPE, "relative_disparity", "nearest", "none").distance.numpy()
+    found = _combined(outputs, SHAPE, "relative_disparity", "nearest", "none")
     known, weight = (
         np.isfinite(found),
         np.broadcast_to(equirect_solid_angles(SHAPE)[:, None], SHAPE),
@@ -135,9 +147,9 @@ def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
 
     photo, _ = _photo((60, 90), 70)
     trained = depth_network("relative_depth")
-    result = DepthPredictor(trained, PhotoViews(trained)).predict(photo)
-    depth = result.depth(photo.camera_matrix)
-    angle = (depth / result.distance) ** 3
+    result = Predictor(trained, head_of(trained), PhotoViews(trained)).predict(photo)
+    depth = result.pixels()
+    angle = (depth / result.distances()) ** 3
     assert angle[depth < 1].sum() / angle.sum() == pytest.approx(0.5, abs=0.02)
 
 
@@ -147,7 +159,7 @@ def test_the_sky_and_unknown_pixels_are_unknown() -> None:
     for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
         up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
         outputs.append((views, depth.where(up < 0.6, 0).where(up > -0.8, torch.nan)))
-    found = combine_depth(outputs, SHAPE, "relative_disparity", "feather").distance.numpy()
+    found = _combined(outputs, SHAPE, "relative_disparity", "feather")
     heights = equirect_directions(SHAPE)[..., 2]
     assert np.isnan(found[(heights > 0.75) | (heights < -0.92)]).all()
     inside = (heights < 0.45) & (heights > -0.7)
@@ -200,9 +212,10 @@ def test_a_predictor_aligns_what_its_network_scales(kind: DepthKind) -> None:
     shares: list[float] = []
     found = {}
     for align in ("none", None):
-        predictor = DepthPredictor(trained, PanoramaViews(trained), view_batch_size=3, align=align)
+        head = head_of(trained, align=align)
+        predictor = Predictor(trained, head, PanoramaViews(trained), view_batch_size=3)
         result = predictor.predict(image, shares.append)
-        ratio = result.distance.numpy() / _truth()
+        ratio = result.pixels().numpy() / _truth()
         found[align] = np.log(ratio / np.median(ratio)).std()
     assert sum(shares) == pytest.approx(2)
     assert found["none"] > 0.08
@@ -230,8 +243,10 @@ def test_photos_get_z_depth(size: tuple[int, int], fov: float) -> None:
     photo, z_depth = _photo(size, fov)
     trained = depth_network()
     for blend in ("nearest", "feather"):
-        found = DepthPredictor(trained, PhotoViews(trained, blend=blend)).predict(photo)
-        ratio = (found.depth(photo.camera_matrix).numpy() / z_depth)[2:-2, 2:-2]
+        found = Predictor(trained, head_of(trained), PhotoViews(trained, blend=blend)).predict(
+            photo
+        )
+        ratio = (found.pixels().numpy() / z_depth)[2:-2, 2:-2]
         np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.03)
         assert 0.7 < np.median(ratio) < 1.5, "meters remain meters"
 
@@ -312,8 +327,6 @@ def test_networks_name_the_method_that_suits_them(
         loaded(trained, monkeypatch, align="median")
     with pytest.raises(SettingError, match="align: found scale; expected None for networks of cl"):
         loaded(trained_network(TANGENT), monkeypatch, align="scale")
-    with pytest.raises(SettingError, match="align: found scale; expected none: the pan"):
-        loaded(trained, monkeypatch, align="scale", views="erp")
 
 
 # Functions.

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.judge import NetworkJudge
@@ -71,7 +72,7 @@ def test_only_the_image_goes_to_the_device_and_only_labels_come_back(
     trained, image, views = _case(name)
     monkeypatch.setattr(trained.network, "to", lambda *_, **__: trained.network)
     with fake_gpu(trained.network) as transfers:
-        predictor = Predictor(trained, views, "cuda", 3)
+        predictor = Predictor(trained, head_of(trained), views, "cuda", 3)
         transfers.clear()
         labels = predictor.predict(image).labels()
     assert labels.device.type == "cuda"

@@ -24,11 +24,11 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PanoramaViews, PhotoViews
 from tangent_train.rendering import rotate_equirect
-from tangent_train.tasks.segmentation import SegmentationTask
 from tests.inference.trained import (
     CUBE,
     ERP,
@@ -40,6 +40,7 @@ from tests.inference.trained import (
     trained_network,
 )
 from tests.models.sphere_networks import awake, small_context
+from tests.tasks.builders import predict_labels, segmentation_task
 
 SGD = functools.partial(torch.optim.SGD, lr=1.0)
 
@@ -48,7 +49,7 @@ def _labels(
     trained: LoadedNetwork, image: InputImage, per_forward: int | None = None, **settings: Any
 ) -> NDArray[np.unsignedinteger]:
     kind = PanoramaViews if image.camera_matrix is None else PhotoViews
-    predictor = Predictor(trained, kind(trained, **settings), "cpu", per_forward)
+    predictor = Predictor(trained, head_of(trained), kind(trained, **settings), "cpu", per_forward)
     shares: list[float] = []
     scores = predictor.predict(image, shares.append)
     assert sum(shares) == pytest.approx(1)
@@ -64,7 +65,7 @@ def _blocks(height: int, width: int) -> NDArray[np.uint8]:
 def test_images_share_memory_only_one_after_the_other() -> None:
     trained = trained_network(TANGENT)
     bright, dark = _blocks(32, 64), _blocks(32, 64)[::-1].copy()
-    predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
+    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained, blend="feather"))
     first = predictor.predict(InputImage(bright))
     expected = first.probabilities(slice(None)).numpy()
     second = predictor.predict(InputImage(dark))
@@ -84,7 +85,7 @@ def test_memory_of_another_size_or_on_a_disk_is_released(
     if not in_memory:
         monkeypatch.setattr("tangent_train.rendering.numba_sums._IN_MEMORY_BYTES", 0)
     trained = trained_network(TANGENT)
-    predictor = Predictor(trained, PanoramaViews(trained, blend="feather"))
+    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained, blend="feather"))
     first = predictor.predict(InputImage(_blocks(64, 128)))
     kept = weakref.ref(first.sums)
     del first
@@ -130,11 +131,11 @@ def test_labels_are_those_of_an_evaluation(
         root=stanford_root, representation=made, inputs=trained.inputs, fold=1, test_rotation=30
     )
     data.upright = "pose" if upright else None
-    task = SegmentationTask(trained.network, made, trained.class_names, SGD)
+    task = segmentation_task(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
     batch = data.on_after_batch_transfer(batch, 0)
     shape, rotation = tuple(batch.target[0].shape), batch.rotation[0].numpy()
-    expected = task.predict_labels(batch.images[0], shape, rotation).numpy()
+    expected = predict_labels(task, batch.images[0], shape, rotation).numpy()
     read = data.source("test").read(int(batch.index[0]))
     assert (read.up is None) == (upright is None)
     labels = _labels(trained, InputImage(read.rgb, read.depth, read.up), 7, **settings)
@@ -150,14 +151,14 @@ def test_cross_image_attention_is_that_of_an_evaluation(per_forward: int) -> Non
     image, made = InputImage(sphere(32)), build_from_config(TANGENT, "representation")
     trained = trained_network(TANGENT, module=network)
     labels = _labels(trained, image, per_forward)
-    task = SegmentationTask(network, made, trained.class_names, SGD).eval()
+    task = segmentation_task(network, made, trained.class_names, SGD).eval()
     (views,) = made.view_sets()
     rendered = render_inputs(image, views, trained.inputs)
     images = normalize(rendered, trained.normalization, trained.inputs)
-    expected = task.predict_labels(images, (32, 64)).numpy() - 1
+    expected = predict_labels(task, images, (32, 64)).numpy() - 1
     np.testing.assert_array_equal(labels, expected)
     task.sees_rays = False
-    assert (task.predict_labels(images, (32, 64)).numpy() - 1 != expected).any(), "attention"
+    assert (predict_labels(task, images, (32, 64)).numpy() - 1 != expected).any(), "attention"
 
 
 def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> None:
@@ -168,6 +169,9 @@ def test_convolutions_are_sampled_on_the_sphere_if_the_views_ask_for_it() -> Non
     expected = _labels(converted, image)
     np.testing.assert_array_equal(_labels(aware, image), expected)
     assert (_labels(plain, image) != expected).mean() > 0.01
+    area = (-90, 90, -30, 30)
+    assert PanoramaViews(plain).description(area) == "1 view of 64 × 32"
+    assert PanoramaViews(aware).description(area) == "1 view of 64 × 32"
     with pytest.raises(SettingError, match=r"only images of 32 × 32 .* Import the network from"):
         _labels(replace(aware, fixed_size=(32, 32)), image)
 
@@ -223,7 +227,7 @@ def test_pixels_of_low_confidence_are_unknown() -> None:
     groups = [[0], [1], [2]]  # of which the last means nothing
     names = ("unknown", "dark", "green")
     trained = trained_network(TANGENT, class_names=names, groups=groups)
-    predictor = Predictor(trained, PanoramaViews(trained), min_confidence=0.6)
+    predictor = Predictor(trained, head_of(trained, min_confidence=0.6), PanoramaViews(trained))
     scores = predictor.predict(InputImage(sphere(32)))
     probabilities = scores.probabilities(slice(None)).numpy()
     best = probabilities.argmax(axis=-1)
@@ -335,7 +339,7 @@ def test_impossible_settings_are_refused() -> None:
     with pytest.raises(SettingError, match=r"at least 48 × 24 \(width"):
         PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
     with pytest.raises(SettingError, match="device"):
-        Predictor(trained, PanoramaViews(trained), "nonsense")
+        Predictor(trained, head_of(trained), PanoramaViews(trained), "nonsense")
 
 
 @pytest.mark.parametrize(("representation", "size"), [(ICOSPHERE, (1, 2562)), (ERP, (32, 64))])

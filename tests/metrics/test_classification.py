@@ -31,12 +31,6 @@ def test_scores_equal_torchmetrics_over_the_whole_data_set() -> None:
     assert scores.counts.sum() == 38
 
 
-def test_scores_without_images_are_nan() -> None:
-    scores = classification_scores(np.zeros((3, 3), np.int64))
-    assert np.isnan([scores.accuracy, scores.class_accuracy, *scores.of_class]).all()
-    assert scores.counts.tolist() == [0, 0, 0]
-
-
 def test_counts_are_whole_numbers_summed_over_processes() -> None:
     metric = ClassificationMetric(2)
     metric.confmat += 2**24  # float32 cannot count beyond

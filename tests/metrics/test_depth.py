@@ -173,30 +173,15 @@ def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> No
     assert near.facts == {"alignment": "none", "range": "0.1 to 10 m, predictions clipped"}
 
 
-def test_an_alignment_without_anything_to_align_changes_nothing_and_a_constant_gets_the_mean() -> (
-    None
-):
-    truth, constant = torch.tensor([[1.0, 2.0], [3.0, torch.nan]]), torch.full((2, 2), 5.0)
-    unknown = torch.full((2, 2), torch.nan)
-    for alignment in get_args(Alignment):
-        assert DepthProtocol(alignment).aligned(constant, unknown).equal(constant)
-    assert DepthProtocol("affine").aligned(constant, truth).equal(torch.full((2, 2), 2.0))
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
-        ({"alignment": "mean"}, "task.alignment"),
-        ({"alignment_in": "log"}, "task.alignment_in"),
-        ({"min_distance": -1}, "task.min_distance"),
-        ({"min_distance": 2, "max_distance": 2}, "task.max_distance"),
+        ({"alignment": "mean"}, "task.head.alignment"),
+        ({"alignment_in": "log"}, "task.head.alignment_in"),
+        ({"min_distance": -1}, "task.head.min_distance"),
+        ({"min_distance": 2, "max_distance": 2}, "task.head.max_distance"),
     ],
 )
 def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
     with pytest.raises(SettingError, match=named):
         DepthProtocol(**settings)
-
-
-def test_another_shape_is_refused() -> None:
-    with pytest.raises(SettingError, match="prediction"):
-        error_sums(torch.ones(2, 4), torch.ones(4, 8))

@@ -105,5 +105,5 @@ def test_every_parameter_learns_and_another_signal_is_refused() -> None:
     assert all(p.grad is not None and p.grad.abs().sum() > 0 for p in network.parameters())
     names = {name.rpartition(".")[2] for name in network.state_dict()}
     assert names == {"weight", "bias", "running_mean", "running_var", "num_batches_tracked"}
-    with pytest.raises(SettingError, match="vertices of the icosphere of level 3"):
+    with pytest.raises(SettingError, match="a signal of 162 values"):
         network(_signals(3))

@@ -16,7 +16,7 @@ from models import (
     MappedConv,
     Table,
     face_neighbors,
-    gnomonic_taps,
+    gnomonic_points,
     hexagonal_rings,
     mesh_operators,
 )
@@ -60,7 +60,7 @@ def test_parameters_of_the_published_classifier_with_hexagonal_filters() -> None
         (mesh_operators, {"pooling": "mean", "unpooling": "mean"}),
         (hexagonal_rings, {"pooling": "mean", "unpooling": "mean", "normalized_ups": True}),
         (face_neighbors, {"pooling": "max", "unpooling": "repeat"}),
-        (gnomonic_taps, {}),
+        (gnomonic_points, {}),
     ],
 )
 def test_scores_turn_with_the_icosphere_and_every_parameter_learns(
@@ -77,7 +77,7 @@ def test_scores_turn_with_the_icosphere_and_every_parameter_learns(
     network.eval()
     scores = network(signals)
     assert scores.shape == (2, 5, 1, len(directions))
-    if table is not gnomonic_taps:  # their grid at a pole is aligned to longitude 0
+    if table is not gnomonic_points:  # their grid at a pole is aligned to longitude 0
         torch.testing.assert_close(network(signals[..., order]), scores[..., order])
     assert not torch.allclose(network(signals.roll(1, -1)), scores.roll(1, -1))
     network.train()(signals).square().sum().backward()
@@ -127,5 +127,5 @@ def test_settings_and_signals_that_do_not_fit_are_refused() -> None:
     with pytest.raises(SettingError, match=r"unpooling: found zeros; expected repeat .* faces"):
         IcosphereUNet(3, 4, 1, face_neighbors, (4, 4), "max")
     network = IcosphereUNet(3, 4, 1, mesh_operators, (4, 4))
-    with pytest.raises(SettingError, match="expected a signal on the 42 vertices"):
+    with pytest.raises(SettingError, match="expected a signal of 42 values"):
         network(torch.zeros(1, 3, 32, 64))

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from models.mapped import Table
-from models.tables import face_neighbors, gnomonic_taps, hexagonal_rings, mapped_samples
+from models.tables import face_neighbors, gnomonic_points, hexagonal_rings, mapped_samples
 from tangent_train.geometry import icosphere, vertex_resolution
-from tangent_train.geometry.gnomonic_taps import gnomonic_taps_xyz, tangent_axes
+from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz, tangent_axes
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 
-_TABLES = [hexagonal_rings, face_neighbors, gnomonic_taps]
+_TABLES = [hexagonal_rings, face_neighbors, gnomonic_points]
 _POLES = [0, 11]
 
 
@@ -109,11 +109,11 @@ def _some_directions() -> NDArray[np.float64]:
     [
         (mapped_samples(2, _some_directions()), _some_directions()),
         (
-            gnomonic_taps(2),
-            gnomonic_taps_xyz(icosphere_directions(2), 3, np.tan(vertex_resolution(2))),
+            gnomonic_points(2),
+            gnomonic_points_xyz(icosphere_directions(2), 3, np.tan(vertex_resolution(2))),
         ),
     ],
-    ids=["mapped_samples", "gnomonic_taps"],
+    ids=["mapped_samples", "gnomonic_points"],
 )
 def test_taps_interpolate_at_their_directions(table: Table, expected: NDArray[np.float64]) -> None:
     assert (table.outputs, table.taps, table.inputs) == (*expected.shape[:2], 162)

@@ -18,7 +18,6 @@ from tangent_train.orientation.gravity import (
     cues,
     estimate_up,
     up_from_pose,
-    up_probabilities,
     upright_rotation,
 )
 from tangent_train.orientation.manhattan import (
@@ -31,21 +30,6 @@ from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
 
 _NO_SEGMENTS = LineSegments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-
-
-def _lit(from_xyz: NDArray[np.float64]) -> NDArray[np.uint8]:
-    bright = equirect_directions((64, 128)) @ from_xyz > 0
-    return np.repeat(np.where(bright, 220, 40).astype(np.uint8)[..., None], 3, axis=-1)
-
-
-def test_light_comes_from_above() -> None:
-    for axis in range(3):
-        even, odd = cues(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3))
-        np.testing.assert_array_equal(even, 0)
-        np.testing.assert_array_equal(odd[:, :2], 0)
-        # Half of the sphere at 220, half at 40: they differ by two standard deviations.
-        np.testing.assert_allclose(odd[:, 2], 2 * np.eye(3)[axis], atol=0.02)
-        assert up_probabilities(_lit(np.eye(3)[axis]), _NO_SEGMENTS, np.eye(3)).argmax() == axis
 
 
 def test_cues_of_known_segments_have_known_values() -> None:
@@ -108,14 +92,6 @@ def test_frames_of_exact_segments(counts: tuple[int, int, int]) -> None:
     assert frame.significance > 3
 
 
-@pytest.mark.parametrize("count", [4, 200])
-def test_random_segments_are_not_significant(count: int) -> None:
-    for seed in range(5):
-        normals, middles = unit(np.random.default_rng(seed).normal(size=(2, count, 3)))
-        segments = LineSegments(normals, middles, np.linspace(0.1, 0.6, count))
-        assert find_manhattan_frames(segments)[0].significance < 1.8
-
-
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -176,19 +152,6 @@ def test_a_judge_chooses_among_the_axes_of_the_best_frame(
         np.testing.assert_array_equal(estimate_up(room, 180, judge), wanted)
 
 
-def test_the_judge_is_not_called_without_a_choice(monkeypatch: pytest.MonkeyPatch) -> None:
-    def judge(ups: NDArray[np.float64]) -> NDArray[np.float64]:
-        raise AssertionError(ups)
-
-    rotation = _tilted(3, 200, 180)
-    assert angle_deg(_up(draw_room((128, 256), rotation), 60, judge), rotation[:, 2]) < 0.5
-    estimate_up(_without_structure()["black"], 180, judge)
-    certain = np.array([0.001, 0.001, 0.996, 0.001, 0.001, 0])
-    function = "tangent_train.orientation.gravity.up_probabilities"
-    monkeypatch.setattr(function, lambda *_: certain)
-    assert estimate_up(draw_room((128, 256), rotation), 180, judge) is not None
-
-
 def test_no_direction_beyond_the_largest_tilt() -> None:
     assert estimate_up(draw_room((128, 256), _tilted(20, 0, 45)), max_tilt_deg=5) is None
     with pytest.raises(SettingError, match="max_tilt_deg: found 181"):
@@ -235,18 +198,6 @@ def test_the_rotation_is_the_smallest(up: tuple[float, float, float]) -> None:
     assert np.linalg.det(rotation) > 0
     # The angle of a rotation is in its trace; no smaller one moves z that far.
     assert math.isclose(np.trace(rotation), 1 + 2 * direction[2], abs_tol=1e-9)
-
-
-def test_the_poles_have_defined_rotations() -> None:
-    np.testing.assert_array_equal(upright_rotation((0, 0, 2)), np.eye(3))
-    np.testing.assert_allclose(upright_rotation((0, 0, -1)), np.diag([-1.0, 1, -1]), atol=1e-15)
-    np.testing.assert_allclose(upright_rotation((1e-200, 0, 1)), np.eye(3), atol=1e-15)
-
-
-@pytest.mark.parametrize("up", [(0, 0, 0), (0, 1), (math.nan, 0, 1), (math.inf, 0, 1), 3.0])
-def test_invalid_directions_are_refused(up: Any) -> None:
-    with pytest.raises(SettingError, match=r"up: found .*three numbers"):
-        upright_rotation(up)
 
 
 # From the pose

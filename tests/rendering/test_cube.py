@@ -20,9 +20,7 @@ def test_pixels_up_to_the_edge_only_use_their_owner(dim: int, shape: tuple[int, 
     owner = np.rint(panorama).astype(int) - 1
     np.testing.assert_allclose(panorama, owner + 1, atol=1e-5)
     scores = torch.eye(6)[:, :, None, None].expand(6, 6, dim, dim)
-    for kind in (torch.float32, torch.float64):  # compiled and torch
-        labels = tangent_to_labels(scores.to(kind), grid, shape).numpy()
-        np.testing.assert_array_equal(labels, owner)
+    np.testing.assert_array_equal(tangent_to_labels(scores, grid, shape), owner)
     x, y, z = np.moveaxis(equirect_directions(shape), -1, 0)
     coordinates = np.stack([x, y, -x, -y, z, -z])
     owned = np.take_along_axis(coordinates, owner[None], axis=0)[0]

@@ -8,8 +8,6 @@ import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation
 from tangent_train.geometry.icosphere_signals import IcosphereElements
-from tangent_train.inference.applying import apply
-from tangent_train.metrics import SegmentationMetric
 from tangent_train.rendering import (
     Blend,
     Interpolation,
@@ -96,21 +94,3 @@ def test_mosaics_equal_those_on_the_cpu_and_each_other(blend: Blend, averaged: b
         found.append(mosaic.labels().cpu())
     assert (found[1] == found[0]).double().mean() > 0.999
     assert torch.equal(found[1], found[2])
-
-
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_applied_functions_equal_those_on_the_cpu(blend: Blend) -> None:
-    panorama = _random(3, *SHAPE)
-    expected = apply(torch.sin, panorama, GRID, blend)
-    on_gpu = apply(torch.sin, panorama.cuda(), GRID, blend)
-    assert on_gpu.is_cuda
-    torch.testing.assert_close(on_gpu.cpu(), expected)
-
-
-def test_confusion_matrices_equal_those_on_the_cpu() -> None:
-    prediction, truth = (_random(2, *SHAPE).abs() * 2).long().clamp(max=4)
-    on_cpu, on_gpu = SegmentationMetric(5), SegmentationMetric(5).cuda()
-    on_cpu.update(prediction, truth)
-    on_gpu.update(prediction.cuda(), truth.cuda())
-    np.testing.assert_array_equal(on_gpu.compute().bands, on_cpu.compute().bands)
-    np.testing.assert_allclose(on_gpu.compute().solid_angle, on_cpu.compute().solid_angle)

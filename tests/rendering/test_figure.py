@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
 from tangent_train.rendering.figure import tangent_figure
 
@@ -46,18 +42,3 @@ def test_gray_of_16_bits_is_drawn_with_numbers() -> None:
     middles = page[TOP + 4 :].reshape(2, 160, 10, 160, 3)[:, 66:90, :, 66:94]
     assert (middles.max(axis=(1, 3, 4)) == 255).all()
     assert (middles.min(axis=(1, 3, 4)) < 80).all()
-
-
-@pytest.mark.parametrize(
-    ("panorama", "base_level", "message"),
-    [
-        (np.zeros((32, 64), np.float32), 0, "gray or color panorama"),
-        (np.zeros((32, 64, 4), np.uint8), 0, "gray or color panorama"),
-        (np.zeros((32, 64), np.uint8), 4, "base_level: found 4"),
-    ],
-)
-def test_unusable_panoramas_are_refused(
-    panorama: NDArray[Any], base_level: int, message: str
-) -> None:
-    with pytest.raises(SettingError, match=message):
-        tangent_figure(panorama, TangentGrid(base_level, base_level + 4))

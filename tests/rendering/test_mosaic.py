@@ -93,18 +93,6 @@ def test_feathered_probabilities_are_those_of_all_images_at_once(
     assert (_labels(result) == labels).mean() > 0.9995
 
 
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_pixels_without_a_probable_class_are_unsure(blend: Blend) -> None:
-    grid, shape = GRIDS[1]
-    result = _added(ScoreMosaic(shape, 7, blend, min_confidence=0.4), _scores(grid), grid)
-    probabilities = _probabilities(result)
-    best = probabilities.max(axis=-1)
-    decided = abs(best - 0.4) > 1e-6
-    expected = np.where(best < 0.4, 7, probabilities.argmax(axis=-1))
-    assert set(np.unique(expected)) == set(range(8))
-    np.testing.assert_array_equal(_labels(result)[decided], expected[decided])
-
-
 def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() -> None:
     grid, shape = GRIDS[1]
     scores = _scores(grid)

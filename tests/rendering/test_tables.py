@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -12,26 +11,15 @@ import torch
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_directions, random_rotation
 from tangent_train.rendering import (
     equirect_to_tangent,
-    set_table_cache_limit,
     tables,
     tangent_to_equirect,
     tangent_to_labels,
 )
-from tangent_train.rendering.compiled import over_rows
 
 ROTATION = random_rotation(np.random.default_rng(2))
-
-
-@pytest.fixture
-def cache(monkeypatch: pytest.MonkeyPatch) -> tables.TableCache:
-    fresh = tables.TableCache(limit=2**24)
-    monkeypatch.setattr(tables, "TABLES", fresh)
-    monkeypatch.setattr(tables, "_ROTATED", tables.TableCache(limit=2**24))
-    return fresh
 
 
 @pytest.mark.parametrize("base_level", [0, 1, 4])
@@ -89,14 +77,6 @@ def test_tables_are_computed_once(
         render((40, 82))
 
 
-def test_tables_of_rotated_grids_evict_no_others(cache: tables.TableCache) -> None:
-    equirect_to_tangent(np.zeros((32, 64)), TangentGrid(0, 4, rotation=ROTATION))
-    tangent_to_equirect(torch.zeros(20, 1, 16, 16), TangentGrid(0, 4, rotation=ROTATION), (8, 16))
-    assert cache.nbytes == 0 < tables._ROTATED.nbytes
-    set_table_cache_limit(0)
-    assert tables._ROTATED.nbytes == 0
-
-
 def test_the_cache_is_bounded_by_bytes() -> None:
     cache = tables.TableCache(limit=100)
 
@@ -117,17 +97,7 @@ def test_the_cache_is_bounded_by_bytes() -> None:
     assert cache.nbytes == 80
 
 
-def test_the_limit_can_be_set(cache: tables.TableCache) -> None:
-    set_table_cache_limit(50_000)
-    equirect_to_tangent(np.zeros((64, 128), np.float32), TangentGrid(0, 5), range(8))
-    assert 0 < cache.nbytes <= 50_000
-    set_table_cache_limit(0)
-    assert cache.nbytes == 0
-    with pytest.raises(SettingError, match="cache limit"):
-        set_table_cache_limit(-1)
-
-
-def test_threads_may_render_at_the_same_time(cache: tables.TableCache) -> None:
+def test_threads_may_render_at_the_same_time() -> None:
     grid, shape = TangentGrid(0, 5), (256, 512)
     scores = np.random.default_rng(0).random((20, 5, 32, 32), np.float32)
     with ThreadPoolExecutor(4) as pool:
@@ -149,43 +119,3 @@ def test_forked_workers_render_after_their_parent() -> None:
     loader: Any = DataLoader([0], batch_size=None, collate_fn=render, timeout=60, **forked)  # type: ignore[arg-type]
     for in_parent, in_worker in zip(expected, next(iter(loader)), strict=True):
         np.testing.assert_array_equal(in_parent, in_worker)
-
-
-@pytest.mark.parametrize("threads", [1, 3])
-def test_rows_are_covered_once_and_errors_surface(
-    monkeypatch: pytest.MonkeyPatch, threads: int
-) -> None:
-    monkeypatch.setattr("torch.get_num_threads", lambda: threads)
-    blocks: list[tuple[int, int]] = []
-    over_rows(lambda *rows: blocks.append(rows), 1000, 1000)
-    assert len(blocks) == (1 if threads == 1 else 8 * threads)
-    covered = [row for start, stop in sorted(blocks) for row in range(start, stop)]
-    assert covered == list(range(1000))
-
-    def fail(start: int, stop: int) -> None:
-        raise ValueError(start, stop)
-
-    with pytest.raises(ValueError, match="0"):
-        over_rows(fail, 1000, 1000)
-
-
-def test_threads_do_not_exceed_the_limit_of_the_cache(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Dropping is slow here: without a lock, tables are added while others count."""
-    count = tables._nbytes
-
-    def slowly(table: tuple[Any, ...]) -> int:
-        time.sleep(1e-4)
-        return count(table)
-
-    monkeypatch.setattr(tables, "_nbytes", slowly)
-    cache = tables.TableCache(10 * 8)
-    table = (np.zeros(1),)
-
-    def use(first: int) -> None:
-        for key in range(first, first + 60):
-            cache.get(key % 40, lambda: table)
-            assert cache.nbytes <= 80
-
-    with ThreadPoolExecutor(8) as pool:
-        list(pool.map(use, range(0, 80, 10)))
-    assert cache.nbytes == 8 * len(cache._tables) <= 80

@@ -31,8 +31,8 @@ def _photo(blend: Blend) -> Any:
     return [sampler.cover(0.3 if blend == "feather" else 0.0)]
 
 
+RINGS: Any = [{"pitch": pitch, "views": 6} for pitch in (0, 45, -45)]
 SETS: dict[str, tuple[Callable[[Blend], Any], tuple[int, int]]] = {
-    "tangent": (lambda _: TangentRepresentation(1, 6).view_sets(), (128, 256)),
     "odd size": (lambda _: TangentRepresentation(0, 5).view_sets(), (61, 123)),
     "cropped, tilted": (
         lambda _: TangentRepresentation(1, 6, crop_multiple=1).with_rotation(TILT).view_sets(),
@@ -43,22 +43,8 @@ SETS: dict[str, tuple[Callable[[Blend], Any], tuple[int, int]]] = {
         (64, 128),
     ),
     "cube": (lambda _: CubemapRepresentation(6).view_sets(), (128, 256)),
-    "cube with a margin": (
-        lambda _: CubemapRepresentation(5, margin=7).with_rotation(TILT).view_sets(),
-        (70, 140),
-    ),
     "rings": (
-        lambda blend: (
-            HorizontalRepresentation(
-                5,
-                [{"pitch": k, "views": 6} for k in (0, 45, -45)],
-                (90, 80),
-                blend=blend,
-                rotations=2,
-            )
-            .with_rotation(TILT)
-            .view_sets()
-        ),
+        lambda blend: HorizontalRepresentation(5, RINGS, (90, 80), blend=blend).view_sets(),
         (70, 140),
     ),
     "equirectangular": (
@@ -148,16 +134,3 @@ def test_nothing_leaves_the_device(name: str, blend: Blend) -> None:
             labels = _filled(ScoreMosaic(shape, 4, **how), sets, on_device).labels()
         assert labels.device.type == "cuda"
         assert set(transfers) <= {"from {'cpu'} to {'cuda'}"}
-
-
-@pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_images_without_pixels_change_nothing(blend: Blend) -> None:
-    (views,) = TangentRepresentation(0, 4).view_sets()
-    mosaic = ScoreMosaic((16, 32), 3, blend, averaged=True, backend="torch")
-    mosaic.add(torch.ones(0, 3, 16, 16), views[:0])
-    assert not mosaic.probabilities(slice(None)).any()
-
-
-def test_sums_that_are_too_large_are_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch_sums, "_BYTES", 64 * 128 * 4 * 4 - 1)
-    assert ScoreMosaic((64, 128), 4, "feather", device="cuda").labels().device.type == "cpu"

@@ -9,9 +9,9 @@ from typing import Any
 
 from omegaconf import OmegaConf
 
+from tangent_train.heads import ClassesHead
 from tangent_train.results.evaluation_result import EvaluationResult, flat_settings
 from tangent_train.results.published import facts
-from tangent_train.tasks import SegmentationTask
 
 NAMES = ("wall", "floor", "sofa")
 BANDS = ((45.0, 90.0), (-90.0, 45.0))
@@ -55,7 +55,7 @@ def example_result(
         OmegaConf.update(config, name.replace("__", "."), value)
     flat = flat_settings(OmegaConf.to_container(config))  # type: ignore[arg-type]
     present = [value for value in scores if value is not None]
-    columns, mean = SegmentationTask.columns, sum(present) / len(present)
+    columns, mean = ClassesHead.columns, sum(present) / len(present)
     of_class = [column.of_class for column in columns.values()]
     return EvaluationResult(
         "panoramas",

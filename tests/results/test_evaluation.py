@@ -22,7 +22,7 @@ from tangent_train.results.evaluation import (
     write_results,
 )
 from tangent_train.results.evaluation_result import EvaluationResult
-from tangent_train.tasks import SegmentationTask
+from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import shape_task
 
 NAMES = ("unknown", "wall", "floor", "=sofa")
@@ -46,15 +46,17 @@ def _record(
     counts: SegmentationCounts | None = None, absent: Any = "skip", noun: str = "panoramas"
 ) -> EvaluationResult:
     """The record of seven images."""
-    task = SegmentationTask(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
+    task = segmentation_task(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
     task.evaluated = 7
-    return task.evaluation_result(counts or _matrices(), noun)
+    task.result = counts or _matrices()
+    return task.evaluation_result(noun)
 
 
 def _record_of_shapes() -> EvaluationResult:
     task = shape_task(nn.Identity(), SHAPES)
     task.evaluated = 16
-    return task.evaluation_result(SHAPE_MATRIX, "shapes")
+    task.result = SHAPE_MATRIX
+    return task.evaluation_result("shapes")
 
 
 def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:

@@ -6,13 +6,13 @@ import torch
 
 from datamodules.core.panoramas import Panorama
 from tangent_train.geometry.equirect import area_mask
-from tangent_train.io.palette import class_colors
-from tangent_train.results.pictures import (
+from tangent_train.heads.pictures import (
     colorize,
     mixed_picture,
     prediction_panel,
     shown_arrays,
 )
+from tangent_train.io.palette import class_colors
 
 NAMES = ("unknown", "wall", "floor", "sofa")
 

@@ -11,12 +11,12 @@ import pytest
 from datamodules.folder.classes import read_classes
 from datamodules.folder.reader import class_masks
 from tangent_train.geometry import camera_matrix_from_fov
+from tangent_train.heads import ClassesHead, PredictedImage
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import area_of_angles, whole_area
 from tangent_train.io.image_files import short_names
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.results.label_results import LabelResults, class_shares
-from tangent_train.results.predictions import PredictedImage, PredictionFolder
+from tangent_train.results.predictions import PredictionFolder
 
 NAMES = ("unknown", "up", "down")
 
@@ -47,7 +47,7 @@ def test_names_are_relative_to_a_folder(tmp_path: Path) -> None:
 def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
     """By data=folder and mask_classes=: they had kept the last of its labels."""
     names = ("unknown", "door", "wall", "door", "u\u0308", "unknown", "Wall", "ü")
-    PredictionFolder(tmp_path, LabelResults(names), ["labels"]).write_summary({}, [])
+    PredictionFolder(tmp_path, ClassesHead(names), ["labels"]).write_summary({}, [])
     labels = np.array([list(range(8))] * 4, np.uint8)
     write_pixels(tmp_path / "labels" / "a.png", labels)
     classes = read_classes(tmp_path / "classes.json")
@@ -66,7 +66,7 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
     cap = (1 - math.sin(math.pi / 3)) / 2
     area = area_of_angles((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
     image = InputImage(np.zeros((180, 360, 3), np.uint8), area=area)
-    shares = class_shares(PredictedImage(image, labels), NAMES)
+    shares = ClassesHead(NAMES).summarize(PredictedImage(image, labels), np.array(True))
     assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})
 
 
@@ -83,6 +83,5 @@ def test_pixels_of_photos_count_by_their_solid_angle() -> None:
         return math.atan(x * y / math.sqrt(1 + x * x + y * y))
 
     part = 2 * (quarter(1, 1) - quarter(0.5, 1)) / (4 * quarter(1, 1))
-    assert class_shares(PredictedImage(image, labels), NAMES)["down"] == pytest.approx(
-        part, rel=1e-3
-    )
+    shares = ClassesHead(NAMES).summarize(PredictedImage(image, labels), np.array(True))
+    assert shares["down"] == pytest.approx(part, rel=1e-3)

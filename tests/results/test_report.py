@@ -13,6 +13,7 @@ from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
 from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
+from tangent_train.heads import DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation_result import EvaluationResult, load_result
 from tangent_train.results.published import (
@@ -23,7 +24,6 @@ from tangent_train.results.published import (
 )
 from tangent_train.results.report import Report, levels_report, runs_report, transfer_report
 from tangent_train.results.rows import RunRow
-from tangent_train.tasks import ClassificationTask, DepthTask
 from tests.decoded import decoded
 from tests.results.example_results import PROTOCOL, example_result, without_solid_angle
 
@@ -208,7 +208,7 @@ def test_reports_of_shapes_have_the_published_scores_of_the_same_rotation() -> N
     settings = {"data._target_": "datamodules.ModelNet40", "level": 5, "name": "shapes"}
     settings["representation.base_level"] = 0
     scores = {"accuracy": 0.8, "class_accuracy": 0.7}
-    columns = ClassificationTask.columns
+    columns = ImageClassHead.columns
     result = EvaluationResult("shapes", 120, columns, scores, classes, settings=settings)
     aligned = replace(result, protocol=facts("paper_modelnet40"))
     rotated = replace(result, protocol={**aligned.protocol, "test_rotation": "so3"})
@@ -244,7 +244,7 @@ def test_the_chart_shows_a_bar_of_the_right_height() -> None:
 
 def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> None:
     """Depth: no classes, no published scores of the data set, and smaller errors are better."""
-    columns = DepthTask.columns
+    columns = DistanceHead.columns
     means = dict.fromkeys(columns, 0.25)
     protocol = {"data": "Stanford2D3DS", "alignment": "none"}
     settings = {"name": "mine", "seed": 0, "level": 6, "data": {"fold": 1}}

@@ -22,9 +22,9 @@ from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
+from tangent_train.heads import ClassesHead
 from tangent_train.io.image_files import short_names
 from tangent_train.io.pixel_files import read_array, write_pixels
-from tangent_train.results.label_results import LabelResults
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
@@ -104,8 +104,8 @@ _PARTS = st.text(st.characters(exclude_characters="/\0", codec="utf-8"), min_siz
 @example([["..x"], ["...", "x"]])
 def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
     paths = [Path("images", *parts) for parts in names]
-    results = LabelResults(("unknown", "wall"))
-    folder = PredictionFolder(Path("/output"), results, ("labels", "probabilities"))
+    head = ClassesHead(("unknown", "wall"))
+    folder = PredictionFolder(Path("/output"), head, ("labels", "probabilities"))
     for name in short_names(paths):
         for file in folder.files(name).values():
             assert file.is_relative_to("/output")

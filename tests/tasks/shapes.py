@@ -12,8 +12,10 @@ from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from datamodules.modelnet40.shape_samples import ShapeSample
+from tangent_train.heads import ImageClassHead
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks import ClassificationTask
+from tangent_train.tasks import ShapeTask
+from tests.tasks.builders import build_head
 
 NAMES = ("bottle", "chair", "mug")
 TANGENT = TangentRepresentation(base_level=0, level=4)
@@ -76,11 +78,12 @@ class SmallNetwork(nn.Module):
 
 def shape_task(
     network: nn.Module | None = None, names: Sequence[str] = NAMES, **settings: Any
-) -> ClassificationTask:
+) -> ShapeTask:
     """A task on shapes; the same small network at every call."""
     torch.manual_seed(0)
     optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))
-    return ClassificationTask(network or SmallNetwork(), TANGENT, names, optimizer, **settings)
+    head = build_head(ImageClassHead, names, settings)
+    return ShapeTask(network or SmallNetwork(), TANGENT, head, optimizer, **settings)
 
 
 class Gradients(lightning.Callback):

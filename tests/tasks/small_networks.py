@@ -13,7 +13,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.loaded import LoadedNetwork, declared_sizes
 from tangent_train.cli.run import Run, build
 from tangent_train.config.build import build_from_config
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.inference.trained import TANGENT, trained_network
 from tests.running import composed_settings
 
@@ -53,7 +53,7 @@ def small_trained(
     )
 
 
-def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
+def save_checkpoint(path: Path, *overrides: str) -> PixelTask:
     """Write the checkpoint of a run, without entries of Lightning.
 
     Args:
@@ -70,5 +70,5 @@ def save_checkpoint(path: Path, *overrides: str) -> SegmentationTask:
     run = Run(path.parent, settings, data, task)
     content = run.contents()
     torch.save(content | {"state_dict": task.state_dict()}, path)
-    trained: SegmentationTask = task.eval()
+    trained: PixelTask = task.eval()
     return trained

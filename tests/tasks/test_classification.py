@@ -6,7 +6,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
 from tests.tasks.shapes import Shapes, gradients_of, quiet_trainer, shape_task
 
 
@@ -43,13 +42,6 @@ class Oracle(nn.Module):
     def forward(self, images: Tensor) -> Tensor:
         brightest = images.mean(dim=(1, 3, 4)).argmax(dim=1)
         return functional.one_hot(brightest % 2, 3).float()
-
-
-def test_a_score_without_a_heading_is_refused_at_the_first_validation() -> None:
-    task = shape_task(Oracle())
-    task.columns = {"accuracy": task.columns["accuracy"]}  # type: ignore[misc]
-    with pytest.raises(SettingError, match=r"columns of ClassificationTask: found .*class_acc"):
-        quiet_trainer().validate(task, datamodule=Shapes(3), verbose=False)
 
 
 def test_every_shape_is_counted_once_in_integers() -> None:

@@ -13,7 +13,8 @@ from torch import Tensor, nn
 
 from models import UNet
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
+from tests.tasks.builders import predict_labels, segmentation_task
 from tests.tasks.shapes import quiet_trainer
 from tests.tasks.test_segmentation import NAMES, Data
 
@@ -32,14 +33,14 @@ def _without_tf32(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
 
 
-def _task(**settings: Any) -> SegmentationTask:
+def _task(**settings: Any) -> PixelTask:
     torch.manual_seed(0)
     representation = TangentRepresentation(base_level=0, level=4)
     optimizer = partial(torch.optim.SGD, lr=0.1)
-    return SegmentationTask(UNet(2, 2, [4, 8]), representation, NAMES, optimizer, **settings)
+    return segmentation_task(UNet(2, 2, [4, 8]), representation, NAMES, optimizer, **settings)
 
 
-def _trained(accelerator: str, **settings: Any) -> SegmentationTask:
+def _trained(accelerator: str, **settings: Any) -> PixelTask:
     task, data = _task(view_batch_size=17), Data()
     quiet = {"max_steps": 2, "max_epochs": 2, "limit_val_batches": 0, "devices": 1}
     trainer = quiet_trainer(accelerator=accelerator, **quiet, **settings)
@@ -81,6 +82,6 @@ def test_cuda_graphs_in_evaluation(monkeypatch: pytest.MonkeyPatch) -> None:
     images = torch.randn(20, 2, 16, 16, device="cuda")
     plain = _task(eval_view_batch_size=5).cuda().eval()
     graphs = _task(eval_view_batch_size=5, compile={"mode": "reduce-overhead"}).cuda().eval()
-    labels = [task.predict_labels(images, (32, 64)) for task in (plain, graphs, graphs)]
+    labels = [predict_labels(task, images, (32, 64)) for task in (plain, graphs, graphs)]
     for found in labels[1:]:
         assert (found == labels[0]).double().mean() > 0.99

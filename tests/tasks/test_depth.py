@@ -13,14 +13,15 @@ from torch import Tensor, nn
 
 from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
-from tangent_train.checkpoints.distances import DistanceNetwork, from_distance, is_metric
+from tangent_train.checkpoints.distances import from_distance, is_metric
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.results.evaluation import result_tables
-from tangent_train.tasks import DepthTask
+from tangent_train.tasks import PixelTask
+from tests.tasks.builders import depth_task
 from tests.tasks.shapes import Spheres, gradients_of, quiet_trainer
 from tests.tasks.test_segmentation import WHOLE
 
@@ -81,11 +82,11 @@ class Right(nn.Module):
         return scale * depth + shift
 
 
-def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> DepthTask:
-    kind: Any = getattr(network, "kind", "log_distance")
+def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> PixelTask:
+    kind: Any = settings.setdefault("depth_kind", getattr(network, "kind", "log_distance"))
     settings = {"alignment": "none" if is_metric(kind) else "affine"} | settings
     optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))
-    return DepthTask(network, representation, (), optimizer, **settings)
+    return depth_task(network, representation, optimizer, **settings)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -95,23 +96,23 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     (batch,) = data.train_dataloader()
     images, truth = task.training_pairs(batch)
     near = (batch.labels > 0) & (batch.labels <= 5 * 512)
-    assert task.loss_norm(truth).item() == int(near.sum())
+    assert task.head.loss_norm(truth).item() == int(near.sum())
     assert task.loss_sum((images,), truth) / near.sum() == pytest.approx(0, abs=2e-5)
     (scores,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
     assert scores["val/loss"] == pytest.approx(0, abs=2e-5)
     counts = [int(((s.target > 0) & (s.target <= 5 * 512)).sum()) for s in data.test]
     assert task.result[:, 0, 0].tolist() == counts
-    assert task.facts["range"] == "0 to 5 m"
+    assert task.head.facts["range"] == "0 to 5 m"
     # Pixels at the borders of the blocks are interpolated.
     assert scores["val/absrel"] < 0.09
     assert scores["val/delta1"] > 0.9
     assert scores["val/missing"] == 0
-    record = task.evaluation_result(task.result, "panoramas")
+    record = task.evaluation_result("panoramas")
     assert next(band["latitude_deg"] for band in record.latitude_bands) == [60, 90]
-    assert record.intervals.keys() == record.scores.keys() == task.columns.keys()
-    assert task.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
+    assert record.intervals.keys() == record.scores.keys() == task.head.columns.keys()
+    assert task.head.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
     with_unknown = np.concatenate([task.result, np.zeros_like(task.result[:1])])
-    assert task.scores_of(with_unknown, [3]).keys() == record.scores.keys()
+    assert task.head.scores_of(with_unknown, [3]).keys() == record.scores.keys()
     if is_metric(kind):
         images[:, 0] += np.log(1.1)
         loss = task.loss_sum((images,), truth) / near.sum()
@@ -139,9 +140,10 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     task = _task(Right(kind, lengths), representation)
     torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
     result, task.evaluated = task.metric.compute(), 1
-    assert task.logged_scores(result)["absrel"] < 1e-3
-    assert "views_aligned" not in task.facts
-    (table,) = result_tables(task.evaluation_result(result, "photos"))
+    assert task.head.scores(result).means["absrel"] < 1e-3
+    assert "views_aligned" not in task.head.facts
+    task.result = result
+    (table,) = result_tables(task.evaluation_result("photos"))
     assert not any("solid angle" in name for name, _ in table.rows)
 
 
@@ -155,15 +157,15 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
     errors = {}
     for align in (None, "scale", "none"):
         task = _task(Scaled(), align=align, alignment="median")
-        assert "views_aligned" not in task.facts
+        assert "views_aligned" not in task.head.facts
         (scores,) = quiet_trainer().test(task, datamodule=Data(), verbose=False)
         errors[align] = scores["test/absrel"]
-        assert task.facts["views_aligned"] == (align or "scale")
+        assert task.head.facts["views_aligned"] == (align or "scale")
     assert errors[None] == errors["scale"] < 0.1 < 0.2 < errors["none"]
 
 
 def test_the_report_has_no_score_of_an_image_without_true_distances() -> None:
-    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), area=None)
+    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), valid=None)
     steps = torch.zeros(8, 16, dtype=torch.int32)
     for target, note in ((steps, ""), (steps + 1024, "AbsRel 0.5")):
         found = _task(nn.Identity()).report_image("a", image, target, torch.ones(8, 16))
@@ -185,7 +187,7 @@ def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
     settings = {"loss": loss, "depth_kind": kind, "alignment": "affine"}
     network, task = _network(), _task(nn.Identity(), **settings)
     images, truth = task.training_pairs(next(iter(Data().train_dataloader())))
-    errors = task.errors(network(images), truth)
+    errors = task.head.errors(network(images), truth)
     known = ~errors.isnan()
     if loss == "log_l1":
         mean = errors[known].abs().mean()
@@ -213,17 +215,10 @@ def test_the_auxiliary_head_adds_its_loss() -> None:
 @pytest.mark.parametrize(
     ("network", "settings", "named"),
     [
-        (Right("relative_depth"), {"alignment": "none"}, "task.alignment.*relative_depth"),
-        (
-            DistanceNetwork(Right("metric_z"), "metric_z"),
-            {"depth_kind": "log_distance"},
-            "metric_z",
-        ),
-        (nn.Identity(), {"depth_kind": "depth"}, "task.depth_kind"),
-        (nn.Identity(), {"loss": "l2"}, "task.loss"),
-        (nn.Identity(), {"align": "median"}, "task.align"),
-        (nn.Identity(), {"scale_invariance": 1.5}, "task.scale_invariance"),
-        (nn.Identity(), {"label_smoothing": 0.1}, "task.label_smoothing"),
+        (Right("relative_depth"), {"alignment": "none"}, "task.head.alignment.*relative_depth"),
+        (nn.Identity(), {"depth_kind": "depth"}, "task.head.depth_kind"),
+        (nn.Identity(), {"loss": "l2"}, "task.head.loss"),
+        (nn.Identity(), {"align": "median"}, "align"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(

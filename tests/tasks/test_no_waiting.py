@@ -11,17 +11,18 @@ from torch import nn
 from datamodules.core.inputs import RGBD_NORMALIZATION, normalize
 from models import AuxiliaryHead, UNet
 from tangent_train.rendering import Blend, TangentRepresentation
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
 from tests.fake_gpu import fake_gpu
 from tests.models.sphere_networks import STAGE, small_context
+from tests.tasks.builders import predict_labels, segmentation_task
 
 SHAPE = (64, 128)
 
 
-def _segmentation(network: nn.Module, blend: Blend = "nearest") -> SegmentationTask:
+def _segmentation(network: nn.Module, blend: Blend = "nearest") -> PixelTask:
     representation = TangentRepresentation(base_level=0, level=5, blend=blend)
     names = ("unknown", *"abcd")
-    return SegmentationTask(network, representation, names, partial(torch.optim.SGD, lr=0.1))
+    return segmentation_task(network, representation, names, partial(torch.optim.SGD, lr=0.1))
 
 
 def _unet() -> nn.Module:
@@ -40,7 +41,7 @@ def test_a_training_step_neither_copies_nor_waits(network: nn.Module) -> None:
         depth, labels = views[..., 0].to(torch.int16), views[..., 0].flatten(0, 1)
         images = normalize((views, depth), RGBD_NORMALIZATION, ("rgb", "depth")).flatten(0, 1)
         inputs = (images, torch.empty(2, 5, 3, 3)) if task.sees_rays else (images,)
-        loss = task.loss_sum(inputs, labels) / task.loss_norm(labels)
+        loss = task.loss_sum(inputs, labels) / task.head.loss_norm(labels)
     assert (loss.device.type, transfers) == ("cuda", [])
 
 
@@ -49,6 +50,6 @@ def test_an_evaluation_copies_nothing_back(blend: Blend) -> None:
     """Only tables of the geometry are copied to the GPU."""
     task = _segmentation(_unet(), blend).eval()
     with fake_gpu(task) as transfers:
-        labels = task.predict_labels(torch.empty(20, 4, 32, 32), SHAPE)
+        labels = predict_labels(task, torch.empty(20, 4, 32, 32), SHAPE)
     assert (labels.device.type, tuple(labels.shape)) == ("cuda", SHAPE)
     assert set(transfers) <= {"from {'cpu'} to {'cuda'}"}

@@ -50,9 +50,7 @@ def test_frozen_parts_stay_as_they_are(optimizer: Any) -> None:
     ("names", "message"),
     [
         (["enc"], r"task\.frozen: found enc; .* such as encoder, neck, head"),
-        (["encoder.7"], r"found encoder\.7; .* such as encoder\.0, encoder\.1, encoder\.2"),
         ([""], "found an empty name"),
-        (["encoder", "neck", "head"], "found the whole network"),
     ],
 )
 def test_impossible_frozen_parts_are_refused(names: list[str], message: str) -> None:
@@ -110,9 +108,3 @@ def test_schedules_move_both_rates_by_epoch_or_over_the_whole_training(
     assert seen[1][-1] == [pytest.approx(last, rel=0.1)]
     for (whole,), rates in zip(seen[1], seen[0.1], strict=True):
         assert rates == pytest.approx([0.1 * whole, whole])
-
-
-@pytest.mark.parametrize("factor", [0, -1, float("inf"), "small"])
-def test_impossible_factors_are_refused(factor: Any) -> None:
-    with pytest.raises(SettingError, match=r"task\.backbone_lr_factor: .*task\.frozen"):
-        shape_task(backbone_lr_factor=factor)

@@ -15,7 +15,8 @@ from torch import Tensor, nn
 from torch.distributed.algorithms.ddp_comm_hooks import default_hooks
 from torch.nn.functional import cross_entropy
 
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
+from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import gradients_of
 from tests.tasks.test_segmentation import NAMES, TANGENT, WEIGHTS, Data
 
@@ -29,8 +30,8 @@ def _network() -> nn.Module:
     )
 
 
-def _task(view_batch_size: int | None = None, **settings: Any) -> SegmentationTask:
-    return SegmentationTask(
+def _task(view_batch_size: int | None = None, **settings: Any) -> PixelTask:
+    return segmentation_task(
         _network(),
         TANGENT,
         NAMES,

@@ -6,19 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid
 from tangent_train.geometry.coverage import check_coverage
 from tangent_train.geometry.equirect import area_mask, check_area
-from tangent_train.geometry.horizontal import checked_rings, half_extents
+from tangent_train.geometry.horizontal import half_extents
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
 from tangent_train.rendering.representations.views import (
     STRIDE,
-    PinholeViews,
     RotationAugmentation,
 )
 
@@ -72,6 +68,8 @@ class HorizontalRepresentation(PinholeRepresentation):
         for ring in rings:
             others = {name: value for name, value in ring.items() if name != "fov"}
             by_fov.setdefault(_pair(ring.get("fov", fov)), []).append(others)
+        if not by_fov:
+            raise SettingError("representation.rings", found="[]", expected="one ring or more")
         if len(by_fov) > 1 and blend == "nearest":
             raise SettingError(
                 "representation.blend",
@@ -79,16 +77,16 @@ class HorizontalRepresentation(PinholeRepresentation):
                 expected="feather, or the same fov for all rings",
                 remedy="Views such as ring or tangent have the same.",
             )
-        checked = checked_rings([ring for part in by_fov.values() for ring in part])
-        self.symmetry_deg = 360 / max(ring.views for ring in checked)
         size = ring_size(level, _pair(fov), dim)
         covered = None
         if area is not None:
             covered = area_mask(check_area(area, "representation.area"), (_ROWS, 2 * _ROWS))
-        how = {"by_owners": blend == "nearest", "is_complete": len(by_fov) == 1}
-        grids = [RingGrid(part, of, size, None, covered, **how) for of, part in by_fov.items()]
-        if len(grids) > 1:
+        is_joint = len(by_fov) > 1
+        coverage = {"by_owners": blend == "nearest", "is_complete": not is_joint}
+        grids = [RingGrid(part, of, size, None, covered, **coverage) for of, part in by_fov.items()]
+        if is_joint:
             check_coverage(grids, covered)
+        self.symmetry_deg = 360 / max(ring["views"] for part in by_fov.values() for ring in part)
         super().__init__(
             min(grids, key=lambda grid: grid.num_images),
             grids,
@@ -100,20 +98,8 @@ class HorizontalRepresentation(PinholeRepresentation):
             rotations,
             faces_per_panorama,
             covered is not None,
-            len(grids) > 1,
+            is_joint,
         )
-
-    def sample(
-        self, rng: np.random.Generator, valid: NDArray[np.bool_] | None = None
-    ) -> PinholeViews:
-        """See `PinholeRepresentation`; of one field of view, drawn by the number of its views."""
-        if not self._is_joint:
-            return super().sample(rng, valid)
-        needed = self._needed([grid.with_rotation(None) for grid in self.grids], valid)
-        counts = np.array([len(faces) for faces in needed])
-        drawn = rng.choice(len(counts), p=counts / counts.sum())
-        least = counts[counts > 0].min()
-        return self._sample(rng, self.grids[drawn], needed[drawn], valid, least)
 
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:

@@ -105,13 +105,13 @@ class IcosphereViews(Views):
             pixels = torch.from_numpy(self._pixels((image.shape[-2], image.shape[-1])))
             result = image.flatten(-2)[..., pixels.to(image.device)]
             return result[None, ..., None, :]
-        shape, rest = (image.shape[0], image.shape[1]), image.shape[2:]
+        height, width, *rest = image.shape
         if interpolation == "nearest":
-            result = image.reshape(-1, *rest)[self._pixels(shape)]
+            result = image.reshape(-1, *rest)[self._pixels((height, width))]
             return result[None, None]
-        planes = image.reshape(*shape, -1).transpose(2, 0, 1)
-        wide = planes.astype(np.promote_types(image.dtype, np.float32))
-        result = self._means(torch.from_numpy(wide)).numpy().T
+        planes = np.moveaxis(image.reshape(height, width, -1), -1, 0)
+        wide = torch.from_numpy(planes.astype(np.promote_types(image.dtype, np.float32)))
+        result = self._means(wide).numpy().T
         result = np.rint(result) if image.dtype.kind in "ui" else result
         return result.astype(image.dtype).reshape(1, 1, -1, *rest)
 

@@ -19,8 +19,7 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.geometry.coverage import check_coverage
-from tangent_train.geometry.valid_views import best_views, needed_views
+from tangent_train.geometry.coverage import best_views, check_coverage, needed_views
 from tangent_train.rendering.checks import Blend, blend_of, check_choice
 from tangent_train.rendering.representations.views import PinholeViews, RotationAugmentation
 
@@ -108,42 +107,26 @@ class PinholeRepresentation:
 
         Of a partial panorama, they are as many as its valid pixels need without rotation, so that
         samples of one batch have equal numbers: those of `needed_views`, or under rotation those
-        that see most valid pixels.
+        that see most valid pixels. Joint grids: images of one, drawn by their number.
         """
-        (needed,) = self._needed([self.grid.with_rotation(None)], valid)
-        return self._sample(rng, self.grid, needed, valid)
-
-    def _sample(
-        self,
-        rng: np.random.Generator,
-        grid: PinholeGrid,
-        needed: NDArray[np.int64],
-        valid: NDArray[np.bool_] | None,
-        most: int | None = None,
-    ) -> PinholeViews:
-        """Return `sample` of one grid.
-
-        Args:
-            rng: Random generator.
-            grid: The grid.
-            needed: Images that are needed without rotation.
-            valid: See `sample`.
-            most: Maximum number of images; None for all that are needed.
-        """
+        grids = self.grids if self._is_joint else [self.grid]
+        needed = self._needed([grid.with_rotation(None) for grid in grids], valid)
+        counts = np.array([len(faces) for faces in needed])
+        drawn = rng.choice(len(grids), p=counts / counts.sum()) if self._is_joint else 0
+        grid, faces = grids[drawn], needed[drawn]
         if self.random_rotation != "none":
-            yaw = self.random_rotation == "yaw"
+            is_yaw = self.random_rotation == "yaw"
             angle = rng.uniform(0, 2 * math.pi)
-            rotation = rotation_about((0, 0, 1), angle) if yaw else random_rotation(rng)
+            rotation = rotation_about((0, 0, 1), angle) if is_yaw else random_rotation(rng)
             grid = _rotated(grid, rotation)
-        faces = None
-        if valid is not None:
-            is_rotated = grid.rotation is not None
-            faces = best_views(grid, valid, len(needed)) if is_rotated else needed
-        limits = [count for count in (self.faces_per_panorama, most) if count is not None]
-        if limits:
-            available = grid.num_images if faces is None else faces
-            faces = rng.choice(available, min(*limits, len(needed)), replace=False)
-        return PinholeViews(grid, faces, self.mirror and bool(rng.random() < 0.5))
+        if valid is not None and grid.rotation is not None:
+            faces = best_views(grid, valid, len(faces))
+        is_subset = self.faces_per_panorama is not None or self._is_joint
+        if is_subset:
+            most = counts[counts > 0].min()
+            faces = rng.choice(faces, min(self.faces_per_panorama or most, most), replace=False)
+        mirrored = self.mirror and bool(rng.random() < 0.5)
+        return PinholeViews(grid, None if valid is None and not is_subset else faces, mirrored)
 
     def _needed(
         self, grids: Sequence[PinholeGrid], valid: NDArray[np.bool_] | None

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.geometry import equirect_directions
-from tangent_train.results.pictures import distance_limits
+from tangent_train.heads.pictures import distance_limits
 
 _STEPS = 65534  # between the nearest and the farthest distance
 _FAR = 4  # medians of the distance: points beyond do not count for the middle of the scene

@@ -9,11 +9,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     equirect_directions,
     icosphere,
-    lonlat_to_xyz,
     random_rotation,
     rotation_about,
 )
@@ -100,16 +98,6 @@ def test_colors_are_means_over_cells(elements: IcosphereElements, seed: int | No
     np.testing.assert_allclose(fine, exact, err_msg="a finer panorama is reduced first")
 
 
-@both_elements
-def test_constants_stay_constants(elements: IcosphereElements) -> None:
-    views = IcosphereRepresentation(3, elements, "so3").sample(np.random.default_rng(0))
-    for dtype in (np.uint8, np.uint16):
-        for value in (1, 200, np.iinfo(dtype).max):
-            assert (views.render(np.full((16, 32), value, dtype), "bilinear") == value).all()
-    rendered = views.render(torch.full((2, 16, 32), 0.7), "bilinear")
-    torch.testing.assert_close(rendered, torch.full_like(rendered, 0.7))
-
-
 def test_a_tensor_has_a_gradient_through_the_means() -> None:
     views = IcosphereViews(1, "vertices", random_rotation(np.random.default_rng(2)))
     image = torch.rand(1, 4, 9, dtype=torch.float64, requires_grad=True)
@@ -169,16 +157,6 @@ def test_round_trip_of_a_smooth_function(
     torch.testing.assert_close(views.on_canvas(exactly, shape)[0], torch.full_like(canvas, 3.5))
 
 
-@both_elements
-def test_scores_at_the_directions_of_a_signal_are_kept(elements: IcosphereElements) -> None:
-    # A canvas of one row and column per direction does not exist: the nearest pixels of a fine one.
-    views, shape = IcosphereViews(1, elements), (512, 1024)
-    values = torch.rand(1, 2, 1, icosphere_count(1, elements))
-    canvas, _ = views.on_canvas(values, shape)
-    there = views.render(canvas[0], "nearest")[0]
-    assert (there - values[0]).abs().max() < 0.02
-
-
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 @both_elements
 def test_labels_of_large_cells_come_back_through_a_mosaic(
@@ -198,28 +176,3 @@ def test_labels_of_large_cells_come_back_through_a_mosaic(
     labels = mosaic.labels().numpy()
     assert (labels[inside] == label[inside]).all()
     assert (labels == label).mean() > 0.93
-
-
-def test_labels_are_never_averaged() -> None:
-    label = np.where(np.arange(64)[None] < 32, 1, 9).astype(np.uint8).repeat(32, 0)
-    for elements in ELEMENTS:
-        assert set(np.unique(IcosphereViews(4, elements).render(label, "nearest"))) == {1, 9}
-
-
-def test_rotations_and_settings() -> None:
-    first, second = IcosphereRepresentation(2, rotations=2).view_sets()
-    assert first.matrix is None
-    assert second.matrix is not None
-    at = second.matrix @ lonlat_to_xyz([0.0, 0.0])
-    np.testing.assert_allclose(at, lonlat_to_xyz([np.radians(36), 0.0]), atol=1e-15)
-    assert IcosphereRepresentation(2, "faces").image_size == (1, 320)
-    assert IcosphereRepresentation(2).erp_height == 8
-    bad: dict[str, Any]
-    for bad, name in (
-        ({"elements": "edges"}, "representation.elements"),
-        ({"interpolation": "linear"}, "representation.interpolation"),
-        ({"random_rotation": "all"}, "representation.random_rotation"),
-        ({"level": 9}, "icosphere level"),
-    ):
-        with pytest.raises(SettingError, match=name):
-            IcosphereRepresentation(**({"level": 3} | bad))

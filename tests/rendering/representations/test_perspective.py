@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.geometry.paper_camera import normalizing_homography
 
@@ -123,16 +122,3 @@ def test_crops_stay_inside_the_photo_and_count_each_pixel_once(
     area = grid.owned().sum() * np.prod(extent / representation.image_size[0])
     slack = 2 * (columns + rows) * max(width, height) * max(extent) / representation.image_size[0]
     assert abs(area - width * height) <= slack
-
-
-def test_the_side_follows_from_the_level() -> None:
-    sides = {level: PerspectiveRepresentation(level).image_size for level in (6, 7, 8)}
-    assert sides == {6: (32, 32), 7: (64, 64), 8: (128, 128)}, "paper: 128 for level 8"
-    wide = PerspectiveRepresentation(8, fov_deg=90).image_size[0]
-    assert wide == round(128 / math.tan(math.pi / 8)), "the same focal length"
-
-
-@pytest.mark.parametrize(("setting", "value"), [("dim", 1), ("dim", [8, 0]), ("dim", [8, 8, 8])])
-def test_impossible_sides_are_refused(setting: str, value: Any) -> None:
-    with pytest.raises(SettingError, match=f"representation.{setting}"):
-        PerspectiveRepresentation(7, **{setting: value})

@@ -13,8 +13,6 @@ from tangent_train.inference.images import InputImage
 from tangent_train.inference.representations import PhotoViews, view_settings
 from tangent_train.rendering import (
     CubemapRepresentation,
-    EquirectRepresentation,
-    IcosphereRepresentation,
     PerspectiveRepresentation,
     TangentRepresentation,
 )
@@ -82,9 +80,3 @@ def test_resized_and_mirrored_photos_keep_their_camera() -> None:
         boxes: Any = crops.canvas_boxes  # type: ignore[attr-defined]
         expected = [_lengths(large.camera_matrix, box, crops.size) for box in boxes]  # type: ignore[attr-defined]
         np.testing.assert_allclose(crops.ray_lengths(), expected, rtol=1e-6)
-
-
-def test_other_views_have_no_optical_axis() -> None:
-    for representation in (EquirectRepresentation(4), IcosphereRepresentation(2)):
-        (views,) = representation.view_sets()
-        np.testing.assert_array_equal(views.ray_lengths(), np.ones((1, 1, 1)))

@@ -82,7 +82,12 @@ def test_evaluation_takes_other_alignments_and_limits(
     checkpoint = "checkpoint=whole/checkpoints/best.ckpt"
     run("evaluate", checkpoint, "hydra.run.dir=again")
     assert results(Path("again")) == results(Path("whole"))
-    limits = ("task.alignment=affine", "task.max_distance=3", "task.clip=true", "task.align=none")
+    limits = (
+        "task.head.alignment=affine",
+        "task.head.max_distance=3",
+        "task.head.clip=true",
+        "task.head.align=none",
+    )
     run("evaluate", checkpoint, *limits, "hydra.run.dir=aligned")
     content = results(Path("aligned"))
     assert content["protocol"]["alignment"] == "affine in distance"
@@ -119,9 +124,9 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
 
     write_depth_checkpoint(Path("photos.ckpt"), depth_kind="relative_disparity")
     tuned = [s for s in once if "widths" not in s] + ["init_from=photos.ckpt"]
-    with pytest.raises(SystemExit, match=r"task\.alignment.*relative_disparity"):
+    with pytest.raises(SystemExit, match=r"task\.head\.alignment.*relative_disparity"):
         run("train", *tuned, "hydra.run.dir=refused")
-    run("train", *tuned, "task.alignment=affine", "hydra.run.dir=relative")
+    run("train", *tuned, "task.head.alignment=affine", "hydra.run.dir=relative")
     assert "Output of the network: relative_disparity" in capsys.readouterr().out
     trained = load_network(Path("relative/checkpoints/best.ckpt"))
     assert trained.depth_kind == "relative_disparity"
@@ -133,7 +138,13 @@ def test_an_imported_network_is_evaluated(run: Run) -> None:
     data = ["data=synthrooms", "data.inputs=[rgb]", "task=depth", "level=4"]
     data += ["data.rooms.views=wide"]  # those of the experiment
     data += [s for s in SETTINGS if s.startswith(("data.rooms", "data.root"))]
-    run("evaluate", "checkpoint=metric.ckpt", *data, "task.alignment=median", "hydra.run.dir=im")
+    run(
+        "evaluate",
+        "checkpoint=metric.ckpt",
+        *data,
+        "task.head.alignment=median",
+        "hydra.run.dir=im",
+    )
     assert results(Path("im"))["protocol"]["alignment"] == "median in distance"
 
 
@@ -164,7 +175,7 @@ def test_a_sweep_searches_for_the_smallest_error(run: Run, monkeypatch: pytest.M
 
 @pytest.mark.usefixtures("stages")
 def test_a_transfer_compares_views_and_their_alignment(run: Run) -> None:
-    shown = ("compare=[{name: unaligned, task.align: none}, erp]", "fine_tuning.epochs=[1]")
+    shown = ("compare=[{name: unaligned, task.head.align: none}, erp]", "fine_tuning.epochs=[1]")
     more: tuple[str, ...] = (*shown, "trainer.max_epochs=1", "photos.representation.dim=16")
     given = [s.replace("rooms/depth", "rooms/transfer_depth") for s in SETTINGS]
     run("transfer", *given, *more, "photos.data.batch_size=4", "name=mine", "panels=0")

@@ -26,7 +26,7 @@ def _builds_at_full_size(config: DictConfig) -> set[str]:
     settings = validate("check", {name: config[name] for name in known})
     with torch.device("meta"):  # shapes only: build runs the network on an image of full size
         data, task = build(settings)
-    assert task.class_names == data.class_names
+    assert task.head.class_names == data.class_names
     trainer = build_from_config(
         settings.trainer, "trainer", logger=False, enable_checkpointing=False
     )

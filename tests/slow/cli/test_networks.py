@@ -40,7 +40,7 @@ def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> No
     cases = {6: SHAPES} if shapes else {3: ("data.inputs=[rgb]",), 4: ("data.inputs=[rgb,depth]",)}
     for channels, of_data in cases.items():
         _, task = build(_composed(*of_data, *settings))
-        assert len(task.class_names) == (40 if shapes else 14)
+        assert len(task.head.class_names) == (40 if shapes else 14)
         images = torch.randn(2, *([3] if shapes else []), channels, 32, 32)
         assert task(images).shape == ((2, 40) if shapes else (2, 13, 32, 32))
     outputs = [task(images)] if shapes else task.outputs(images).values()

@@ -14,7 +14,8 @@ from torch import Tensor, nn
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks import SegmentationTask
+from tangent_train.tasks import PixelTask
+from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import quiet_trainer
 
 
@@ -46,9 +47,9 @@ class Faulty(nn.Module):
         return self.wrong(scores) if len(self.seen) - 1 == self.at else scores
 
 
-def small_task(network: nn.Module, **settings: Any) -> SegmentationTask:
+def small_task(network: nn.Module, **settings: Any) -> PixelTask:
     """A task on tangent images of the classes of Stanford2D3DS."""
-    return SegmentationTask(
+    return segmentation_task(
         network,
         TangentRepresentation(base_level=0, level=4),
         Stanford2D3DS.class_names,

@@ -1,4 +1,4 @@
-"""Taps of distortion-aware convolutions: grids on the tangent planes of directions."""
+"""Sampling points of distortion-aware convolutions: grids on the tangent planes of directions."""
 
 from __future__ import annotations
 
@@ -28,29 +28,29 @@ def tangent_axes(directions_xyz: ArrayLike) -> NDArray[np.float64]:
     return np.stack([east, north, xyz], axis=-2)
 
 
-def gnomonic_taps_xyz(
+def gnomonic_points_xyz(
     directions_xyz: ArrayLike, kernel: int | tuple[int, int], pitch: float
 ) -> NDArray[np.float64]:
     """Return where a convolution samples the sphere (Coors et al. 2018, Tateno et al. 2018).
 
-    The taps of a direction form a grid on its tangent plane, aligned to north: the inverse gnomonic
-    projection. They are in the order of a convolution's weight on an image: rows from north to
-    south, columns from west to east.
+    The points of a direction form a grid on its tangent plane, aligned to north: the inverse
+    gnomonic projection. They are in the order of a convolution's weight on an image: rows from
+    north to south, columns from west to east.
 
     Args:
         directions_xyz: ``(P, 3)`` non-zero vectors of any length.
         kernel: Rows and columns of the grid; one number for both.
-        pitch: Distance of neighboring taps on the tangent plane of the unit sphere.
+        pitch: Distance of neighboring points on the tangent plane of the unit sphere.
 
     Returns:
         ``(P, rows · columns, 3)`` unit vectors.
 
-    >>> gnomonic_taps_xyz([[1.0, 0.0, 0.0]], 3, 1.0)[0, [1, 5]].round(4).tolist()
+    >>> gnomonic_points_xyz([[1.0, 0.0, 0.0]], 3, 1.0)[0, [1, 5]].round(4).tolist()
     [[0.7071, 0.0, 0.7071], [0.7071, 0.7071, 0.0]]
     """
     rows, columns = (kernel, kernel) if isinstance(kernel, int) else kernel
     up, right = ((np.arange(side) - (side - 1) / 2) * pitch for side in (rows, columns))
     y, x = np.meshgrid(up[::-1], right, indexing="ij")
     offsets = np.stack([x, y, np.ones_like(x)], axis=-1).reshape(-1, 3)
-    taps = offsets @ tangent_axes(directions_xyz)
-    return np.asarray(taps / np.linalg.norm(taps, axis=-1, keepdims=True))
+    points = offsets @ tangent_axes(directions_xyz)
+    return np.asarray(points / np.linalg.norm(points, axis=-1, keepdims=True))

@@ -25,10 +25,10 @@ from tangent_train.geometry import (
     perspective_directions,
     random_rotation,
 )
-from tangent_train.inference.alignment import (
+from tangent_train.heads.alignment import (
     Alignment,
     ViewSamples,
-    align,
+    align_views,
     lattice,
     sample_views,
     sphere_points,
@@ -122,7 +122,7 @@ def test_meters_remain_meters_with_a_shift_of_each_view() -> None:
     """Depth without any relation between views: the shifts of an affine fit cancel its scale."""
     samples = _truth("tangent").samples
     random = np.random.default_rng(0).uniform(1, 3, len(samples.value))
-    found = align([samples._replace(value=random)], "metric_z", "affine")
+    found = align_views([samples._replace(value=random)], "metric_z", "affine")
     after = found.scale[samples.view] * random + found.shift[samples.view]
     known = after > 0  # else unknown
     factors = [np.median((after / random)[known & (samples.view == n)]) for n in range(20)]
@@ -133,7 +133,7 @@ def test_meters_remain_meters_with_a_shift_of_each_view() -> None:
 def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> None:
     truth, rng = _truth(views), np.random.default_rng(5)
     samples = _corrupted(truth, kind, rng)
-    found: Any = align([samples], kind)
+    found: Any = align_views([samples], kind)
     assert np.abs(_errors(found, samples, truth.distance)).max() < EXACT
     assert found.report.mode == ("affine" if kind.startswith("relative") else "scale")
     if found.report.mode == "scale":
@@ -145,7 +145,7 @@ def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> Non
     bad = rng.random(len(samples.value)) < 0.2
     wild = truth.distance * np.exp(bad * rng.normal(0, 1, len(bad)))
     wrong = _corrupted(truth._replace(distance=wild), kind, rng)
-    errors = _errors(align([wrong], kind), wrong, truth.distance)[~bad]
+    errors = _errors(align_views([wrong], kind), wrong, truth.distance)[~bad]
     assert np.abs(errors).max() < 1e-2
 
 
@@ -153,18 +153,18 @@ def test_order_of_views_and_rotation_of_the_grid_do_not_matter() -> None:
     truth, rng = _truth("horizontal"), np.random.default_rng(6)
     samples = _corrupted(truth, "relative_disparity", rng)
     noisy = samples._replace(value=samples.value * np.exp(rng.normal(0, 0.02, len(samples.value))))
-    found = align([noisy], "relative_disparity")
+    found = align_views([noisy], "relative_disparity")
     order, shuffled = map(rng.permutation, (samples.num_views, len(samples.value)))
     arrays: Any = (array[shuffled] for array in noisy[1:])
     other = ViewSamples(samples.num_views, *arrays)
     other = other._replace(view=order[other.view])
-    again = align([other], "relative_disparity")
+    again = align_views([other], "relative_disparity")
     np.testing.assert_allclose(again.scale[order], found.scale, rtol=1e-5)
     np.testing.assert_allclose(again.shift[order], found.shift, rtol=1e-5, atol=1e-5)
 
     rotated = _truth("rotated")
     samples = _corrupted(rotated, "metric_z", rng)
-    errors = _errors(align([samples], "metric_z"), samples, rotated.distance)
+    errors = _errors(align_views([samples], "metric_z"), samples, rotated.distance)
     assert np.abs(errors).max() < EXACT
 
 
@@ -196,7 +196,7 @@ def test_the_fit_minimizes_the_cauchy_loss() -> None:
         spread = 1.4826 * float(np.median(np.abs(residuals(unknowns, levels))))
         noise = max(spread, 0.7 * noise)
         unknowns = minimize(loss, unknowns, (levels, noise), "BFGS", options={"gtol": 1e-9}).x
-    found = align([samples._replace(value=value)], "relative_depth")
+    found = align_views([samples._replace(value=value)], "relative_depth")
     ratio = found.scale / (np.exp(unknowns[:4]) / unit)
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-4)
     np.testing.assert_allclose(found.shift, ratio * np.exp(unknowns[:4]) * unknowns[4:], atol=1e-4)
@@ -209,7 +209,7 @@ def test_nearly_flat_views_with_outliers_are_aligned() -> None:
     bad = rng.random(len(noise)) < 0.2
     distance = truth.distance * np.exp(noise + bad * rng.normal(0, 1, len(noise)))
     samples = _corrupted(Truth(truth.samples, distance), "relative_depth", rng)
-    errors = _errors(align([samples], "relative_depth"), samples, truth.distance)
+    errors = _errors(align_views([samples], "relative_depth"), samples, truth.distance)
     of_views = [np.median(errors[(samples.view == n) & ~bad]) for n in range(samples.num_views)]
     assert np.abs(of_views).max() < 0.01
 
@@ -223,7 +223,7 @@ def test_many_narrow_views_are_aligned() -> None:
     distance = _room()(equirect_directions(SHAPE)[rows, columns])
     noisy = Truth(samples, distance * np.exp(rng.normal(0, 0.02, len(distance))))
     samples = _corrupted(noisy, "relative_depth", rng)
-    errors = _errors(align([samples], "relative_depth"), samples, distance)
+    errors = _errors(align_views([samples], "relative_depth"), samples, distance)
     of_views = [np.median(errors[samples.view == n]) for n in range(samples.num_views)]
     assert np.abs(of_views).max() < 0.04
 
@@ -238,7 +238,7 @@ def test_noise_does_not_shrink_scales(noise: float) -> None:
     noisy = z_depth + rng.normal(0, noise, len(view))
     scale = np.array([0.5, 1.0, 3.0])
     samples = ViewSamples(3, view, point, noisy / scale[view], lengths, np.zeros((len(view), 2)))
-    found = align([samples], "relative_depth")
+    found = align_views([samples], "relative_depth")
     np.testing.assert_allclose(found.scale, scale, rtol=0.05)
 
 
@@ -249,7 +249,7 @@ def test_unobservable_shifts_remain_small() -> None:
     scale = np.exp(rng.normal(0, 0.5, samples.num_views))[samples.view]
     noise = np.exp(rng.normal(0, 0.01, len(scale)))
     samples = samples._replace(value=scale * noise / truth.distance)
-    errors = _errors(align([samples], "relative_disparity"), samples, truth.distance)
+    errors = _errors(align_views([samples], "relative_disparity"), samples, truth.distance)
     assert np.quantile(np.abs(errors), 0.9) < 0.05
 
 
@@ -265,7 +265,7 @@ def test_views_that_cannot_be_compared_are_reported(kind: Kind) -> None:
     value[is_sky] = 0 if kind == "relative_disparity" else np.nan
     # Views 20 to 25, the cube, share no point with the others: a group of its own.
     point = np.where(view >= 20, samples.point + 10**6, samples.point)
-    found = align([samples._replace(value=value, point=point)], kind)
+    found = align_views([samples._replace(value=value, point=point)], kind)
     report = found.report
     assert report.empty == (2, 5)
     assert report.groups == 7  # the faces of a cube have no direction in common
@@ -291,12 +291,12 @@ def _first_view(samples: ViewSamples) -> ViewSamples:
 def test_one_view_and_no_valid_view(mode: Any) -> None:
     samples = _truth("horizontal").samples
     nothing = samples._replace(value=np.full(len(samples.value), np.nan))
-    found = align([nothing], "relative_disparity", mode)
+    found = align_views([nothing], "relative_disparity", mode)
     assert len(found.report.empty) == samples.num_views
     assert found.report.step_after is None
     assert (found.scale == 1).all()
     one = _first_view(samples)
-    alone = align([one._replace(value=one.ray_length)], "metric_z", mode)
+    alone = align_views([one._replace(value=one.ray_length)], "metric_z", mode)
     assert (alone.scale.item(), alone.shift.item(), alone.report.groups) == (1, 0, 1)
     assert (alone.report.isolated, alone.report.mode) == ((), "none")
 
@@ -340,7 +340,7 @@ def test_views_are_sampled_where_the_canvas_is(name: str) -> None:
         assert np.isnan(samples.position).all()
         assert (samples.ray_length == 1).all()
         with pytest.raises(SettingError, match=r"grid.*none, scale or affine"):
-            align([samples, samples], "metric_z", "grid")
+            align_views([samples, samples], "metric_z", "grid")
         return
     assert np.abs(samples.position).max() <= 1
     cosines = (directions[rows, columns] * axes[samples.view]).sum(axis=-1)
@@ -357,7 +357,7 @@ def test_rendered_views_of_a_room_agree_after_the_alignment(kind: Kind) -> None:
     scale = np.exp(rng.normal(0, 0.5, 20))[:, None, None]
     output = _output(distance, lengths, kind)
     output = output * scale + rng.normal(0, 0.5, scale.shape) * kind.startswith("relative")
-    found = align([sample_views(output, views, SHAPE, points)], kind)
+    found = align_views([sample_views(output, views, SHAPE, points)], kind)
     part = slice(3, 17)
     raw, lengths_of_rays = torch.from_numpy(output[part, None]), torch.from_numpy(lengths)
     applied = found.applied(raw, part, lengths_of_rays)[:, 0].numpy()
@@ -376,27 +376,29 @@ def test_a_grid_removes_smooth_errors_of_views() -> None:
     bent = rng.normal(0, 0.2, (20, 2, 1, 1)) * (x * y, y**2)
     output = distance / lengths * np.exp(bent.sum(axis=1))
     samples = sample_views(output, views, SHAPE, points)
-    plain: Any = align([samples], "metric_z", "scale")
-    corrected: Any = align([samples], "metric_z", "grid")
+    plain: Any = align_views([samples], "metric_z", "scale")
+    corrected: Any = align_views([samples], "metric_z", "grid")
     assert plain.report.step_after > 0.05
     assert corrected.report.step_after < 0.2 * plain.report.step_after
     assert corrected.grid.shape == (20, 5, 5)
     assert np.median(corrected.grid.mean(axis=(1, 2))) == pytest.approx(0, abs=1e-12)
     raw, rays = torch.from_numpy(output[:, None]), torch.from_numpy(lengths)
     applied = np.exp(corrected.applied(raw, slice(0, 20), rays)[:, 0].numpy())
-    again = align([sample_views(applied, views, SHAPE, points)], "metric_distance", "none").report
+    again = align_views(
+        [sample_views(applied, views, SHAPE, points)], "metric_distance", "none"
+    ).report
     assert again.step_before == pytest.approx(corrected.report.step_after, rel=0.1)
     assert again.step_after == again.step_before
 
     exact = sample_views(distance / lengths, views, SHAPE, points)
-    nothing: Any = align([exact], "metric_z", "grid")
+    nothing: Any = align_views([exact], "metric_z", "grid")
     assert np.quantile(np.abs(nothing.grid), 0.9) < 0.02
 
 
 def test_sky_and_invalid_pixels_after_the_alignment() -> None:
     raw = torch.tensor([2.0, 0.0, -1.0, math.nan, math.inf])[None, None, None]
     lengths = torch.full((1, 1, 5), 2.0)
-    report = align([_first_view(_truth("horizontal").samples)], "metric_z", "none").report
+    report = align_views([_first_view(_truth("horizontal").samples)], "metric_z", "none").report
     for kind, scale, shift, expected in (
         ("relative_disparity", 1.0, 0.0, [1, 0, 0]),
         ("relative_disparity", 2.0, 3.0, [3.5, 0, 0.5]),

@@ -1,8 +1,7 @@
-"""Base class of tasks for every pixel of the views of panoramas and photos."""
+"""Training and evaluation of networks for every pixel of panoramas and photos."""
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,9 +11,10 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from datamodules.core.samples import EvaluationSample
+from datamodules.core.samples import EvaluationSample, valid_mask
 from tangent_train.errors import SettingError, at_least
-from tangent_train.inference.engine import sees_rays, upright_rays
+from tangent_train.heads import Head
+from tangent_train.inference.engine import scored_views, sees_rays, upright_rays, view_scores
 from tangent_train.rendering import EquirectRepresentation, IcosphereRepresentation
 from tangent_train.rendering.representations.views import Representation
 from tangent_train.tasks.base import Part, Task
@@ -24,11 +24,12 @@ ViewSet = tuple[Any, Any, Tensor | None]
 them."""
 
 
-class ViewsTask(Task):
+class PixelTask(Task):
     """Trains a network on views of panoramas, or on crops of photos, and scores whole images.
 
     The views of all images of a batch, on all processes, contribute to one gradient (paper,
-    supplement, "Semantic segmentation").
+    supplement, "Semantic segmentation"). Validation and test cover the whole sphere, or the whole
+    photo; the outputs are put together and compared with the original labels.
 
     Args:
         network: Module ``(B, C, h, w) -> (B, K, h, w)``, or one that returns a dict with this
@@ -36,7 +37,8 @@ class ViewsTask(Task):
             network whose `forward` also takes ``rays`` and ``view_batch_size`` gets the viewing
             rays of its images and bounds its memory (`models.SphereContext`).
         representation: Representation of the images.
-        *arguments: Class names, optimizer and scheduler, see `Task`.
+        head: The meaning of the output.
+        *arguments: Optimizer and scheduler, see `Task`.
         auxiliary_weight: Weight of the loss of the auxiliary output.
         eval_view_batch_size: Number of images per forward pass in evaluation, which bounds memory.
         **settings: Further arguments of `Task`.
@@ -46,15 +48,13 @@ class ViewsTask(Task):
         self,
         network: nn.Module,
         representation: Any,
+        head: Head,
         *arguments: Any,
         auxiliary_weight: float = 0.4,
         eval_view_batch_size: int = 32,
         **settings: Any,
     ) -> None:
-        super().__init__(network, representation, *arguments, **settings)
-        if not auxiliary_weight >= 0:
-            expected = "0 or more"
-            raise SettingError("task.auxiliary_weight", found=auxiliary_weight, expected=expected)
+        super().__init__(network, representation, head, *arguments, **settings)
         self.sees_rays = sees_rays(network)
         whole = EquirectRepresentation | IcosphereRepresentation
         if self.sees_rays and isinstance(representation, whole):
@@ -64,13 +64,9 @@ class ViewsTask(Task):
                 expected="tangent images or a cube map for a network with cross-image context",
                 remedy="Use the network without context.",
             )
+        head.num_outputs = getattr(network, "num_scores", head.num_outputs)
         self.auxiliary_weight = auxiliary_weight
         self.eval_view_batch_size = at_least("task.eval_view_batch_size", eval_view_batch_size, 1)
-
-    @property
-    @abstractmethod
-    def num_scores(self) -> int:
-        """Number of outputs of the network at every pixel."""
 
     def forward(
         self,
@@ -97,8 +93,15 @@ class ViewsTask(Task):
             count = self.view_batch_size if self.training else self.eval_view_batch_size
             returned = self.network(images, rays, count)
         outputs = returned if isinstance(returned, Mapping) else {"out": returned}
-        expected = (len(images), self.num_scores, *images.shape[-2:])
-        self.checked_scores(outputs["out"], expected)
+        found = tuple(outputs["out"].shape)
+        expected = (len(images), self.head.num_outputs, *images.shape[-2:])
+        if found != expected:
+            raise SettingError(
+                "output of the network",
+                found=found,
+                expected=expected,
+                remedy="Set network.num_classes to the number of classes, or to null.",
+            )
         return outputs
 
     def example(self, channels: int) -> Tensor:
@@ -113,33 +116,85 @@ class ViewsTask(Task):
         return len(self.representation.sample(np.random.default_rng(0)).rays()) or 1
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
-        """Return all images of a batch ``(n, C, h, w)`` and their labels ``(n, h, w)``."""
-        return batch.images.flatten(0, 1), batch.labels.flatten(0, 1)
+        """Return all images of a batch ``(n, C, h, w)`` and their targets, see `Head.targets`."""
+        truth = self.head.truth(batch.labels.flatten(0, 1))
+        lengths = batch.ray_lengths.expand(*batch.labels.shape[:2], *batch.ray_lengths.shape[-2:])
+        return batch.images.flatten(0, 1), self.head.targets(truth, lengths.flatten(0, 1))
 
     def training_parts(self, batch: Any) -> list[Part]:
         """See `Task`; a network that takes rays gets all images, which it divides."""
         if self.sees_rays and batch.rays.numel():
-            images, labels = self.training_pairs(batch)
-            return [((images, batch.rays), labels)]
+            images, targets = self.training_pairs(batch)
+            return [((images, batch.rays), targets)]
         return super().training_parts(batch)
 
-    @abstractmethod
-    def predict_sample(self, sample: EvaluationSample[Tensor]) -> tuple[Tensor, Tensor]:
-        """Predict a panorama or the crops of a photo; add to the validation loss, except in a test.
-
-        Returns:
-            Prediction and truth for `metric`.
-        """
+    def loss_sum(self, inputs: tuple[Tensor, ...], targets: Tensor) -> Tensor:
+        """Return the loss, summed over pixels, including that of an auxiliary output."""
+        outputs = self.outputs(*inputs)
+        loss = self.head.loss_sum(outputs["out"], targets)
+        if "aux" not in outputs:
+            return loss
+        return loss + self.auxiliary_weight * self.head.auxiliary_sum(outputs["aux"], targets)
 
     @torch.no_grad()
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of panoramas or photos to `metric`; return the predictions."""
         predictions = []
         for fields in zip(*batch, strict=True):
-            prediction, truth = self.predict_sample(EvaluationSample(*fields))
+            sample: EvaluationSample[Tensor] = EvaluationSample(*fields)
+            truth = self.head.truth(sample.target)
+            if truth.ndim == 2:
+                where = sample.rotation.cpu().numpy(), valid_mask(sample.valid)
+                predicted = self.predict_panorama(sample.images, tuple(truth.shape), *where, truth)
+                prediction = self.head.comparable(predicted, truth)
+            else:
+                predicted = self.predict_crops(sample, truth)
+                prediction = self.head.comparable(predicted, truth, sample.ray_lengths)
             self.metric.update(prediction, truth)
             predictions.append(prediction)
         return torch.stack(predictions)
+
+    def predict_crops(self, sample: EvaluationSample[Tensor], truth: Tensor) -> Tensor:
+        """Predict the crops of a photo ``(n, h, w)``; see `predict_panorama`."""
+        lengths = sample.ray_lengths
+        lengths = lengths.expand(len(truth), *lengths.shape[-2:])
+        predictions, step = [], self.eval_view_batch_size
+        for part, outputs in view_scores(self, sample.images.__getitem__, len(truth), step):
+            predictions.append(self.head.crop_pixels(outputs, lengths[part]))
+            self._add_loss(outputs, truth[part], lengths[part])
+        return torch.cat(predictions)
+
+    def predict_panorama(
+        self,
+        images: Float[Tensor, "images channels height width"],
+        shape: Any,
+        rotation: NDArray[np.float64] | None = None,
+        valid: NDArray[np.bool_] | None = None,
+        truth: Tensor | None = None,
+    ) -> Tensor:
+        """Predict every pixel of a panorama, see `Head`.
+
+        Args:
+            images: Images of all view sets of the representation, in this order.
+            shape: ``(H, W)`` of the panorama.
+            rotation: Rotation of the representation ``(3, 3)``.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
+            truth: Result of `Head.truth`, to add to the validation loss, except in a test.
+        """
+        sets = self.view_sets(images, rotation, valid)
+        how: dict[str, Any] = {"averaged": len(sets) > 1, "device": images.device}
+        mosaic = self.head.mosaic(shape, self.representation.blend, valid=valid, **how)
+        for views, outputs in scored_views(self, sets, self.eval_view_batch_size):
+            mosaic.add(outputs, views)
+            if truth is not None and not self.is_tested:
+                lengths = torch.from_numpy(views.ray_lengths()).to(outputs.device)
+                self._add_loss(outputs, labels_of_views(truth, views), lengths)
+        return mosaic.pixels().to(images.device)
+
+    def _add_loss(self, outputs: Tensor, truth: Tensor, lengths: Tensor) -> None:
+        """Add the loss of views, without auxiliary outputs, to the validation loss."""
+        if not self.is_tested:
+            self.add_validation_loss(outputs, self.head.targets(truth, lengths))
 
     def view_sets(
         self, images: Tensor, rotation: NDArray[np.float64] | None, valid: NDArray[np.bool_] | None

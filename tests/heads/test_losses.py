@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn import functional
 
-from tangent_train.tasks.losses import (
+from tangent_train.heads.losses import (
     auxiliary_sum,
     cross_entropy_norm,
     cross_entropy_sum,

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,13 +12,13 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
+from tangent_train.heads import DistanceHead, PredictedImage
+from tangent_train.heads.distance import points_of, spread_pixels
+from tangent_train.heads.pictures import colorize_distance, distance_picture
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import area_of_angles, whole_area
 from tangent_train.io.palette import distance_colors
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
-from tangent_train.results.depth_results import DepthResults, points_of, spread_pixels
-from tangent_train.results.pictures import colorize_distance, distance_picture
-from tangent_train.results.predictions import PredictedImage
 
 RNG = np.random.default_rng(0)
 
@@ -93,34 +92,33 @@ def test_pictures_have_a_bar_of_their_colors() -> None:
 
 def test_a_video_has_one_range_of_colors() -> None:
     """That of all frames, so that a distance has the same color in all of them."""
-    results = DepthResults(is_metric=True, depth_format=None, depth_scale=1000, points=None)
+    head = DistanceHead()
     frames = [_panorama(np.full((8, 16), m, np.float32)) for m in (1, 4, np.nan, 9)]
     everywhere = np.array(True)
-    entries = [{"depth": results.summarize(frame, everywhere)} for frame in frames]
-    assert [entry["depth"].get("median") for entry in entries] == [1, 4, None, 9]
-    paint = results.painter("color", entries)
+    summaries = [head.summarize(frame, everywhere) for frame in frames]
+    assert [summary.get("median") for summary in summaries] == [1, 4, None, 9]
+    paint = head.painter("color", summaries)
     painted = [paint(frame.image.rgb, frame.pixels)[0, 0] for frame in frames]
     assert (painted[0] == distance_colors()[0]).all()
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
     assert not painted[2].any()
-    (row,) = results.table(entries[2:3]).rows
+    (row,) = head.table(summaries[2:3]).rows
     assert row == ["known pixels, % of the solid angle", "0"]
 
 
 def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    how: dict[str, Any] = {"is_metric": True, "points": None}
     with pytest.raises(SettingError, match=r"depth_format: found a missing package.*\[exr\]"):
-        DepthResults(**how, depth_format="exr", depth_scale=1000)
+        DistanceHead(depth_format="exr")
     with pytest.raises(SettingError, match="depth_scale: found inf; expected more than 0"):
-        DepthResults(**how, depth_format=None, depth_scale=math.inf)
+        DistanceHead(depth_scale=math.inf)
 
 
 def test_the_table_counts_images_whose_views_agree_less_than_before() -> None:
-    results = DepthResults(is_metric=True, depth_format=None, depth_scale=1000, points=None)
+    head = DistanceHead()
     steps = [{"step_before": 0.2, "step_after": after} for after in (0.1, 0.201, 0.3, 0.4)]
-    rows = results.table([{"depth": step} for step in (*steps, {"step_before": None})]).rows
+    rows = head.table([*steps, {"step_before": None}]).rows
     assert [row for row in rows if "agree less" in row[0]] == [
         ["images whose views agree less than before: try another align", "2"]
     ]

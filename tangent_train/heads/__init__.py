@@ -1,0 +1,41 @@
+"""Output heads: how a kind of output is trained, scored, put together, drawn and written."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from tangent_train.heads.base import Head, PredictedImage, Scores
+from tangent_train.heads.classes import ClassesHead
+from tangent_train.heads.distance import DistanceHead
+from tangent_train.heads.image_class import ImageClassHead
+
+__all__ = [
+    "HEADS",
+    "ClassesHead",
+    "DistanceHead",
+    "Head",
+    "ImageClassHead",
+    "PredictedImage",
+    "Scores",
+    "head_of",
+]
+
+
+HEADS: dict[str, type[ClassesHead | DistanceHead]] = {
+    head.kind: head for head in (ClassesHead, DistanceHead)
+}
+"""Heads of networks from files, by the kind of labels that these predict."""
+
+
+def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
+    """Return the head of a network from a file.
+
+    Args:
+        loaded: `LoadedNetwork`.
+        **settings: Settings of the head, see `Head.predict_settings`.
+    """
+    if loaded.depth_kind is not None:
+        return DistanceHead(depth_kind=loaded.depth_kind, **settings)
+    head = ClassesHead(loaded.class_names, **settings)
+    head.num_outputs = loaded.network.num_scores  # with that of no class
+    return head

@@ -1,0 +1,336 @@
+"""Base class of heads: the meaning of a network's output."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, ClassVar, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor, nn
+from torchmetrics import Metric
+
+from tangent_train.errors import SettingError
+from tangent_train.geometry import equirect_solid_angles, ray_lengths
+from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.segmentation import Interval
+from tangent_train.rendering import Blend
+from tangent_train.rendering.representations.views import Views
+
+RGB = NDArray[np.uint8]
+"""A picture ``(H, W, 3)``."""
+
+Painter = Callable[[RGB, NDArray[Any]], RGB]
+"""Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
+
+class Scores(NamedTuple):
+    """Scores of a split, shares of 1 or in a unit; NaN if undefined.
+
+    Attributes:
+        means: Scores over all images by name, the main score first.
+        of_classes: Scores ``(K,)`` of the classes by name; empty without classes.
+        bands: Scores of the latitude bands from north to south; empty for photos.
+        confusion: Counts; rows are true, columns predicted classes. None without classes.
+    """
+
+    means: Mapping[str, float]
+    of_classes: Mapping[str, NDArray[Any]] = MappingProxyType({})
+    bands: Sequence[Mapping[str, float]] = ()
+    confusion: NDArray[np.int64] | None = None
+
+
+class PredictedImage(NamedTuple):
+    """An image with its predicted pixels.
+
+    Attributes:
+        image: Photo, or image of the whole sphere.
+        pixels: Prediction ``(h, w)`` for the area of the image, see `Head`.
+        facts: Further facts about the prediction, for its summary.
+    """
+
+    image: Any
+    pixels: NDArray[Any]
+    facts: Mapping[str, Any] = MappingProxyType({})
+
+
+class SummaryTable(NamedTuple):
+    """Cells of a table of predictions.
+
+    Attributes:
+        title: Text above the table.
+        header: Name of each column.
+        rows: Cells of each row.
+    """
+
+    title: str
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+
+
+class HeadMosaic(Protocol):
+    """A panorama or photo that is put together from the outputs of its views."""
+
+    @property
+    def facts(self) -> Mapping[str, Any]:
+        """Facts for the summary of a prediction, after `pixels`."""
+
+    def add(self, outputs: Tensor, views: Views) -> None:
+        """Add the outputs ``(n, C, h, w)`` of some views."""
+
+    def pixels(self) -> Tensor:
+        """Return the prediction ``(H, W)``, see `Head`."""
+
+
+class Head(nn.Module, ABC):
+    """The meaning of a network's output.
+
+    A head trains a network (loss and norm), scores it, puts the outputs of views together to a
+    panorama, draws the result, and writes and reads its files. Tasks, the engine and the commands
+    are the same for all heads.
+
+    Args:
+        class_names: Names of the labels of the data; empty without classes.
+
+    Attributes:
+        kind: Kind of the predictions, by which files and commands select the head.
+        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
+        columns: Names and units of the scores over a split, in the order of the tables.
+        main_score: Score that selects the best epoch.
+        takes: Input and output of a network for this head, for messages.
+        num_outputs: Number of channels of the network's output.
+        predict_settings: Settings of ``tangent-predict`` that are arguments of the head.
+        is_metric: False for distances that are known up to a scale.
+        suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
+            predicted pixels, from which pictures are made. All but the last are usual.
+        summary: Name of the summary of an image in the summary file.
+        summary_columns: Names in the summary of an image that ``summary.csv`` lists.
+        unknown: Value of unknown pixels.
+    """
+
+    kind: ClassVar[str]
+    labels: ClassVar[str]
+    columns: ClassVar[Mapping[str, ScoreColumn]]
+    main_score: ClassVar[str]
+    takes: ClassVar[str]
+    predict_settings: ClassVar[Sequence[str]] = ()
+    summary: ClassVar[str] = ""
+    unknown: ClassVar[float] = 0
+    num_outputs: int
+    is_metric: bool = True
+    suffixes: Mapping[str, str] = MappingProxyType({})
+    summary_columns: Sequence[str] = ()
+
+    def __init__(self, class_names: Sequence[str] = ()) -> None:
+        super().__init__()
+        self.class_names = tuple(class_names)
+
+    # Training
+
+    def read_data(self, data: Any) -> None:
+        """Take from the data module what the loss needs, such as class weights."""
+
+    def truth(self, labels: Tensor) -> Tensor:
+        """Return labels of the data in the form of predictions, e.g. meters instead of steps."""
+        return labels
+
+    def targets(self, truth: Tensor, ray_lengths: Tensor) -> Tensor:
+        """Return the output of the network that would be correct, for `loss_sum`.
+
+        Args:
+            truth: Result of `truth` for views ``(n, h, w)``.
+            ray_lengths: ``(1 or n, h, w)``, see `Views.ray_lengths`.
+        """
+        return truth
+
+    @abstractmethod
+    def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        """Return the sum of the losses of outputs ``(n, C, h, w)``."""
+
+    @abstractmethod
+    def loss_norm(self, targets: Tensor) -> Tensor:
+        """Return the number that the sum of the losses of a step is divided by."""
+
+    def auxiliary_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        """Return the sum of the losses of an auxiliary output, which may be coarser."""
+        resized = nn.functional.interpolate(outputs, targets.shape[-2:], mode="bilinear")
+        return self.loss_sum(resized, targets)
+
+    # Scores
+
+    @abstractmethod
+    def build_metric(self) -> Metric:
+        """Build the metric of a split: ``update(prediction, truth)`` adds an image."""
+
+    @abstractmethod
+    def scores(self, result: Any) -> Scores:
+        """Return the scores of a split.
+
+        Args:
+            result: Value of the metric.
+        """
+
+    def intervals(self, result: Any) -> Mapping[str, Interval]:
+        """Return 95 % bootstrap intervals over the images, for means that have one."""
+        return {}
+
+    def scores_of(self, result: Any, places: Sequence[int]) -> Mapping[str, float]:
+        """Return scores over some of the images by name; by default, none.
+
+        Args:
+            result: Value of the metric.
+            places: Places of the images in the order of the evaluation.
+        """
+        return {}
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
+        return {}
+
+    def mode_of(self, monitor: str) -> str:
+        """Return ``min`` for a loss and for errors, see `ScoreColumn.better`; else ``max``.
+
+        Args:
+            monitor: Name of a logged value, e.g. ``val/miou``.
+        """
+        column = self.columns.get(monitor.partition("/")[2])
+        is_error = column is not None and column.better == "lower"
+        return "min" if is_error or monitor.endswith("loss") else "max"
+
+    # From views to a panorama
+
+    def mosaic(
+        self,
+        shape: tuple[int, int],
+        blend: Blend,
+        *,
+        averaged: bool = False,
+        device: Any = "cpu",
+        valid: NDArray[np.bool_] | None = None,
+        camera_matrix: NDArray[np.float64] | None = None,
+    ) -> HeadMosaic:
+        """Return an empty panorama or photo.
+
+        Args:
+            shape: ``(H, W)`` of the panorama or photo.
+            blend: Blend of the views.
+            averaged: True if several sets of views are averaged, or more than the pixels is needed.
+            device: Device of the outputs.
+            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
+            camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
+        """
+        raise NotImplementedError
+
+    def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
+        """Return the prediction ``(n, h, w)`` of single crops of a photo.
+
+        Args:
+            outputs: Outputs of the network ``(n, C, h, w)``.
+            ray_lengths: See `targets`.
+        """
+        raise NotImplementedError
+
+    def comparable(
+        self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None
+    ) -> Tensor:
+        """Return a prediction as the metric compares it with the truth, e.g. with its scale.
+
+        Args:
+            prediction: Prediction of a panorama ``(H, W)`` or of crops ``(n, h, w)``.
+            truth: Truth of the same shape.
+            ray_lengths: ``(n, h, w)`` of crops; None for a panorama.
+        """
+        return prediction
+
+    # Pictures and files
+
+    def panel(self, rgb: RGB, truth: NDArray[Any], prediction: NDArray[Any]) -> RGB | None:
+        """Draw one prediction beside the truth; None if the head draws no pictures."""
+        return None
+
+    def note(self, prediction: Tensor, truth: Tensor) -> str:
+        """Return the score of one image as text for the report's viewer."""
+        return ""
+
+    def file_kinds(self, write: Sequence[str] | None) -> Sequence[str]:
+        """Return the kinds of output of the setting `write`.
+
+        Raises:
+            SettingError: A kind belongs to other networks.
+        """
+        if foreign := set(write or ()).difference(self.suffixes):
+            raise SettingError(
+                "write",
+                found=", ".join(sorted(foreign)),
+                expected=f"{', '.join(self.suffixes)} for a network that predicts {self.source}",
+            )
+        return list(self.suffixes)[:-1] if write is None else write
+
+    @property
+    def source(self) -> str:
+        """Kind of output that holds the predicted pixels."""
+        return next(iter(self.suffixes))
+
+    def count(self, mosaics: Iterable[HeadMosaic]) -> str:
+        """Prepare for predictions by those of some images; return a line to print, or ""."""
+        return ""
+
+    def predicted(
+        self, mosaic: HeadMosaic, image: Any, files: Mapping[str, Path] = MappingProxyType({})
+    ) -> PredictedImage:
+        """Return the predicted pixels of an image.
+
+        Args:
+            mosaic: The image, put together from views.
+            image: Panorama or photo.
+            files: Files of the image by kind. Those that need the mosaic are written at once.
+        """
+        pixels = mosaic.pixels().cpu().numpy()
+        return PredictedImage(image, image.cut(pixels), mosaic.facts)
+
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write the files of one image by kind, except for those that `predicted` has written."""
+        raise NotImplementedError
+
+    def read(self, file: Path) -> NDArray[Any]:
+        """Read the predicted pixels from a file that `write` wrote."""
+        raise NotImplementedError
+
+    def painter(self, kind: str, summaries: Sequence[Any]) -> Painter:
+        """Return a function that paints the frames of a video.
+
+        Args:
+            kind: Kind of output, e.g. ``color``.
+            summaries: Summaries of all frames of the video.
+        """
+        raise NotImplementedError
+
+    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
+        """Return the summary of one image.
+
+        Args:
+            predicted: Image with its prediction.
+            is_counted: Mask ``(h, w)``, or of any shape that fits, that is True for counted pixels.
+        """
+        return {}
+
+    def table(self, summaries: Sequence[Any]) -> SummaryTable:
+        """Return a table of the summaries of all images."""
+        return SummaryTable("", (), ())
+
+
+def solid_angles(predicted: PredictedImage) -> NDArray[np.floating]:
+    """Return the relative solid angles ``(h, w)`` of the pixels.
+
+    A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
+    """
+    image, shape = predicted.image, predicted.pixels.shape
+    if image.camera_matrix is not None:
+        return ray_lengths(image.camera_matrix, shape) ** -3.0
+    of_rows = equirect_solid_angles(image.shape)[:, None]
+    if image.area is not None:
+        of_rows = of_rows[image.area.places()[0]]
+    return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory

@@ -1,0 +1,409 @@
+"""Head for distances: the distance from the center at every pixel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, ClassVar, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from datamodules.core.labels import DISTANCE
+from datamodules.core.panoramas import STEPS_PER_M
+from tangent_train.checkpoints.distances import (
+    along_rays,
+    depth_of_output,
+    distance_of,
+    from_distance,
+    is_disparity,
+    is_metric,
+)
+from tangent_train.checkpoints.kinds import Align, DepthKind
+from tangent_train.errors import SettingError, at_least, of_extra
+from tangent_train.files import write_bytes
+from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.heads.aligned_mosaic import AlignedMosaic
+from tangent_train.heads.base import (
+    RGB,
+    Head,
+    Painter,
+    PredictedImage,
+    Scores,
+    SummaryTable,
+    solid_angles,
+)
+from tangent_train.heads.losses import DepthLoss, log_error_sum
+from tangent_train.heads.pictures import (
+    colorize_distance,
+    distance_limits,
+    distance_panel,
+    distance_picture,
+)
+from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
+from tangent_train.metrics.depth import (
+    Alignment,
+    DepthMetric,
+    DepthProtocol,
+    Quantity,
+    depth_intervals,
+    error_sums,
+    mean_depth_scores,
+    scaled_and_shifted,
+)
+from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
+from tangent_train.metrics.segmentation import Interval
+from tangent_train.rendering import Blend
+from tangent_train.rendering.checks import check_choice
+
+_LEAST = 1e-3
+"""Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
+
+_WORSE = 1.01
+"""Quotient of the steps after and before an alignment above which views agree less."""
+
+_SAMPLES = 2**16
+"""Pixels whose median is that of an image."""
+
+_ROWS = {
+    "known": "known pixels, % of the solid angle",
+    "too_far": "too far for 16 bits, unknown in depth files, %",
+    "nearest": "nearest{unit}",
+    "median": "median{unit}",
+    "farthest": "farthest{unit}",
+    "step_before": "median step between views before alignment, %",
+    "step_after": "median step between views after alignment, %",
+    "isolated": "views without overlap",
+}
+"""Rows of the table, by name in the summary; shares are in percent."""
+
+
+class DistanceHead(Head):
+    """One distance for every pixel, or depth of another kind, see `DepthKind`.
+
+    The loss is that of the logarithm. The views of a panorama are aligned with each other and
+    blended. Scores are means over the images. Predicted pixels are distances from the center in
+    panoramas and z-depth in photos, float32, NaN where unknown.
+
+    Args:
+        class_names: Not used.
+        depth_kind: Kind of the network's output; None for ``log_distance``.
+        loss: Kind of loss, see `log_error_sum`.
+        scale_invariance: λ of the loss `scale_invariant`.
+        align: Alignment of the views of a panorama with each other, see `heads.alignment`; None for
+            the usual one of `depth_kind`.
+        alignment: See `DepthProtocol`.
+        alignment_in: See `DepthProtocol`; None for the quantity in which the network predicts.
+        min_distance: See `DepthProtocol`; pixels beyond the limits are ignored in training too.
+        max_distance: See `DepthProtocol`.
+        clip: See `DepthProtocol`.
+        depth_format: Suffix of the depth files without dot: png, npy or exr; None for png.
+        depth_scale: Units per meter in PNG files.
+        points: Number of points of an image, at most; None for 500 000.
+
+    Raises:
+        SettingError: A setting is invalid, or a package for the format is missing.
+    """
+
+    kind: ClassVar[str] = DISTANCE
+    labels: ClassVar[str] = DISTANCE
+    columns: ClassVar[Mapping[str, ScoreColumn]] = with_solid_angle(
+        {
+            "absrel": ScoreColumn("AbsRel", "", better="lower"),
+            "delta1": ScoreColumn("δ1"),
+            "rmse": ScoreColumn("RMSE", "m", better="lower"),
+            "mae": ScoreColumn("MAE", "m", better="lower", is_main=False),
+            "sqrel": ScoreColumn("SqRel", "m", better="lower", is_main=False),
+            "rmse_log": ScoreColumn("RMSElog", "", better="lower", is_main=False),
+            "delta2": ScoreColumn("δ2", is_main=False),
+            "delta3": ScoreColumn("δ3", is_main=False),
+            "missing": ScoreColumn("missing", better="lower", is_main=False),
+        }
+    )
+    main_score: ClassVar[str] = "absrel"
+    takes: ClassVar[str] = "images (n, C, h, w) to one number for every pixel (n, 1, h, w)"
+    predict_settings: ClassVar[Sequence[str]] = ("align", "depth_format", "depth_scale", "points")
+    num_outputs = 1
+    summary: ClassVar[str] = "depth"
+    unknown: ClassVar[float] = math.nan
+    summary_columns = ("unit", *_ROWS)
+
+    def __init__(
+        self,
+        class_names: Sequence[str] = (),
+        depth_kind: DepthKind | None = None,
+        loss: DepthLoss = "log_l1",
+        scale_invariance: float = 0.5,
+        align: Align | None = None,
+        alignment: Alignment = "none",
+        alignment_in: Quantity | None = None,
+        min_distance: float = 0.0,
+        max_distance: float | None = None,
+        clip: bool = False,
+        depth_format: str | None = None,
+        depth_scale: float = 1000.0,
+        points: int | None = None,
+    ) -> None:
+        super().__init__()
+        self.depth_kind: DepthKind = depth_kind or "log_distance"
+        check_choice("task.head.depth_kind", self.depth_kind, get_args(DepthKind))
+        check_choice("task.head.loss", loss, get_args(DepthLoss))
+        check_choice("align", align or "none", get_args(Align))
+        quantity = alignment_in or ("disparity" if is_disparity(self.depth_kind) else "distance")
+        self.protocol = DepthProtocol(alignment, quantity, min_distance, max_distance, clip)
+        self.loss: DepthLoss = loss
+        self.scale_invariance = scale_invariance
+        self.align = align
+        self.is_metric = is_metric(self.depth_kind)
+        suffix = f".{depth_format or 'png'}"
+        if suffix == ".exr":
+            with of_extra("exr", "depth_format"):
+                import OpenEXR  # noqa: F401
+        if not 0 < depth_scale < math.inf:
+            raise SettingError("depth_scale", found=depth_scale, expected="more than 0")
+        self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
+        self._points = 500_000 if points is None else at_least("points", points, 1)
+        self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
+        self._aligned: AlignedMosaic | None = None
+
+    # Training
+
+    def truth(self, labels: Tensor) -> Float[Tensor, "*shape"]:
+        """Return true distances in meters; NaN where they are unknown or beyond the limits.
+
+        Args:
+            labels: Distances in steps of 1/512 m, 0 where unknown.
+        """
+        return self.protocol.limited(labels.float() / STEPS_PER_M)
+
+    def targets(self, truth: Tensor, ray_lengths: Tensor) -> Tensor:
+        """Return the output that would be correct, see `Head`."""
+        return from_distance(truth, self.depth_kind, ray_lengths)
+
+    def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        """Return the loss of outputs ``(n, 1, h, w)``, given the correct ones ``(n, h, w)``."""
+        return log_error_sum(self.errors(outputs, targets), self.loss, self.scale_invariance)
+
+    def errors(
+        self, outputs: Float[Tensor, "images 1 height width"], targets: Tensor
+    ) -> Float[Tensor, "images height width"]:
+        """Return the errors of the logarithm of the network's depth, or disparity.
+
+        Relative outputs are first scaled and shifted, see `scaled_and_shifted`.
+
+        Args:
+            outputs: Outputs of the network.
+            targets: The correct outputs ``(n, h, w)``; NaN where unknown.
+        """
+        values = outputs[:, 0].to(targets.dtype)  # float32 in half-precision training
+        if self.depth_kind == "log_distance":
+            return values - targets
+        if not self.is_metric:
+            values = scaled_and_shifted(values, targets)
+        return values.clamp(min=_LEAST).log() - targets.log()
+
+    def loss_norm(self, targets: Tensor) -> Tensor:
+        """Return the number of pixels whose distance is known."""
+        return (~targets.isnan()).sum().float()
+
+    # Scores
+
+    def build_metric(self) -> DepthMetric:
+        """Build the metric, which keeps the sums of the errors of each image.
+
+        Raises:
+            SettingError: The predictions have no scale, and are not aligned with the truth.
+        """
+        if self.protocol.alignment == "none" and not self.is_metric:
+            raise SettingError(
+                "task.head.alignment",
+                found=f"none, for a network that predicts {self.depth_kind}",
+                expected="median, scale or affine: the scale of its distances is unknown",
+                remedy="task.head.alignment=affine",
+            )
+        return DepthMetric()
+
+    def scores(self, result: NDArray[np.float64]) -> Scores:
+        """Return means over images; for panoramas, also by solid angle and latitude.
+
+        Args:
+            result: Sums ``(images, 8, 10)``, see `error_sums`.
+        """
+        pixels, angles = (mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
+        if not result[:, 1].any():
+            return Scores(pixels)
+        bands = map(mean_depth_scores, result[:, 2:].swapaxes(0, 1))
+        return Scores(pixels | by_solid_angle(angles), bands=list(bands))
+
+    def intervals(self, result: NDArray[np.float64]) -> dict[str, Interval]:
+        """Return intervals of the means."""
+        pixels, angles = (depth_intervals(result[:, weighting]) for weighting in (0, 1))
+        return pixels | by_solid_angle(angles)
+
+    def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
+        """Return means over some images; NaN if they have no known distances."""
+        undefined = dict.fromkeys(self.scores(result).means, np.nan)
+        return undefined | dict(self.scores(result[list(places)]).means)
+
+    @property
+    def facts(self) -> dict[str, str]:
+        """Errors are those of the pixels of an image, averaged over the images.
+
+        The alignment of views is known after an evaluation on panoramas.
+        """
+        views = {} if self._aligned is None else {"views_aligned": self._aligned.report.mode}
+        return {"weighting": "pixels, then images", **self.protocol.facts, **views}
+
+    def comparable(
+        self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None
+    ) -> Tensor:
+        """Return distances aligned with the true ones; crops of a photo have separate scales."""
+        if ray_lengths is None:
+            return self.protocol.aligned(prediction, truth)
+        crops = zip(prediction, truth, ray_lengths, strict=True)
+        return torch.stack([self.protocol.aligned(*crop) for crop in crops])
+
+    # From views to a panorama
+
+    def mosaic(
+        self,
+        shape: tuple[int, int],
+        blend: Blend,
+        *,
+        averaged: bool = False,
+        device: Any = "cpu",
+        valid: NDArray[np.bool_] | None = None,
+        camera_matrix: NDArray[np.float64] | None = None,
+    ) -> AlignedMosaic:
+        """Return a mosaic that keeps all views until they are aligned."""
+        given = shape, self.depth_kind, blend, self.align
+        self._aligned = AlignedMosaic(*given, valid=valid, camera_matrix=camera_matrix)
+        return self._aligned
+
+    def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
+        """Return distances along the rays of single crops."""
+        lengths = ray_lengths[:, None]
+        values, kind = depth_of_output(outputs, self.depth_kind, lengths)
+        return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
+
+    # Pictures and files
+
+    def panel(self, rgb: RGB, truth: NDArray[Any], prediction: NDArray[Any]) -> RGB:
+        """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
+        return distance_panel(rgb, truth, prediction)
+
+    def note(self, prediction: Tensor, truth: Tensor) -> str:
+        """Return AbsRel of one image; "" without known distances."""
+        sums = error_sums(prediction, truth)[:1].cpu().numpy()
+        absrel = mean_depth_scores(sums)["absrel"]
+        return "" if np.isnan(absrel) else f"AbsRel {absrel:.3g}"
+
+    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
+        """Write depth, a colored picture and points."""
+        if "depth" in files:
+            write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
+        if "color" in files:
+            picture = distance_picture(predicted.pixels, "m" if self.is_metric else "relative")
+            write_pixels(files["color"], picture)
+        if "points" in files:
+            from trimesh import PointCloud  # half a second
+
+            points, colors = points_of(predicted, spread_pixels(predicted, self._points))
+            content: Any = PointCloud(points.astype(np.float32), colors).export(file_type="ply")
+            write_bytes(files["points"], content)
+
+    def read(self, file: Path) -> NDArray[Any]:
+        """Read depth."""
+        depth = read_depth_m(file, self._units_per_m)
+        return np.where(depth > 0, depth, np.float32(np.nan))
+
+    def painter(self, kind: str, summaries: Sequence[Any]) -> Painter:
+        """Color depth by the range of all frames of the video."""
+        ranges = [colors for summary in summaries if (colors := summary.get("colors"))]
+        near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
+        limits = min(near), max(far)
+        return lambda rgb, depth: colorize_distance(depth, limits)
+
+    def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
+        """Return unit, shares of the solid angle, distances, range of the colors, alignment."""
+        depth, angles = predicted.pixels, solid_angles(predicted)
+        total = np.sum(angles, where=is_counted) or 1
+        known, too_far = (
+            np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
+        )
+        facts = {"known": known, "too_far": too_far, **predicted.facts}
+        summary: dict[str, Any] = {"unit": "m" if self.is_metric else "relative"}
+        if known:
+            median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
+            facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
+            summary["colors"] = [float(f"{limit:.4g}") for limit in distance_limits(depth)]
+        return summary | {
+            name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
+            for name, value in facts.items()
+        }
+
+    def table(self, summaries: Sequence[Any]) -> SummaryTable:
+        """Return the means of the summaries over the images."""
+        rows, unit = [], ", m" if self.is_metric else ""
+        for name, title in _ROWS.items():
+            values = [value for of in summaries if (value := of.get(name)) is not None]
+            if any(values) or (name == "known" and values):
+                mean = np.mean(values) * (100 if "%" in title else 1)
+                rows.append([title.format(unit=unit), f"{mean:.3g}"])
+        steps = [(of.get("step_before"), of.get("step_after")) for of in summaries]
+        if worse := sum(None not in step and step[1] > _WORSE * step[0] for step in steps):
+            rows.append(
+                ["images whose views agree less than before: try another align", str(worse)]
+            )
+        kind = "depth in meters" if self.is_metric else "relative: median distance 1"
+        return SummaryTable(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
+
+
+def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
+    """Return known pixels, evenly spread over the solid angle that they cover.
+
+    Row by row, a pixel is taken each time the solid angle has grown by a `count`-th of the sum
+    (systematic sampling).
+
+    Args:
+        predicted: Image with its depth.
+        count: Number of pixels, at most.
+
+    Returns:
+        ``(2, n)`` rows and columns of the depth map.
+    """
+    grown = np.where(np.isfinite(predicted.pixels), solid_angles(predicted), 0).ravel()
+    np.cumsum(grown, out=grown)  # in place, which saves memory
+    grown *= count / (grown[-1] or 1)
+    np.floor(grown, out=grown)
+    chosen = np.flatnonzero(np.concatenate([grown[:1] > 0, grown[1:] > grown[:-1]]))
+    return np.stack(np.unravel_index(chosen, predicted.pixels.shape))
+
+
+def points_of(
+    predicted: PredictedImage, pixels: NDArray[np.intp]
+) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+    """Return ``(n, 3)`` points and their RGB colors.
+
+    Args:
+        predicted: Image with its depth.
+        pixels: Rows and columns, see `spread_pixels`.
+
+    Returns:
+        Points in right-handed axes, as other programs expect: of panoramas x ahead (the middle of
+        the panorama), y to the left, z up; of photos x to the right, y down, z ahead.
+    """
+    image, depth, (rows, columns) = predicted.image, predicted.pixels[tuple(pixels)], pixels
+    if image.area is not None:
+        of_rows, of_columns = image.area.places()
+        rows, columns = of_rows[rows], of_columns[columns]
+        lonlat_rad = equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape)
+        rays = lonlat_to_xyz(lonlat_rad) @ FLIP_Y
+    else:
+        rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
+        rays = rays @ np.linalg.inv(np.asarray(image.camera_matrix)).T
+    return rays * depth[:, None].astype(np.float64), image.rgb[rows, columns]

@@ -1,0 +1,45 @@
+"""A third kind of output, a head and its metric, is trained, evaluated and predicted."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import pytest
+import torch
+from torch import nn
+
+from tangent_train.inference.engine import Predictor
+from tangent_train.inference.images import InputImage
+from tangent_train.inference.representations import PanoramaViews
+from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import PixelTask
+from tests.heads.toy_share import ShareHead
+from tests.inference.trained import TANGENT, sphere, trained_network
+from tests.tasks.shapes import quiet_trainer
+from tests.tasks.test_segmentation import NAMES, Data
+
+
+@pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
+def test_a_head_and_its_metric_are_enough() -> None:
+    torch.manual_seed(0)
+    head, representation = ShareHead(NAMES, "b"), TangentRepresentation(base_level=0, level=4)
+    task = PixelTask(nn.Conv2d(2, 1, 1), representation, head, partial(torch.optim.SGD, lr=5))
+    trainer, data = quiet_trainer(max_epochs=60, limit_val_batches=0), Data()
+    (before,) = trainer.test(task, datamodule=data, verbose=False)
+    trainer.fit(task, datamodule=data)
+    (after,) = trainer.test(task, datamodule=data, verbose=False)
+    assert after["test/mae"] < 0.85 * before["test/mae"]
+    assert head.mode_of(task.monitor) == "min"
+    result = task.evaluation_result("panoramas")
+    assert (result.main, result.scores["mae"]) == ("mae", after["test/mae"])
+
+    loaded = trained_network(TANGENT)
+    loaded.__dict__["network"] = nn.Conv2d(3, 1, 1)
+    mosaic = Predictor(loaded, head, PanoramaViews(loaded)).predict(InputImage(sphere(32)))
+    with torch.no_grad():
+        weight = loaded.network.weight.flatten().numpy()
+    found = head.predicted(mosaic, InputImage(sphere(32))).pixels
+    colors = loaded.normalization.mean, loaded.normalization.std
+    values = (sphere(32) / 255 - colors[0]) / colors[1] @ weight + loaded.network.bias.item()
+    assert np.abs(found - values).mean() < 0.05
