@@ -15,7 +15,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.io.gpano import PanoramaArea
 
 WHOLE, PART = "whole panorama", "35° above and below the horizon"

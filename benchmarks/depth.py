@@ -18,7 +18,7 @@ from tangent_train.geometry import equirect_directions
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, views_per_forward
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews, photo_network_settings
+from tangent_train.inference.views import PanoramaViews, photo_network_settings
 
 
 class RoomDepth(nn.Module):

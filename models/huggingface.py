@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.unet import check_sides
-from tangent_train.config.setting_rules import flat_settings
 from tangent_train.errors import SettingError, of_extra
 
 _Value = bool | int | float | str | None
@@ -77,6 +76,12 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
     return {"model_type": kind.model_type, **known}
 
 
+def _names(settings: Mapping[str, Any], prefix: str = "") -> set[str]:
+    """Return the names of settings and of settings inside them."""
+    inner = (_names(v, f"{prefix}{n}.") for n, v in settings.items() if isinstance(v, Mapping))
+    return {f"{prefix}{name}" for name in settings}.union(*inner)
+
+
 def _patch_size(config: Any) -> int:
     """Return the side in pixels of the patches that a network reads whole; 1 without patches."""
     inside = getattr(config, "backbone_config", None) or config
@@ -106,7 +111,7 @@ class _TransformersNetwork(nn.Module):
     ) -> None:
         super().__init__()
         known = architecture(config)
-        unknown = dict(flat_settings(config)).keys() - dict(flat_settings(known)).keys()
+        unknown = _names(config) - _names(known)
         if unknown:
             raise SettingError(
                 f"network.config.{min(unknown)}",

@@ -12,8 +12,8 @@ from tangent_train.imports import import_own_packages
 
 if TYPE_CHECKING:
     from tangent_train.geometry import RingGrid, TangentGrid
+    from tangent_train.inference.api import load
     from tangent_train.inference.applying import apply
-    from tangent_train.inference.network import load
     from tangent_train.rendering import (
         equirect_to_tangent,
         tangent_to_equirect,
@@ -36,7 +36,7 @@ _HOMES = {
     "RingGrid": "geometry",
     "TangentGrid": "geometry",
     "apply": "inference.applying",
-    "load": "inference.network",
+    "load": "inference.api",
 }
 
 

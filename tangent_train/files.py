@@ -11,9 +11,11 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any
 
-from tangent_train.errors import DataError
+from pydantic import AfterValidator, TypeAdapter, ValidationError
+
+from tangent_train.errors import DataError, printable
 
 
 @contextmanager
@@ -110,6 +112,59 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
             remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
     return content
+
+
+def is_text(value: Any) -> bool:
+    """Return True for one line of text without control characters, such as a class name."""
+    return isinstance(value, str) and "\n" not in value and printable(value) == value
+
+
+def is_class_name(value: Any) -> bool:
+    """Return True for a text that can be written as UTF-8; names of files may not."""
+    return is_text(value) and not any("\ud800" <= letter <= "\udfff" for letter in value)
+
+
+def _one_line(text: str) -> str:
+    if not is_text(text):
+        raise ValueError("one line of text")
+    return text
+
+
+Text = Annotated[str, AfterValidator(_one_line)]
+"""Kind of a field in a file: one line of text without control characters."""
+
+
+def check_fields(
+    path: Path, content: Any, kinds: Mapping[str, Any], expected: str, where: str = ""
+) -> dict[str, Any]:
+    """Return the fields of a mapping in a file, each of its kind.
+
+    Args:
+        path: File, for the message.
+        content: Content of the file.
+        kinds: Type of each field; a union with None if the field may be missing.
+        expected: Expected file, for the message.
+        where: Place in the file, for the message.
+
+    Returns:
+        Values of the fields; None for missing ones.
+
+    Raises:
+        DataError: The content is not a mapping, or a field is missing or of another type.
+    """
+    inside = f"in {where}" if where else "inside"
+    if not isinstance(content, Mapping):
+        found = f"{type(content).__name__} instead of a mapping {inside}"
+        raise DataError(path, found=found, expected=expected)
+    fields = {}
+    for name, kind in kinds.items():
+        value = content.get(name)
+        try:
+            fields[name] = TypeAdapter(kind).validate_python(value, strict=True)
+        except ValidationError as error:
+            found = f"no {name} {inside}" if value is None else f"{name}={value!r} {inside}"
+            raise DataError(path, found=found, expected=expected) from error
+    return fields
 
 
 def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> Any:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import io
 import logging
-import multiprocessing  # noqa: F401 - stores the working directory, where its processes start
-import os
 import sys
 import warnings
 from collections.abc import Iterator
-from contextlib import chdir, contextmanager, redirect_stderr, redirect_stdout
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -38,24 +36,6 @@ def import_own_packages() -> None:
                 f"{other.origin} is not used: tangent-train has a package of this name. Rename it "
                 "to use its classes in a config.\n"
             )
-
-
-@contextmanager
-def elsewhere() -> Iterator[None]:
-    """Change the working directory to that of this package, for a block with imports.
-
-    While they are imported, torch loads ``libcuda.so.1``, numba reads ``.numba_config.yaml`` and
-    matplotlib reads ``matplotlibrc`` from the working directory, which may contain untrusted files.
-    OpenCV adds an empty entry to ``LD_LIBRARY_PATH``, with which further processes would load
-    libraries from there; it is removed.
-    """
-    with chdir(Path(__file__).parent):
-        try:
-            yield
-        finally:
-            entries = os.environ.pop("LD_LIBRARY_PATH", "").split(os.pathsep)
-            if entries := [entry for entry in entries if entry]:
-                os.environ["LD_LIBRARY_PATH"] = os.pathsep.join(entries)
 
 
 @contextmanager

@@ -19,10 +19,10 @@ from tests.running import run_python
 
 def test_names_come_from_their_packages() -> None:
     from tangent_train import geometry, rendering
-    from tangent_train.inference import applying, network
+    from tangent_train.inference import api, applying
 
     assert tangent_train.TangentGrid is geometry.TangentGrid
-    assert tangent_train.load is network.load
+    assert tangent_train.load is api.load
     assert tangent_train.apply is applying.apply
     for name in ("equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)

@@ -24,7 +24,7 @@ from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, view_scores, views_per_forward
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.photo_networks import PhotoNetwork, import_network
 
 

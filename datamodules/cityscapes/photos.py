@@ -34,9 +34,8 @@ from datamodules.core.inputs import Input
 from datamodules.core.numbered import NumberedReader, number_table
 from datamodules.core.panoramas import ImageFiles
 from datamodules.core.problems import Problems
-from tangent_train.config.build import check_fields
 from tangent_train.errors import DataError
-from tangent_train.files import read_json
+from tangent_train.files import check_fields, read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
 from tangent_train.io.pixel_files import read_image_size
 

@@ -21,9 +21,9 @@ from datamodules.core.inputs import Normalization
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.problems import Problems
 from datamodules.core.reading import SplitReader, Transform
-from tangent_train.config.build import is_class_name
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
+from tangent_train.files import is_class_name
 from tangent_train.threads import in_threads
 
 _Item = TypeVar("_Item", bound=Item)

@@ -14,8 +14,6 @@ from typing import Any, TypeVar
 
 import cv2
 
-from tangent_train.imports import elsewhere
-
 _THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 _Result = TypeVar("_Result")
 
@@ -48,8 +46,7 @@ def in_processes(
     with _one_thread_each(), ProcessPoolExecutor(processes, context, _prepare_worker) as pool:
         try:
             if "forkserver" in methods:
-                with elsewhere():  # the processes it starts return to the working directory
-                    forkserver.ensure_running()
+                forkserver.ensure_running()
             futures = [pool.submit(work, *piece) for piece in pieces]
             for future in as_completed(futures):
                 yield future.result()

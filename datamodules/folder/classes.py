@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.config.build import is_class_name
 from tangent_train.errors import DataError, counted
-from tangent_train.files import read_json
+from tangent_train.files import is_class_name, read_json
 from tangent_train.io.image_files import composed
 
 UNKNOWN_NAME = "unknown"

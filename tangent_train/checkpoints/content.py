@@ -1,16 +1,13 @@
-"""Content of a checkpoint and of the settings of a run."""
+"""Content of a checkpoint."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
-import yaml  # type: ignore[import-untyped]
-
-from tangent_train.config.build import Text, check_fields, check_plain
-from tangent_train.errors import DataError, first_line
-from tangent_train.files import load_plain, write_text
+from tangent_train.errors import DataError
+from tangent_train.files import Text, check_fields, load_plain
 
 INPUTS = list[Literal["rgb", "depth", "elevation"]]
 """Inputs of a network; equal to `datamodules.core.inputs.Input`, which is slow to import."""
@@ -45,59 +42,4 @@ def read_checkpoint(path: Path, needed: Collection[str] = tuple(_FIELDS)) -> dic
         raise DataError(path, found="a folder", expected=_EXPECTED, remedy=remedy)
     content = load_plain(path, _EXPECTED, mmap=True)
     kinds = {name: kind for name, kind in _FIELDS.items() if name in needed}
-    checked = check_fields(path, content, kinds, _EXPECTED)
-    if "config" in checked:
-        checked["config"] = check_plain(path, checked["config"], "config")
-    return checked
-
-
-def read_settings(path: Path) -> dict[str, Any]:
-    """Read the settings of a run from a file that `write_settings` wrote.
-
-    Nothing is interpolated: ``${oc.env:HOME}`` is an ordinary string. Aliases, by which a few lines
-    can expand to more than fits into memory, merged mappings (``<<``) and repeated names are
-    refused.
-
-    Raises:
-        DataError: The file is missing, or is not such a file.
-    """
-    expected = "the settings of a run, without aliases"
-    try:
-        content = _Loader(path.read_text(encoding="utf-8")).get_single_data()
-    except (OSError, ValueError, RecursionError, yaml.YAMLError) as error:
-        found = first_line(f"{type(error).__name__}: {error}")
-        raise DataError(path, found=found, expected=expected) from error
-    if not isinstance(content, dict):
-        raise DataError(path, found=type(content).__name__, expected=expected)
-    settings: dict[str, Any] = check_plain(path, content, "settings")
-    return settings
-
-
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        """Refuse aliases."""
-        if self.check_event(yaml.AliasEvent):
-            raise yaml.YAMLError("an alias")
-        return super().compose_node(parent, index)
-
-    def flatten_mapping(self, node: Any) -> None:
-        """Refuse repeated names, of which PyYAML takes the last one."""
-        names = [(name.tag, str(name.value)) for name, _ in node.value]
-        if len(set(names)) < len(names):
-            raise yaml.YAMLError(f"a repeated name among {', '.join(n for _, n in names)}")
-
-
-class _Dumper(yaml.SafeDumper):  # type: ignore[misc]
-    def ignore_aliases(self, data: Any) -> bool:
-        """Write repeated values without aliases."""
-        return True
-
-
-def write_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Write settings as YAML, with strings quoted so that every reader takes them literally.
-
-    Raises:
-        DataError: The settings have values that `read_settings` and `read_checkpoint` refuse.
-    """
-    check_plain(path, settings, "settings")
-    write_text(path, yaml.dump(dict(settings), Dumper=_Dumper, sort_keys=False, allow_unicode=True))
+    return check_fields(path, content, kinds, _EXPECTED)

@@ -21,7 +21,7 @@ from tangent_train.cli.run import (
 )
 from tangent_train.config.settings import EvaluateSettings
 from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.representations import check_size, panorama_settings
+from tangent_train.inference.views import check_size, panorama_settings
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -40,7 +40,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.label_map is not None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
-        loaded, notes = mapped.trained, [f"Label map {label_map.name}: {mapped}."]
+        loaded, notes = mapped.loaded, [f"Label map {label_map.name}: {mapped}."]
     check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
@@ -55,7 +55,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
     """Return the settings that come from the file: views, level, inputs and normalization."""
     level, section = settings.level or loaded.level, settings.representation or {}
     if "_target_" not in section:  # changes of the views of the file
-        stored = panorama_settings(loaded, level) if level != loaded.level else {}
+        stored = {} if settings.level is None else panorama_settings(loaded, level)
         section = {**loaded.representation, **stored, **section}
     if section.get("level", 0) is None:
         section = {**section, "level": level}

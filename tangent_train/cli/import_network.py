@@ -115,7 +115,7 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
 
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
-    from tangent_train.inference.representations import PanoramaViews
+    from tangent_train.inference.views import PanoramaViews
 
     names = trained.class_names[1:]
     mean, std = trained.normalization.mean, trained.normalization.std

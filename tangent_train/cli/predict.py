@@ -26,7 +26,7 @@ from tangent_train.errors import SettingError, counted
 from tangent_train.heads import PredictedImage
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.inference.images import DepthFolder, InputImage, read_panorama, read_photo
-from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.io.masks import Masks
 from tangent_train.io.tangent_folders import panorama_area
 from tangent_train.results.html import EncodedImage

@@ -16,9 +16,9 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.heads import HEADS, PredictedImage, head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage, with_up
-from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.inference.up_likelihood import UpLikelihood
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 
 _OF_HEADS = {"min_confidence": 0, "min_share": 0, "align": None, "depth_format": None, "points": None}
 """Settings of single heads, with the value that is not read."""
@@ -51,7 +51,7 @@ class Prediction:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
             print_text(f"Label map {label_map.name}: {mapped}.")
-            loaded = mapped.trained
+            loaded = mapped.loaded
         has_confidences = loaded.predicts == PIXEL_CLASSES
         if settings.upright == "auto" and not has_confidences:
             expected = "pose or null: depth networks do not estimate the up direction"
@@ -60,7 +60,7 @@ class Prediction:
         self._predictor = Predictor(
             loaded, self.head, views, settings.device, settings.view_batch_size
         )
-        self._judge = NetworkJudge(original, self._predictor.device)
+        self._up_likelihood = UpLikelihood(original, self._predictor.device)
 
     def prepare(self, examples: Iterable[Callable[[], InputImage]]) -> None:
         """Let the head count in some of the images, see `Head.count`.
@@ -94,4 +94,4 @@ class Prediction:
     def _upright(self, image: InputImage) -> InputImage:
         if self._settings.upright != "auto":
             return image
-        return with_up(image, self._settings.max_tilt_deg, self._judge)
+        return with_up(image, self._settings.max_tilt_deg, self._up_likelihood)

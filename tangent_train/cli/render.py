@@ -17,7 +17,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
 from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
-from tangent_train.inference.representations import view_settings
+from tangent_train.inference.views import view_settings
 from tangent_train.io.camera_files import (
     CAMERAS_FILE,
     RIG_FILE,

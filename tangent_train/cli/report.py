@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from tangent_train.console import print_text
-from tangent_train.imports import elsewhere
 
 
 def report(arguments: Sequence[str]) -> None:
@@ -21,9 +20,8 @@ def report(arguments: Sequence[str]) -> None:
     """
     options = _parser().parse_args(arguments)
     # Slow imports, not needed to refuse a command line.
-    with elsewhere():
-        from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
-        from tangent_train.results.report import runs_report
+    from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
+    from tangent_train.results.report import runs_report
 
     results = [load_result(folder) for folder in find_runs(options.folders)]
     notes = [f"{run}: not finished, ignored." for run in unfinished_runs(options.folders)]

@@ -32,18 +32,18 @@ from tangent_train.checkpoints.loaded import (
 )
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
-from tangent_train.config.settings import RunSettings, flat_settings
+from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.results.evaluation import (
     confusion_table,
     result_tables,
     summary_lines,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult, plain_scores
+from tangent_train.results.evaluation_result import EvaluationResult, flat_settings, plain_scores
 from tangent_train.results.html import write_report
 from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.schedules import Schedule
@@ -118,7 +118,7 @@ class Run:
         """
         by_classes = self.task.head.kind == PIXEL_CLASSES  # else upright=auto is by the image alone
         if getattr(self.data, "upright", None) == "auto" and by_classes:
-            self.data.estimate_up(NetworkJudge(self.as_loaded(), trainer.strategy.root_device))
+            self.data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.source("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation

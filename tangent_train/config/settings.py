@@ -507,15 +507,6 @@ def plain(value: Any) -> Any:
     return [plain(one) for one in value] if isinstance(value, tuple) else value
 
 
-def flat_settings(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Return the settings of nested sections by their names, ``section.setting``."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        inner = isinstance(value, Mapping)
-        flat |= flat_settings(value, f"{prefix}{key}.") if inner else {f"{prefix}{key}": value}
-    return flat
-
-
 def validate(command: str, config: Any) -> Any:
     """Return the settings of a command as an object of its class.
 

@@ -3,7 +3,7 @@
 A representation selects the views of an image. The engine renders them, or takes rendered views
 from the loader, passes them to the network a few at a time, and adds the scores to a mosaic.
 Images, views, scores and mosaic are on one device. Validation, test, prediction, transfer, `load`
-and `NetworkJudge` use the engine.
+and `UpLikelihood` use the engine.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.heads import Head
     from tangent_train.inference.images import InputImage
-    from tangent_train.inference.representations import PanoramaViews, PhotoViews
+    from tangent_train.inference.views import PanoramaViews, PhotoViews
     from tangent_train.rendering import Interpolation
     from tangent_train.rendering.representations.views import Views
 
@@ -162,7 +162,7 @@ class RenderedViews:
     the device once, and tensors are rendered there.
 
     Args:
-        trained: The network, which is on the device.
+        loaded: The network, which is on the device.
         image: The panorama or photo.
         shape: Rows and columns to which it is resized first.
         device: A torch device.
@@ -170,31 +170,31 @@ class RenderedViews:
 
     def __init__(
         self,
-        trained: LoadedNetwork,
+        loaded: LoadedNetwork,
         image: InputImage,
         shape: tuple[int, int],
         device: torch.device | str,
     ) -> None:
-        weights = next(trained.network.parameters(), None)
+        weights = next(loaded.network.parameters(), None)
         # channels_last halves the time of a UNet on a CPU; an ONNX file has a fixed format.
         contiguous = torch.contiguous_format
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
-        self._trained = trained
+        self._loaded = loaded
         arrays = renders_arrays(device)
         self._image = image.resized(shape) if arrays else image
-        self._planes = None if arrays else input_planes(image, shape, trained.inputs, device)
+        self._planes = None if arrays else input_planes(image, shape, loaded.inputs, device)
 
     def __call__(self, views: Views) -> Tensor:
         """Return normalized views ``(n, C, h, w)``."""
-        inputs = self._trained.inputs
+        inputs = self._loaded.inputs
         if self._planes is None:
             rendered = render_inputs(self._image, views, inputs)
         else:
             rgb, others = self._planes
             colors = views.render(rgb, "bilinear").round().movedim(1, -1)
             rendered = colors, *(views.render(plane, how)[:, 0] for plane, how in others)
-        images = normalize(rendered, self._trained.normalization, inputs)
+        images = normalize(rendered, self._loaded.normalization, inputs)
         return images.to(self._dtype).contiguous(memory_format=self._format)
 
     def of(self, views: Views) -> ViewImages:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from datamodules.core.image_module import Upright
-    from tangent_train.inference.judge import NetworkJudge
+    from tangent_train.inference.up_likelihood import UpLikelihood
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]
     """Returns depth for an image of a size, in steps of 1/512 m; None without depth."""
@@ -151,17 +151,17 @@ def read_panorama(
     return InputImage(area.place(rgb), placed, up, area=area)
 
 
-def with_up(image: InputImage, max_tilt_deg: float, judge: NetworkJudge) -> InputImage:
+def with_up(image: InputImage, max_tilt_deg: float, up_likelihood: UpLikelihood) -> InputImage:
     """Return a panorama with its zenith, which is estimated if it is not given.
 
     Args:
         image: A panorama.
         max_tilt_deg: Largest tilt of an estimate, see `estimate_up`.
-        judge: Evidence for the estimate, from the confidence of a network.
+        up_likelihood: Evidence for the estimate, from the confidence of a network.
     """
     if image.up is not None:
         return image
-    return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(judge, image)))
+    return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(up_likelihood, image)))
 
 
 def read_photo(

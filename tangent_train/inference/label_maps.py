@@ -22,9 +22,8 @@ from typing import Literal
 
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.config.build import Text, check_fields
 from tangent_train.errors import DataError, SettingError
-from tangent_train.files import read_json
+from tangent_train.files import Text, check_fields, read_json
 from tangent_train.io.image_files import composed
 
 Unmapped = Literal["unknown", "never"]
@@ -57,14 +56,14 @@ class MappedNetwork:
     """A network with the classes of a map.
 
     Attributes:
-        trained: The network.
+        loaded: The network.
         classes: Classes of the original network in each target class.
         absent: Source classes of the map that the original network lacks.
         unmapped: Other classes of the original network.
         unmapped_wins: True if unmapped classes may win, as label 0.
     """
 
-    trained: LoadedNetwork
+    loaded: LoadedNetwork
     classes: Mapping[str, Sequence[str]]
     absent: Sequence[str]
     unmapped: Sequence[str]
@@ -123,7 +122,7 @@ def load_label_map(given: str | Path) -> LabelMap:
 
 
 def map_classes(
-    trained: LoadedNetwork,
+    loaded: LoadedNetwork,
     label_map: LabelMap,
     unmapped: Unmapped = "unknown",
     targets: Sequence[str] | None = None,
@@ -131,7 +130,7 @@ def map_classes(
     """Return a network with the classes of a map instead of its own.
 
     Args:
-        trained: The network.
+        loaded: The network.
         label_map: The map.
         unmapped: Treatment of classes that are not in the map. Unknown classes of an imported
             network remain unknown.
@@ -150,9 +149,9 @@ def map_classes(
             expected=f"names among {', '.join(targets)}",
         )
     target_of = {_plain(n): target for target, names in label_map.classes.items() for n in names}
-    trained.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
-    names = trained.class_names[1:]
-    groups = trained.groups or [[k] for k in range(len(names))]
+    loaded.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
+    names = loaded.class_names[1:]
+    groups = loaded.groups or [[k] for k in range(len(names))]
     members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
     for k, name in enumerate(names):
         members[target_of.get(_plain(name))].append(k)
@@ -163,7 +162,7 @@ def map_classes(
             found=f"no class of {label_map.source or 'the map'} in a network of {', '.join(names)}",
             expected="a map whose source classes include the network's",
         )
-    if remaining and unmapped == "never" and trained.score_kind == "labels":
+    if remaining and unmapped == "never" and loaded.score_kind == "labels":
         raise SettingError(
             "unmapped",
             found="never, for a network that returns labels",
@@ -176,7 +175,7 @@ def map_classes(
     scores += [unknown] if unknown else []
     found = {str(target): [names[k] for k in group] for target, group in members.items()}
     return MappedNetwork(
-        trained=replace(trained, class_names=("unknown", *targets), groups=scores),
+        loaded=replace(loaded, class_names=("unknown", *targets), groups=scores),
         classes=found,
         absent=[n for n in target_of if n not in map(_plain, names)],
         unmapped=[names[k] for k in remaining],

@@ -21,11 +21,12 @@ from tangent_train.checkpoints.loaded import (
     write_onnx_description,
 )
 from tangent_train.checkpoints.scores import Groups, network_for_views, plain_scores
-from tangent_train.config.build import build_from_config, unregistered
+from tangent_train.config.build import build_from_config
+from tangent_train.config.from_file import classes_to_trust
 from tangent_train.errors import SettingError, first_line, width_height
 from tangent_train.files import atomic_path
 from tangent_train.geometry import camera_matrix_from_fov, vertex_resolution
-from tangent_train.inference.representations import (
+from tangent_train.inference.views import (
     Levels,
     ViewChoice,
     check_size,
@@ -123,7 +124,7 @@ def import_network(
         else:
             _write_checkpoint(loaded, temporary)
         # The classes are from the user.
-        loaded = load_network(temporary, unregistered(network.settings))
+        loaded = load_network(temporary, classes_to_trust(network.settings))
     return loaded
 
 

@@ -23,7 +23,7 @@ from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import (
+from tangent_train.inference.views import (
     PanoramaViews,
     PhotoViews,
     images_of_side,
@@ -48,8 +48,8 @@ def here(tmp_path: Path) -> Path:
     return tmp_path
 
 
-TORCHVISION = ("network=torchvision", "output=net.ckpt")
-OF_ONNX = ("network=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
+TORCHVISION = ("library=torchvision", "output=net.ckpt")
+OF_ONNX = ("library=onnx", "file=net.onnx", "classes=classes.json", "normalization=unit")
 
 
 @pytest.mark.parametrize("wins", [True, False])
@@ -118,7 +118,7 @@ def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: P
     name = "lraspp_mobilenet_v3_large"
     monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
     monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
-    given = ("network=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
+    given = ("library=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
     with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as message:
         run("import", *given)
     file = Path(str(message.value).rpartition("save it as ")[2].removesuffix("."))
@@ -177,7 +177,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
     network = torchvision_models.get_model(name, weights=None, weights_backbone=None).eval()
     torch.save(network.state_dict(), here / "state.pt")
     (here / "classes.json").unlink()
-    arguments = ("network=torchvision", f"model={name}", "weights=state.pt")
+    arguments = ("library=torchvision", f"model={name}", "weights=state.pt")
     run("import", *arguments, "output=net.ckpt")
     weights = torchvision_models.get_model_weights(name)["DEFAULT"]
     assert f"21 classes: {', '.join(weights.meta['categories'])}\n" in capsys.readouterr().out
@@ -194,7 +194,7 @@ def test_torchvision_gives_the_scores_of_its_own_transform(
 # Depth.
 
 OF_DEPTH = (
-    *("network=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx"),
+    *("library=onnx", "file=depth.onnx", "normalization=unit", "output=ours.onnx"),
     "depth=metric_z",
 )
 
@@ -251,19 +251,19 @@ def test_a_network_of_a_config_predicts_depth(here: Path, run: Run, capsys: Capt
         ((*OF_DEPTH[:-1], "depth=meters"), "depth: found meters; expected .*metric_z"),
         ((*OF_ONNX, "output=o.onnx", "depth=metric_z"), "classes: .*expected null for depth"),
         (
-            ("network=onnx", "file=net.onnx", *OF_DEPTH[2:]),
+            ("library=onnx", "file=net.onnx", *OF_DEPTH[2:]),
             "found 4 per pixel, .*Leave out depth=",
         ),
         (
-            ("network=huggingface", "model=net", "output=net.ckpt", "depth=metric_z"),
+            ("library=huggingface", "model=net", "output=net.ckpt", "depth=metric_z"),
             "depth: found metric_z; expected null for networks of classes",
         ),
-        ((*TORCHVISION, "depth=metric_z"), "depth: found metric_z; .*null for network=torchvision"),
+        ((*TORCHVISION, "depth=metric_z"), "depth: found metric_z; .*null for library=torchvision"),
         (
-            ("network=huggingface", "output=net.ckpt", "weights=DEFAULT"),
-            "weights: .*network=huggingface",
+            ("library=huggingface", "output=net.ckpt", "weights=DEFAULT"),
+            "weights: .*library=huggingface",
         ),
-        ((*OF_DEPTH, "model=net"), "model: found net; expected null for network=onnx"),
+        ((*OF_DEPTH, "model=net"), "model: found net; expected null for library=onnx"),
         (("network=unet", "output=net.ckpt", "file=depth.onnx"), "file: .*null for network=unet"),
     ],
 )

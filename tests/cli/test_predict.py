@@ -20,7 +20,7 @@ from PIL import Image
 from tangent_train.geometry import rotation_about
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
@@ -215,11 +215,11 @@ def test_the_network_estimates_the_up_direction(
     room = draw_room((128, 256), tilt)
     write_pixels(tmp_path / "in" / "a.png", room)
 
-    def judge(self: NetworkJudge, image: InputImage, ups: NDArray[np.float64]) -> Any:
+    def judge(self: UpLikelihood, image: InputImage, ups: NDArray[np.float64]) -> Any:
         np.testing.assert_array_equal(image.rgb, room)
         return 30 * ups @ tilt[:, 2]
 
-    monkeypatch.setattr(NetworkJudge, "__call__", judge)
+    monkeypatch.setattr(UpLikelihood, "__call__", judge)
     found = predict(upright="auto", max_tilt_deg=180, write="[labels]", report=0)["a"]
     assert found["tilt_deg"] == pytest.approx(100, abs=0.5)
 

@@ -53,37 +53,13 @@ def test_conventions_of_hydra() -> None:
     assert given == (inner, 2), "handed on as they are"
 
 
-@pytest.mark.parametrize("text", ["${oc.env:HOME}", "a\\${x} ${y", "$\\\\{x}", "${z}"])
-def test_text_is_not_interpreted_again(text: str) -> None:
-    """The config is resolved already: a folder may be called so."""
-    inner = {"_target_": f"{ME}.pair", "first": [text]}
-    section = {"_target_": f"{ME}.Kept", "x": text, "y": {"z": [text, {"z": text}]}, "i": inner}
-    named = build_from_config(section, "x").named
-    assert named == {"x": text, "y": {"z": [text, {"z": text}]}, "i": ([text], None)}
-
-
 @pytest.mark.parametrize(
     ("section", "message"),
     [
-        (UNET | {"in_channels": "three"}, r"^network\.in_channels: found three; expected int"),
-        (UNET | {"in_chanels": 3}, r"^network: found in_chanels for .*Is in_channels meant\?"),
-        (UNET | {"widths": 8}, r"^network: found models\.UNet cannot be made"),
-        (
-            {"_target_": f"{ME}.Kept", "i": UNET | {"x": 1}},
-            r"^network\.i: found x for models\.UNet",
-        ),
-        (
-            {"_target_": f"{ME}.Kept", "i": [UNET | {"widths": 8}]},
-            r"^network\.i\.0: found models\.UNet cannot",
-        ),
-        ({"_target_": f"{ME}.Absent"}, r"^network\._target_: .*Absent, which cannot be imported"),
-        ({"_target_": "os.unlink", "path": "x"}, r"^network: found os\.unlink cannot be made"),
-        ({"_target_": f"{ME}.Kept", "_args_": 3}, r"^network: .*InstantiationException"),
-        ({"_target_": f"{ME}.Handing", "x": 1}, r"^network: .*Handing cannot .* argument 'x'"),
-        (
-            {"_target_": f"{ME}.Kept", "i": {"_target_": f"{ME}.Handing", "x": 1}},
-            r"^network\.i: .*Handing cannot .* argument 'x'",
-        ),
+        (UNET | {"in_chanels": 3}, r"^network: found models\.UNet.*argument 'in_chanels'"),
+        ({"_target_": f"{ME}.Kept", "i": UNET | {"x": 1}}, r"^network: .*argument 'x'"),
+        ({"_target_": f"{ME}.Absent"}, r"^network: found .*Absent"),
+        ({"_target_": f"{ME}.Handing", "x": 1}, r"^network: .*Handing.* argument 'x'"),
         (None, r"^network: found None; expected a section"),
     ],
 )
@@ -93,8 +69,7 @@ def test_errors_in_one_line(section: Any, message: str) -> None:
 
 
 def test_errors_of_ones_own_class_are_raised_as_they_are() -> None:
-    for section in ({"_target_": "builtins.int", "_args_": ["x"]},) * 2:
+    section = {"_target_": "builtins.int", "_args_": ["x"]}
+    for tried in (section, {"_target_": f"{ME}.Kept", "x": section}):
         with pytest.raises(ValueError, match="invalid literal"):
-            build_from_config(section, "x")
-        with pytest.raises(ValueError, match="invalid literal"):
-            build_from_config({"_target_": f"{ME}.Kept", "x": section}, "x")
+            build_from_config(tried, "x")

@@ -11,7 +11,7 @@ from torch import nn
 
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
 from tests.heads.toy_share import ShareHead

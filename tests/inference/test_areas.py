@@ -20,7 +20,7 @@ from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask

@@ -30,11 +30,11 @@ from tangent_train.geometry import (
 from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads import head_of
 from tangent_train.heads.aligned_mosaic import AlignedMosaic
+from tangent_train.inference.api import Network
 from tangent_train.inference.applying import apply
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.network import Network
-from tangent_train.inference.representations import PanoramaViews, PhotoViews, view_settings
+from tangent_train.inference.views import PanoramaViews, PhotoViews, view_settings
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.datamodules.data_files import gpano_xmp
 from tests.inference.trained import CUBE, ERP, ICOSPHERE, TANGENT, trained_network
@@ -261,7 +261,7 @@ def network(monkeypatch: pytest.MonkeyPatch) -> Network:
 
 def loaded(trained: LoadedNetwork, monkeypatch: pytest.MonkeyPatch, **settings: Any) -> Network:
     """Return a network as `load` does, without a file."""
-    monkeypatch.setattr("tangent_train.inference.network.load_network", lambda *_: trained)
+    monkeypatch.setattr("tangent_train.inference.api.load_network", lambda *_: trained)
     return tt.load("net.ckpt", **settings)
 
 
@@ -312,21 +312,13 @@ def test_networks_name_the_method_that_suits_them(
         "<Network of depth (metric_distance), inputs rgb, trained at level 5 on 32×32 images of "
         "TangentRepresentation, on cpu>"
     )
-    for method in (network.labels, network.scores):
+    for method in (network.labels, network.probabilities):
         with pytest.raises(SettingError, match=r"predicts distance; expected .*Use depth\(\)"):
             method(panorama)
-    with pytest.raises(SettingError, match=r"predicts pixel_classes; .*Use labels\(\) or scores"):
+    with pytest.raises(SettingError, match=r"predicts pixel_classes; .*Use labels\(\) or prob"):
         classes.depth(panorama)
-    automatic: Any = "auto"
-    with pytest.raises(SettingError, match=r"upright: found auto; .*Use pose for files"):
-        network.depth(panorama, upright=automatic)
-    trained = depth_network()
-    with pytest.raises(SettingError, match=r"min_confidence: found 0\.5; expected 0 for depth"):
-        loaded(trained, monkeypatch, min_confidence=0.5)
-    with pytest.raises(SettingError, match="align: found 'median'; expected"):
-        loaded(trained, monkeypatch, align="median")
-    with pytest.raises(SettingError, match="align: found scale; expected None for networks of cl"):
-        loaded(trained_network(TANGENT), monkeypatch, align="scale")
+    with pytest.raises(TypeError, match="min_confidence"):
+        loaded(depth_network(), monkeypatch, min_confidence=0.5)
 
 
 # Functions.

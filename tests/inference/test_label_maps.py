@@ -96,7 +96,7 @@ def test_a_map_maps_a_network_as_a_set_of_classes_the_labels(name: str, labels: 
     key = labels.key[1 : 1 + len(labels.of)].tolist()
     order = (*range(1, 1 + len(labels.names)), 0)
     groups = [[k for k, to in enumerate(key) if to == label] for label in order]
-    assert list(map(list, mapped.trained.groups or ())) == groups
+    assert [list(group) for group in mapped.loaded.groups] == groups
 
 
 def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:
@@ -117,7 +117,7 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
     groups = None if nothing is None else [*([k] for k in range(6)), nothing]
     given = LabelMap("m", None, {"wall": ["painting", "wall"], "beam": ["rafter"],
                                  "floor": ["floor", "rug"], "rest": ["bed"]})  # fmt: skip
-    trained = map_classes(_trained(names, groups), given, unmapped).trained
+    trained = map_classes(_trained(names, groups), given, unmapped).loaded
     assert trained.class_names == ("unknown", "wall", "beam", "floor", "rest")
     scores = torch.randn(2, 6 + (nothing is not None), 16, 16, dtype=torch.float64)
     scores[0] *= 8
@@ -139,7 +139,7 @@ def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
     """Scores of pixels and images are averaged with weights that may be 0."""
     trained = map_classes(
         _trained(["a", "b"]), LabelMap("m", None, {"none": [], "b": ["b"]}), "never"
-    ).trained
+    ).loaded
     found = trained.network(1e4 * torch.randn(64, 2, 1, 1))[..., 0, 0]
     weights = torch.rand(256, 64) * (torch.rand(256, 64) < 0.5)
     assert bool((weights @ found).argmax(1).bool().all())
@@ -149,8 +149,8 @@ def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
 def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
     given = LabelMap("m", None, {"floor": ["floor"], "wall": ["wall"]})
     trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))
-    assert trained.trained.class_names == ("unknown", "wall", "sofa", "floor")
-    assert trained.trained.groups == ((0,), (), (1,))
+    assert trained.loaded.class_names == ("unknown", "wall", "sofa", "floor")
+    assert [list(group) for group in trained.loaded.groups] == [[0], [], [1]]
     with pytest.raises(SettingError, match="target classes wall; expected names among floor, sofa"):
         map_classes(_trained(["wall"]), given, targets=("floor", "sofa"))
 
@@ -160,10 +160,10 @@ def test_a_map_can_follow_a_map() -> None:
     first = LabelMap("m", None, {"indoor": ["bed", "wall"], "outdoor": ["sky"]})
     names = ["bed", "wall", "sky", "tree"]
     trained = replace(_trained(names, [[3], [2], [1], [0]]), fixed_size=(8, 8))
-    once = map_classes(trained, first).trained
-    assert once.groups == ((3, 2), (1,), (0,))
-    twice = map_classes(once, LabelMap("n", None, {"all": ["outdoor"]})).trained
-    assert twice.groups == ((1,), (0, 3, 2))
+    once = map_classes(trained, first).loaded
+    assert [list(group) for group in once.groups] == [[3, 2], [1], [0]]
+    twice = map_classes(once, LabelMap("n", None, {"all": ["outdoor"]})).loaded
+    assert [list(group) for group in twice.groups] == [[1], [0, 3, 2]]
     assert twice.network(torch.randn(1, 4, 12, 20)).shape == (1, 2, 12, 20)
 
 

@@ -27,7 +27,7 @@ from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews, PhotoViews
+from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tangent_train.rendering import rotate_equirect
 from tests.inference.trained import (
     CUBE,

@@ -19,7 +19,7 @@ from tangent_train.errors import SettingError
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.label_maps import LabelMap, map_classes
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.photo_networks import import_network
 from tangent_train.photo_networks.own_files import load_onnx
 from tests.models.onnx_files import write_linear
@@ -119,7 +119,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     loaded = _imported(path, list(map(str, range(60))))
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
     merged = LabelMap("pairs", None, {f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
-    for network in (loaded, map_classes(loaded, merged).trained):
+    for network in (loaded, map_classes(loaded, merged).loaded):
         predictor = Predictor(network, PanoramaViews(network), min_confidence=0.5)
         mosaic = predictor.predict(InputImage(rgb))
         assert set(np.unique(network.labels(mosaic.labels()))) == {18}

@@ -8,10 +8,10 @@ from statistics import fmean
 from typing import Any
 
 import pytest
+import yaml  # type: ignore[import-untyped]
 
 from datamodules.modelnet40.shape_files import MODELNET40
 from datamodules.stanford2d3ds.files import CLASSES
-from tangent_train.checkpoints.content import write_settings
 from tangent_train.files import write_text
 from tangent_train.heads import DistanceHead, ImageClassHead
 from tangent_train.results.chart import report_png
@@ -254,7 +254,8 @@ def test_errors_are_marked_and_only_main_scores_are_columns(tmp_path: Path) -> N
         written = EvaluationResult("panoramas", 2, columns, means, protocol=protocol)
         written = replace(written, protocol=protocol | {"alignment": alignment})
         write_text(folder / "results.json", written.json())
-        write_settings(folder / "config.yaml", settings | {"task": {"alignment": alignment}})
+        content = settings | {"task": {"alignment": alignment}}
+        (folder / "config.yaml").write_text(yaml.safe_dump(content))
         records.append(load_result(folder))
     assert records[0].columns == columns
     assert records[0].scores == means

@@ -14,7 +14,8 @@ import torch
 from transformers import quantizers
 
 from tangent_train.checkpoints.loaded import load_network
-from tangent_train.config.build import SettingsFile, build_from_config
+from tangent_train.config.build import build_from_config
+from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import smp
 from tests.photo_networks import huggingface_networks as networks
@@ -98,7 +99,7 @@ def test_backbones_are_not_looked_up(backbone: Any, folder: Path, tmp_path: Path
     network = {"_target_": "models.HuggingFaceNetwork", "config": config, "num_classes": 2}
     uses: tuple[Callable[[], Any], ...] = (
         lambda: networks.imported(folder),
-        lambda: build_from_config(network, "network", SettingsFile(path)),
+        lambda: build_from_file(network, "network", path),
     )
     for use in uses:
         refused = pytest.raises((DataError, SettingError), match="network")
@@ -114,10 +115,9 @@ def fetching() -> None:
 
 def test_the_hub_is_offline_for_files_alone(tmp_path: Path) -> None:
     section = {"_target_": f"{__name__}.fetching"}
-    file = SettingsFile(tmp_path / "x.ckpt", trust=[f"{__name__}.fetching"])
     with watched(tmp_path / "forbidden") as happened:
-        with pytest.raises(DataError, match=r"x\.ckpt: found .*fetching cannot be made"):
-            build_from_config(section, "network", file)
+        with pytest.raises(DataError, match=r"x\.ckpt: found network cannot be built"):
+            build_from_file(section, "network", tmp_path / "x.ckpt", [section["_target_"]])
         assert happened == []
         with pytest.raises(OSError):  # noqa: PT011 - any error of the connection
             build_from_config(section, "network")

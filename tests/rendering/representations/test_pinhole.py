@@ -18,7 +18,7 @@ from tangent_train.geometry import (
     equirect_directions,
     rotation_about,
 )
-from tangent_train.inference.representations import view_settings
+from tangent_train.inference.views import view_settings
 from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,

@@ -10,7 +10,7 @@ import pytest
 
 from tangent_train.config.build import build_from_config
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PhotoViews, view_settings
+from tangent_train.inference.views import PhotoViews, view_settings
 from tangent_train.rendering import (
     CubemapRepresentation,
     PerspectiveRepresentation,

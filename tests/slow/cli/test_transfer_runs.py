@@ -89,7 +89,7 @@ def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_
     photos = write_cityscapes(tmp_path / "photos")
     size = {"height": 32, "width": 32}
     networks.saved(partial(networks.segformer, CLASSES), tmp_path / "segformer", size=size)
-    run("import", "network=huggingface", "model=segformer", "output=segformer.ckpt")
+    run("import", "library=huggingface", "model=segformer", "output=segformer.ckpt")
     experiment = "field/cityscapes_densepass_13"
     arguments = [f"experiment={experiment}", "checkpoint=segformer.ckpt", "level=6"]
     arguments += [f"data.root={panoramas}", f"photos.data.root={photos}", "panels=0"]

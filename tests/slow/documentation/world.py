@@ -89,8 +89,8 @@ def build_world(folder: Path) -> Path:
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.onnx",
         "tangent-export checkpoint=runs/rgb/…/checkpoints/best.ckpt output=model.safetensors",
         "tangent-render input=room.jpg output=tangent",
-        f"tangent-import network=huggingface model={SEGFORMER} output=segformer.ckpt",
-        f"tangent-import network=huggingface model={OF_CITYSCAPES} output=cityscapes.ckpt",
+        f"tangent-import library=huggingface model={SEGFORMER} output=segformer.ckpt",
+        f"tangent-import library=huggingface model={OF_CITYSCAPES} output=cityscapes.ckpt",
     ):
         run(line.split(), {}, folder)
     for root in ("synthrooms", "rooms_standard"):

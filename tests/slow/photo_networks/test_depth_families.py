@@ -50,7 +50,7 @@ def test_depth_of_a_panorama_is_that_of_the_exported_network(family: Any, tmp_pa
             continue
         export_network(trained, tmp_path / name)
         again = tt.load(tmp_path / name, align="scale")
-        assert again.trained.depth_kind == kind
+        assert again.loaded.depth_kind == kind
         found, near = again.depth(panorama), np.nanmax(1 / expected)
         np.testing.assert_array_equal(np.isnan(found), np.isnan(expected))
         np.testing.assert_allclose(1 / found, 1 / expected, rtol=1e-3, atol=1e-4 * near)

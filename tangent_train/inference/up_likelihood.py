@@ -19,7 +19,7 @@ from tangent_train.inference.engine import (
     views_per_forward,
 )
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.representations import PanoramaViews
+from tangent_train.inference.views import PanoramaViews
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
 
@@ -33,26 +33,26 @@ if TYPE_CHECKING:
 _FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
 _EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
 _COUNTED = 20  # more, smaller views do not add evidence
-_LEAST_DOUBT = 1e-4
+_LEAST = 1e-4
 
 
 @dataclass(frozen=True)
-class NetworkJudge:
+class UpLikelihood:
     """Estimates how likely directions are to be up, from the confidence of a network.
 
     A network that was trained on upright images is most confident on upright images. For each
     direction it gets four horizontal views of 135° that are upright for that direction. A network
     with cross-image attention gets all views of its representation, with which it was more often
-    right, and a network of whole spheres gets its view. The doubt of a view is the mean of 1 −
-    confidence over its pixels. The likelihood of a direction is the product of doubt⁻³ over up to
+    right, and a network of whole spheres gets its view. The uncertainty of a view is the mean of 1 −
+    confidence over its pixels. The likelihood of a direction is the product of uncertainty⁻³ over up to
     20 views.
 
     Attributes:
-        trained: The network.
+        loaded: The network.
         device: Device of the network.
     """
 
-    trained: LoadedNetwork
+    loaded: LoadedNetwork
     device: torch.device | str = "cpu"
 
     def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -66,17 +66,19 @@ class NetworkJudge:
             ``(n,)`` log-likelihoods. All are 0 for a network with elevation as an input, because
             that depends on the direction itself.
         """
-        if "elevation" in self.trained.inputs:
+        if "elevation" in self.loaded.inputs:
             return np.zeros(len(ups_xyz))
-        rows = min(image.rgb.shape[0], 2 ** (self.trained.level + 1))
+        rows = min(image.rgb.shape[0], 2 ** (self.loaded.level + 1))
         panorama = InputImage(image.rgb, image.depth)
-        rendered = RenderedViews(self.trained, panorama, (rows, 2 * rows), self.device)
-        doubts = np.array([self._doubts(rendered, up) for up in ups_xyz])
-        counted = min(doubts.shape[1], _COUNTED)
-        return -_EXPONENT * counted * np.log(doubts + _LEAST_DOUBT).mean(axis=1)
+        rendered = RenderedViews(self.loaded, panorama, (rows, 2 * rows), self.device)
+        uncertainties = np.array([self._uncertainties(rendered, up) for up in ups_xyz])
+        counted = min(uncertainties.shape[1], _COUNTED)
+        return -_EXPONENT * counted * np.log(uncertainties + _LEAST).mean(axis=1)
 
-    def _doubts(self, rendered: RenderedViews, up: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Return the mean doubt of each view."""
+    def _uncertainties(
+        self, rendered: RenderedViews, up: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return the mean uncertainty of each view."""
         network: Any = self._network
         representation, rays = self._representation, None
         per_forward = views_per_forward(representation.image_size)
@@ -95,20 +97,20 @@ class NetworkJudge:
     @cached_property
     def _network(self) -> nn.Module:
         """The network for pinhole images."""
-        return make_ordinary(self.trained.network)
+        return make_ordinary(self.loaded.network)
 
     @property
     def _takes_own_views(self) -> bool:
-        return self.trained.is_spherical or sees_rays(self.trained.network)
+        return self.loaded.is_spherical or sees_rays(self.loaded.network)
 
     @cached_property
     def _representation(self) -> Representation:
         """The views of an upright panorama."""
-        trained = self.trained
+        loaded = self.loaded
         if self._takes_own_views:
-            return PanoramaViews(trained).representation
-        quarter = round(2 / TangentGrid(0, trained.level).pitch)  # pixels of 90° at its level
-        least = quarter if trained.fixed_size is None else max(trained.fixed_size)
-        side = -(-least // trained.size_multiple) * trained.size_multiple
+            return PanoramaViews(loaded).representation
+        quarter = round(2 / TangentGrid(0, loaded.level).pitch)  # pixels of 90° at its level
+        least = quarter if loaded.fixed_size is None else max(loaded.fixed_size)
+        side = -(-least // loaded.size_multiple) * loaded.size_multiple
         beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))
-        return CubemapRepresentation(trained.level, side, margin=round(side / 2 * beyond))
+        return CubemapRepresentation(loaded.level, side, margin=round(side / 2 * beyond))

@@ -14,7 +14,7 @@ from datamodules.core.inputs import Normalization
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere_signals import icosphere_directions
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.judge import NetworkJudge
+from tangent_train.inference.up_likelihood import UpLikelihood
 from tests.inference.trained import ERP, ICOSPHERE, TANGENT, trained_network
 
 if TYPE_CHECKING:
@@ -56,13 +56,13 @@ class SkyOfVertices(Sky):
         return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
 
 
-def _judge(network: Sky | None = None, **changes: Any) -> NetworkJudge:
+def _judge(network: Sky | None = None, **changes: Any) -> UpLikelihood:
     changes |= {
         "module": network or Sky(),
         "class_names": ("unknown", "up", "down"),
         "normalization": PLAIN,
     }
-    return NetworkJudge(trained_network(TANGENT | {"level": 5}, **changes))
+    return UpLikelihood(trained_network(TANGENT | {"level": 5}, **changes))
 
 
 def _bright_above(up: NDArray[np.float64], height: int = 64) -> NDArray[np.uint8]:
@@ -116,7 +116,7 @@ def test_a_network_of_whole_spheres_gets_its_view_in_every_direction(
 ) -> None:
     names = ("unknown", "up", "down")
     trained = trained_network(representation, module=network, class_names=names, fixed_size=size)
-    judge = NetworkJudge(replace(trained, normalization=PLAIN))
+    judge = UpLikelihood(replace(trained, normalization=PLAIN))
     ups = AXES @ random_rotation(np.random.default_rng(1)).T
     for true in range(6):
         likely = judge(InputImage(_bright_above(ups[true])), ups)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -28,9 +28,9 @@ from tangent_train.inference.images import (
     read_photo,
     with_up,
 )
-from tangent_train.inference.judge import NetworkJudge
 from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
-from tangent_train.inference.representations import Levels, PanoramaViews, PhotoViews, ViewChoice
+from tangent_train.inference.up_likelihood import UpLikelihood
+from tangent_train.inference.views import Levels, PanoramaViews, PhotoViews, ViewChoice
 from tangent_train.io.gpano import Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
@@ -93,36 +93,21 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
-    check_choice("unmapped", unmapped, get_args(Unmapped))
-    check_choice("blend", blend, get_args(Blend))
-    check_choice("fill", "mean" if fill is None else fill, get_args(Fill))
     original = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     loaded = original
-    if label_map is None:
-        _check_unset("unmapped", unmapped, "unknown", "without label_map")
-    else:
-        loaded = map_classes(original, load_label_map(label_map), unmapped).trained
-    chosen = loaded, levels, base_level, blend, rotations
-    how = device, view_batch_size
-    if loaded.predicts == DISTANCE:
-        _check_unset("min_confidence", min_confidence, 0, "for depth networks")
-        head = head_of(loaded, align=align)
-    else:
-        _check_unset("align", align, None, "for networks of classes")
-        head = head_of(loaded, min_confidence=min_confidence)
+    if label_map is not None:
+        loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
+    # A setting of another head is an unexpected argument.
+    given = {"min_confidence": min_confidence, "align": align}
+    head = head_of(loaded, **{name: value for name, value in given.items() if value})
+    chosen, how = (loaded, levels, base_level, blend, rotations), (device, view_batch_size)
     panoramas = Predictor(loaded, head, PanoramaViews(*chosen, views, fill), *how)
     return Network(
         loaded,
         panoramas,
         lambda: Predictor(loaded, head, PhotoViews(*chosen), *how),
-        NetworkJudge(original, panoramas.device),
+        UpLikelihood(original, panoramas.device),
     )
-
-
-def _check_unset(setting: str, value: object, unused: object, reason: str) -> None:
-    """Refuse a setting that would be ignored."""
-    if value != unused:
-        raise SettingError(setting, found=value, expected=f"{unused} {reason}")
 
 
 class Network:
@@ -133,41 +118,41 @@ class Network:
     size of the image: tensors on the same device for tensors, else arrays.
 
     Args:
-        trained: The network.
+        loaded: The network.
         panoramas: Predictor for panoramas.
         photos: Function that creates the predictor for photos.
-        judge: Evidence for the direction of up, from the network's confidence.
+        up_likelihood: Evidence for the direction of up, from the network's confidence.
 
     Attributes:
-        trained: The network, with its inputs, level and representation.
+        loaded: The network, with its inputs, level and representation.
         class_names: K + 1 names of the labels, the unknown class first; none for depth networks.
         palette: ``(K + 1, 3)`` uint8 RGB colors of the labels; ``palette[labels]`` is an image.
     """
 
     def __init__(
         self,
-        trained: LoadedNetwork,
+        loaded: LoadedNetwork,
         panoramas: Predictor,
         photos: Callable[[], Predictor],
-        judge: NetworkJudge,
+        up_likelihood: UpLikelihood,
     ) -> None:
-        self.trained = trained
-        self.class_names = trained.class_names
-        self.palette = class_colors(len(trained.class_names))
+        self.loaded = loaded
+        self.class_names = loaded.class_names
+        self.palette = class_colors(len(loaded.class_names))
         self._panoramas = panoramas
         self._photos = cache(photos)
-        self._judge = judge
+        self._up_likelihood = up_likelihood
 
     def __repr__(self) -> str:
         """Return classes or kind of depth, inputs, views and device in one line."""
-        trained, names = self.trained, self.class_names[1:]
+        loaded, names = self.loaded, self.class_names[1:]
         shown = ", ".join(names[:_SHOWN]) + ", …" * (len(names) > _SHOWN)
-        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({trained.depth_kind})"
-        rows, columns = trained.image_size
-        kind = str(trained.representation["_target_"]).rpartition(".")[2]
+        predicts = f"{len(names)} classes ({shown})" if names else f"depth ({loaded.depth_kind})"
+        rows, columns = loaded.image_size
+        kind = str(loaded.representation["_target_"]).rpartition(".")[2]
         return (
-            f"<Network of {predicts}, inputs {', '.join(trained.inputs)}, "
-            f"trained at level {trained.level} on {columns}×{rows} images of {kind}, "
+            f"<Network of {predicts}, inputs {', '.join(loaded.inputs)}, "
+            f"trained at level {loaded.level} on {columns}×{rows} images of {kind}, "
             f"on {self._panoramas.device}>"
         )
 
@@ -206,9 +191,9 @@ class Network:
             DataError: A file cannot be used, or the image is not a whole panorama.
             SettingError: The image cannot be used, or the network needs another input.
         """
-        self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
+        self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         how: dict[str, Any] = {"depth": depth, "fov": fov, "area": area, "upright": upright}
-        mosaic, read = self._predict(image, max_tilt_deg=max_tilt_deg, mask=mask, **how)
+        mosaic, read = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
         labels = _cut(mosaic.pixels().cpu().numpy(), image, read, mask, 0)
         if isinstance(image, Tensor):
             return torch.from_numpy(labels.astype(np.int64)).to(image.device)
@@ -235,13 +220,13 @@ class Network:
         Returns:
             ``(H, W)`` float32, NaN where unknown: an array, or a tensor. In meters for networks
             that return meters. Others have an unknown unit: the median of the depth is 1, by solid
-            angle (`trained.depth_kind` starts with ``relative``).
+            angle (`loaded.depth_kind` starts with ``relative``).
 
         Raises:
             DataError: See `labels`.
             SettingError: See `labels`; or the views cannot be aligned in this way.
         """
-        self.trained.check_predicts(DISTANCE, "Use labels() or scores() of this network.")
+        self.loaded.check_predicts(DISTANCE, "Use labels() or probabilities() of this network.")
         if upright == "auto":
             raise SettingError(
                 "upright",
@@ -249,11 +234,11 @@ class Network:
                 expected="pose or None for depth networks: auto needs the confidence of classes",
                 remedy="Use pose for files with GPano tags, or a network of classes to align it.",
             )
-        found, read = self._predict(image, fov=fov, area=area, upright=upright, mask=mask)
+        found, read = self._predict(image, fov=fov, area=area, upright=upright)
         depth = _cut(found.pixels().cpu().numpy(), image, read, mask, np.nan)
         return torch.from_numpy(depth).to(image.device) if isinstance(image, Tensor) else depth
 
-    def scores(self, image: Picture, **settings: Any) -> Any:
+    def probabilities(self, image: Picture, **settings: Any) -> Any:
         """Return the probability of every class at every pixel.
 
         Args:
@@ -269,17 +254,13 @@ class Network:
             DataError: See `labels`.
             SettingError: See `labels`.
         """
-        self.trained.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        if settings.get("mask") is not None:
-            expected = "None for scores: they are not masked"
-            raise SettingError("mask", found="one", expected=expected)
+        self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
         mosaic, read = self._predict(image, averaged=True, **settings)
-        scores: Any = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1]
-        if read.area is not None:
-            scores = torch.from_numpy(np.ascontiguousarray(read.area.cut(scores.cpu().numpy())))
+        found = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1].cpu().numpy()
+        found = np.ascontiguousarray(read.cut(found))
         if isinstance(image, Tensor):
-            return scores.movedim(-1, 0).contiguous().to(image.device)
-        return scores.contiguous().cpu().numpy()
+            return torch.from_numpy(found).movedim(-1, 0).contiguous().to(image.device)
+        return found
 
     def _predict(
         self,
@@ -288,47 +269,34 @@ class Network:
         depth: Any = None,
         fov: float | None = None,
         area: Sequence[float] | None = None,
-        upright: Any = None,
+        upright: Upright = None,
         max_tilt_deg: float = 60.0,
-        mask: Any = None,
-        **settings: Any,
+        averaged: bool = False,
     ) -> tuple[Any, InputImage]:
-        """Predict a photo or a panorama; return the result and the image."""
+        """Predict a photo or a panorama; return the mosaic and the image."""
         of_size = partial(self._depth, depth)
         if fov is not None:
-            for name, value in {"area": area, "upright": upright, "mask": mask}.items():
-                if value is not None:
-                    raise SettingError(name, found="one, with fov=", expected="None for photos")
+            if (area, upright) != (None, None):
+                raise SettingError("area and upright", found="one", expected="None for photos")
             photo = read_photo(image, fov, of_size)
-            return self._photos().predict(photo, **settings), photo
-        if upright is not None:
-            check_choice("upright", upright, ("pose", "auto"))
-            if upright == "pose" and not isinstance(image, str | Path):
-                raise SettingError(
-                    "upright",
-                    found=f"pose, of {described(image)}",
-                    expected="auto or None: only files have GPano tags",
-                    remedy="Give the path of the panorama.",
-                )
+            return self._photos().predict(photo, averaged=averaged), photo
+        check_choice("upright", upright or "pose", ("pose", "auto"))
         panorama = read_panorama(image, area, upright, of_size)
         if upright == "auto":
-            panorama = with_up(panorama, max_tilt_deg, self._judge)
-        return self._panoramas.predict(panorama, **settings), panorama
+            panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
+        return self._panoramas.predict(panorama, averaged=averaged), panorama
 
     def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
-        """Return depth in steps of 1/512 m; refuse depth of another size or kind."""
-        is_input = "depth" in self.trained.inputs
-        if depth is None and not is_input:
+        """Return depth in steps of 1/512 m, of the size of the image."""
+        if depth is None and "depth" not in self.loaded.inputs:
             return None
         array = depth.numpy(force=True) if isinstance(depth, Tensor) else depth
         fits = isinstance(array, np.ndarray) and (array.shape, array.dtype.kind) == (size, "f")
-        if not (is_input and fits):
+        if not fits or "depth" not in self.loaded.inputs:
             raise SettingError(
                 "depth",
                 found="none" if depth is None else described(depth),
-                expected=f"floats in meters, {width_height(size)}"
-                if is_input
-                else f"None: the network's inputs are {' and '.join(self.trained.inputs)}",
+                expected=f"floats in meters, {width_height(size)}, for a network that takes depth",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 

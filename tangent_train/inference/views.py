@@ -91,7 +91,7 @@ class PanoramaViews:
     angular resolution of their crops.
 
     Args:
-        trained: The network.
+        loaded: The network.
         levels: See `Levels`. All are rendered from a panorama of the highest level.
         base_level: Base level b of tangent images; None as trained.
         blend: Blending of overlapping views.
@@ -110,7 +110,7 @@ class PanoramaViews:
 
     def __init__(
         self,
-        trained: LoadedNetwork,
+        loaded: LoadedNetwork,
         levels: Levels = None,
         base_level: int | None = None,
         blend: Blend = "feather",
@@ -118,15 +118,15 @@ class PanoramaViews:
         views: ViewChoice = None,
         fill: Fill | None = None,
     ) -> None:
-        settings = panorama_settings(trained, levels, base_level, views)
+        settings = panorama_settings(loaded, levels, base_level, views)
         settings["rotations"] = rotations
         if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
             settings["blend"] = blend
-        self.representation = _built(trained, settings)
+        self.representation = _built(loaded, settings)
         self.image_size = self.representation.image_size
         self.distortion_aware = getattr(self.representation, "distortion_aware", False)
         self.blend = self.representation.blend
-        self._fill = fill or trained.fill
+        self._fill = fill or loaded.fill
 
     def description(self, area: Sequence[float] | None = None) -> str:
         """Return number and size of the views; of pinhole images also their angle and resolution.
@@ -177,7 +177,7 @@ class PhotoViews:
     """Selects crops of photos with the size and angular resolution of the training images.
 
     Args:
-        trained: The network.
+        loaded: The network.
         levels: See `Levels`.
         base_level: Base level b of tangent images whose size the crops get; None as trained.
         blend: ``feather``: crops overlap by at least a quarter and are averaged.
@@ -189,7 +189,7 @@ class PhotoViews:
 
     def __init__(
         self,
-        trained: LoadedNetwork,
+        loaded: LoadedNetwork,
         levels: Levels = None,
         base_level: int | None = None,
         blend: Blend = "feather",
@@ -197,12 +197,12 @@ class PhotoViews:
     ) -> None:
         if rotations != 1:
             raise SettingError("rotations", found=rotations, expected="1 for photos")
-        if "elevation" in trained.inputs:
+        if "elevation" in loaded.inputs:
             expected = "a panorama: the elevation of pixels, which the network takes, is unknown"
             raise SettingError("image", found="a photo", expected=expected)
         self._crops = [
-            _photo_representation(trained, level, base_level)
-            for level in level_list(levels, trained.photo_level or trained.level)
+            _photo_representation(loaded, level, base_level)
+            for level in level_list(levels, loaded.photo_level or loaded.level)
         ]
         self.image_size = max(crops.image_size for crops in self._crops)
         self.blend: Blend = blend
@@ -320,7 +320,7 @@ def _check_single(levels: Sequence[int], base_level: int | None) -> None:
 
 
 def panorama_settings(
-    trained: LoadedNetwork,
+    loaded: LoadedNetwork,
     levels: Levels = None,
     base_level: int | None = None,
     views: ViewChoice = None,
@@ -328,7 +328,7 @@ def panorama_settings(
     """Return the settings of the representation of panoramas, see `PanoramaViews`.
 
     Args:
-        trained: The network.
+        loaded: The network.
         levels: See `Levels`.
         base_level: Base level b of tangent images; None as trained.
         views: See `ViewChoice`.
@@ -336,10 +336,10 @@ def panorama_settings(
     Raises:
         SettingError: The representation does not have these settings.
     """
-    side, settings = trained.photo_side, dict(trained.representation)
+    side, settings = loaded.photo_side, dict(loaded.representation)
     if side is not None and views is not None:
         return photo_network_settings(side, levels, base_level, views)
-    chosen = [trained.level] if levels is None else level_list(levels, trained.level)
+    chosen = [loaded.level] if levels is None else level_list(levels, loaded.level)
     level = max(chosen)
     if views is not None:
         settings = view_settings(views)
@@ -347,7 +347,7 @@ def panorama_settings(
         base_level is not None and settings["_target_"] != _TANGENT
     ):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
-    if level != trained.level and views is None:
+    if level != loaded.level and views is None:
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = level
     if settings["_target_"] != _TANGENT:
@@ -369,7 +369,7 @@ def panorama_settings(
 
 
 def _built(
-    trained: LoadedNetwork, settings: dict[str, Any]
+    loaded: LoadedNetwork, settings: dict[str, Any]
 ) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
     """Build the representation from settings.
 
@@ -377,60 +377,60 @@ def _built(
         SettingError: The network does not support its image size.
     """
     built: Any = build_from_config(settings, "representation")
-    check_size(trained, built.image_size)
+    check_size(loaded, built.image_size)
     return built
 
 
 def _photo_representation(
-    trained: LoadedNetwork, level: int, base_level: int | None
+    loaded: LoadedNetwork, level: int, base_level: int | None
 ) -> PerspectiveRepresentation:
-    settings = trained.representation
+    settings = loaded.representation
     if settings["_target_"] == PERSPECTIVE and base_level is None:
         half_extent = math.tan(math.radians(settings.get("fov_deg", 45.0)) / 2)
-        half_extent /= 2.0 ** (level - trained.level)
-        size = trained.image_size
+        half_extent /= 2.0 ** (level - loaded.level)
+        size = loaded.image_size
     else:
-        views = "tangent" if trained.photo_level is not None else None
-        seen = _built(trained, panorama_settings(trained, level, base_level, views))
+        views = "tangent" if loaded.photo_level is not None else None
+        seen = _built(loaded, panorama_settings(loaded, level, base_level, views))
         if not isinstance(seen, PinholeRepresentation):
-            return _photo_representation(trained, level, _BASE_LEVEL)
+            return _photo_representation(loaded, level, _BASE_LEVEL)
         size = seen.image_size
         half_extent = min(grid.half_size[0] for grid in seen.grids)
-    check_size(trained, size)
+    check_size(loaded, size)
     return PerspectiveRepresentation(level, 2 * math.degrees(math.atan(half_extent)), size)
 
 
-def check_size(trained: LoadedNetwork, size: tuple[int, int]) -> None:
+def check_size(loaded: LoadedNetwork, size: tuple[int, int]) -> None:
     """Refuse image sizes that a network does not support.
 
     Args:
-        trained: The network.
+        loaded: The network.
         size: Rows and columns of the images.
 
     Raises:
         SettingError: The network does not support the size.
     """
-    if _fits(trained, size):
+    if _fits(loaded, size):
         return
-    expected = f"multiples of {trained.size_multiple}, the network's stride"
+    expected = f"multiples of {loaded.size_multiple}, the network's stride"
     remedy = "Choose other levels, or leave both as trained."
-    if trained.fixed_size is not None:
-        size_in_file = width_height(trained.fixed_size)
+    if loaded.fixed_size is not None:
+        size_in_file = width_height(loaded.fixed_size)
         expected = f"at least {size_in_file}, the input size of the network's file"
-    if trained.is_spherical:
-        expected = f"{width_height(trained.image_size)}, the panorama or signal of the training"
+    if loaded.is_spherical:
+        expected = f"{width_height(loaded.image_size)}, the panorama or signal of the training"
         remedy = "It labels whole panoramas: leave projection, views and base_level as trained too."
     found = f"images of {width_height(size)}"
     raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
 
 
-def _fits(trained: LoadedNetwork, size: tuple[int, int]) -> bool:
+def _fits(loaded: LoadedNetwork, size: tuple[int, int]) -> bool:
     """Return True if a network supports images of rows and columns."""
-    if trained.is_spherical:
-        return size == trained.image_size
-    if trained.fixed_size is not None:
-        return all(n >= least for n, least in zip(size, trained.fixed_size, strict=True))
-    return not any(side % trained.size_multiple for side in size)
+    if loaded.is_spherical:
+        return size == loaded.image_size
+    if loaded.fixed_size is not None:
+        return all(n >= least for n, least in zip(size, loaded.fixed_size, strict=True))
+    return not any(side % loaded.size_multiple for side in size)
 
 
 def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:
