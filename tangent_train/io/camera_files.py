@@ -20,6 +20,7 @@ from pydantic import Field
 
 from tangent_train.errors import DataError
 from tangent_train.files import Text, check_fields, write_text
+from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
 CAMERAS_FILE = "cameras.json"
