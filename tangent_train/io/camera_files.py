@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from tangent_train.errors import DataError
-from tangent_train.files import Text, check_fields, write_text
 from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
