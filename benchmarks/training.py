@@ -69,7 +69,7 @@ def loader(quick: bool) -> Iterator[Table]:
         alternatives = []
         stores = {"PNG files": "null", "prepared store": f"{root}/store"}
         for name, store in stores.items():
-            overrides = ["experiment=rooms/standard", *settings, f"data.store={store}"]
+            overrides = ["experiment=rooms/standard", *settings, f"data.cache={store}"]
             data, _ = built(overrides, f"{root}/rooms", 2 ** (level + 1))
             epochs = 1 if store == "null" or quick else 20
             alternatives.append(_loading(name, data, epochs, is_ours=store != "null"))

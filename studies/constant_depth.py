@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from omegaconf import OmegaConf
 from torch import nn
 
-from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.images import STEPS_PER_M
 from tangent_train.cli.run import build_data
 from tangent_train.config.build import build_from_config
 from tangent_train.files import config_folder
@@ -43,7 +43,7 @@ def main() -> None:
     settings: Any = OmegaConf.to_container(config, resolve=True)
     data = build_data(settings)
     data.make_files()
-    train, test, view = data.source("train"), data.source("test"), data.representation
+    train, test, view = data.dataset("train"), data.dataset("test"), data.representation
     targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
     empty: dict[str, Any] = {"network": nn.Identity(), "class_names": (), "optimizer": None}
     for name, meters in constants(np.stack(targets)).items():

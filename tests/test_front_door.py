@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import datamodules
 import models
 import tangent_train
 from models import UNet
@@ -26,7 +25,7 @@ def test_names_come_from_their_packages() -> None:
     assert tangent_train.apply is applying.apply
     for name in ("equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)
-    for package in (tangent_train, datamodules, models):
+    for package in (tangent_train, models):
         assert set(package.__all__) <= set(dir(package))
     with pytest.raises(AttributeError, match="no attribute 'missing'"):
         _ = tangent_train.missing

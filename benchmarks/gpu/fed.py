@@ -35,9 +35,9 @@ def fed(quick: bool) -> Iterator[Table]:
     settings += ["task.view_batch_size=null", "task.channels_last=true", "data.in_memory=false"]
     settings += [f"task.head.class_weights={[1] * 13}"]
     with tempfile.TemporaryDirectory() as root:
-        settings.append(f"data.store={root}/store")
+        settings.append(f"data.cache={root}/store")
         data, task = built(settings, f"{root}/rooms", 2 ** (level + 1), rooms)
-        source = data.source("train")
+        source = data.dataset("train")
         source.items = [*source.items] * 64  # one long epoch
         batch = next(iter(data.train_dataloader()))
         batch = move_data_to_device(batch._replace(images=data.normalized(batch)), DEVICE)
@@ -123,7 +123,7 @@ def _rendered(data: Any, count: int) -> Iterator[Any]:
     """Yield batches rendered on the device from panoramas in pinned memory."""
     grid, panoramas = data.representation.grid, []
     for k in range(count):
-        image = data.source("train").read(k)
+        image = data.dataset("train").read(k)
         parts = map(torch.tensor, (image.rgb, image.depth.clip(max=2048), image.labels))
         panoramas.append([part.pin_memory() if _ON_GPU else part for part in parts])
     while True:

@@ -1,1 +1,24 @@
-"""Common parts of all data sets: data modules, samples, transforms, the prepared store, checks."""
+"""Common parts of all data sets: files -> images -> samples -> loaders.
+
+A data set is one class. Its fields are its settings, checked by their types::
+
+    @data_set
+    class Mine(PanoramaDataModule):  # or PhotoDataModule
+        label_maps = {"3": LabelMap.of(["sky", "wall", "ground"], unknown=[0])}
+
+        lighting: Literal["day", "night"] = "day"  # the setting data.lighting
+
+        def files(self, split: Split) -> list[ImageFiles]:
+            folder = self.root / self.lighting / split
+            return [ImageFiles(p.stem, p, p.with_suffix(".labels.png")) for p in ...]
+
+`files` lists a split without opening files; lists that belong together go into a `cached_property`.
+Problems and warnings of folders go to `self.problems`. Label images are read with the label map;
+`decode_labels`, `decode_depth`, `decode_camera` or `decode` read other formats. `decode_settings`
+adds the settings that the decoded arrays depend on, for the cache. `normalizations`, `units_per_m`,
+`no_depth`, `no_distances`, `folds`, `fact_settings` and `groups` describe the data set further.
+
+The way of a file to a sample: `ImageDataModule.decode` (as stored) -> `read` (size of the run,
+kept in the `cache`) -> `finish` (placed on the sphere, masked, rotated, aligned) ->
+`ImageDataset.__getitem__` (views of a representation) -> `make_loader`.
+"""

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self, get_args
 import torch
 from torch import Tensor
 
-from datamodules.core.panoramas import STEPS_PER_M
+from datamodules.core.images import STEPS_PER_M
 from tangent_train.errors import SettingError
 
 Input = Literal["rgb", "depth", "elevation"]

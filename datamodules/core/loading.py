@@ -156,7 +156,7 @@ def _check_length(length: int, world_size: int) -> None:
 
 _FEWER = (
     "Memory may be too small for that many: use fewer (0 works in the process itself), a lower "
-    "level, or a store (data.store=…, data.in_memory=false); or enlarge /dev/shm (docker run "
+    "level, or a cache (data.cache=…, data.in_memory=false); or enlarge /dev/shm (docker run "
     "--shm-size=8g)."
 )
 _CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Error: ", re.DOTALL)

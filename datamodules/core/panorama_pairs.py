@@ -12,7 +12,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.labeled_data import print_on_rank_zero
+from datamodules.core.data_module import print_on_rank_zero
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.gpano import read_area

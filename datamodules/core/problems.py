@@ -13,10 +13,12 @@ from tangent_train.errors import DataError, SettingError
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping, Sequence
 
-    from datamodules.core.index import Item, Split
+    from datamodules.core.cache import Files
+    from datamodules.core.images import ImageFiles
+    from datamodules.core.splits import Split
 
 
-_Item = TypeVar("_Item", bound="Item")
+_Files = TypeVar("_Files", bound="Files")
 
 
 class Problem(NamedTuple):
@@ -88,7 +90,7 @@ class Problems:
         self._noted += others._noted
 
     def compare_counts(
-        self, splits: Mapping[Split, Sequence[Item]], *published: Mapping[str, int]
+        self, splits: Mapping[Split, Sequence[Files]], *published: Mapping[str, int]
     ) -> None:
         """Warn if the numbers of images of the splits are not published ones.
 
@@ -108,9 +110,9 @@ class Problems:
             if count not in allowed:
                 self.incomplete[split] = f"{count} of {' or '.join(map(str, allowed))}"
 
-    def note_strays(self, labels: Iterable[Path], images: Iterable[Item]) -> None:
+    def note_strays(self, labels: Iterable[Path], images: Iterable[ImageFiles]) -> None:
         """Warn of label images that belong to none of the images."""
-        strays = set(labels) - {image.parts["labels"] for image in images}
+        strays = set(labels) - {image.labels for image in images}
         self.note_absent("label images", map(str, strays))
 
     def note_absent(self, source: str, names: Iterable[str]) -> None:
@@ -134,7 +136,7 @@ class Problems:
         """Names of unusable images or shapes."""
         return {p.item for p in self._noted if p.item is not None}
 
-    def without(self, items: Iterable[_Item]) -> list[_Item]:
+    def without(self, items: Iterable[_Files]) -> list[_Files]:
         """Return the usable images or shapes."""
         broken = self.items
         return [item for item in items if item.name not in broken]

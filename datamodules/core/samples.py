@@ -1,9 +1,8 @@
-"""Training and evaluation samples from labeled images."""
+"""Training and evaluation samples, and their parts rendered from images."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -11,13 +10,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
+from datamodules.core.images import STEPS_PER_M, Image
 from datamodules.core.inputs import MAX_DEPTH_M, Input
-from datamodules.core.loading import Seed, sample_key, sample_rng
-from datamodules.core.panoramas import STEPS_PER_M
-from datamodules.core.reading import SplitReader
 from tangent_train.geometry import equirect_elevations
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering.representations.views import Views
@@ -75,75 +71,11 @@ def valid_mask(valid: Tensor) -> NDArray[np.bool_] | None:
     return valid.cpu().numpy() if valid.numel() else None
 
 
-@dataclass(frozen=True)
-class TrainingImages(Dataset[TrainingSample[Inputs]]):
-    """Random views of images, by index or (epoch, index).
-
-    Attributes:
-        source: The images.
-        representation: Representation of the images.
-        seed: Seed of the run, 0 or more.
-        inputs: Inputs of the network, see `Input`.
-        color_jitter: Strength of the color augmentation, 0 to 1, see `jitter_colors`.
-    """
-
-    source: SplitReader[Any, Any]
-    representation: Any
-    seed: Seed
-    inputs: Sequence[Input]
-    color_jitter: float = 0.0
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def __getitem__(self, key: int | tuple[int, int]) -> TrainingSample[Inputs]:
-        epoch, index = sample_key(key, len(self))
-        image = self.source.read(index)
-        rng = sample_rng(self.seed, epoch, index)
-        views = image.sampler(self.representation).sample(rng, image.valid)
-        rgb, *others = render_inputs(image, views, self.inputs)
-        if self.color_jitter:
-            rgb = jitter_colors(rgb, self.color_jitter, rng)
-        labels = _tensor(_for_torch(views.render(image.labels, "nearest")))
-        rays = torch.from_numpy(world_rays(views, image.up))
-        return TrainingSample((rgb, *others), labels, rays, _ray_lengths([views], image), index)
-
-
-@dataclass(frozen=True)
-class EvaluationImages(Dataset[EvaluationSample[Inputs]]):
-    """Whole images, by index or (epoch, index); the epoch is ignored.
-
-    Attributes:
-        source: The images.
-        representation: Representation of the images.
-        inputs: Inputs of the network, see `Input`.
-    """
-
-    source: SplitReader[Any, Any]
-    representation: Any
-    inputs: Sequence[Input]
-
-    def __len__(self) -> int:
-        return len(self.source)
-
-    def __getitem__(self, key: int | tuple[int, int]) -> EvaluationSample[Inputs]:
-        _, index = sample_key(key, len(self))
-        image = self.source.read(index)
-        view_sets = image.sampler(self.representation).view_sets(image.valid)
-        of_sets = [render_inputs(image, views, self.inputs) for views in view_sets]
-        images = tuple(map(torch.cat, zip(*of_sets, strict=True)))
-        rotation = np.eye(3) if image.up is None else upright_rotation(image.up)
-        target = torch.tensor(_for_torch(image.target(self.representation)))
-        valid = torch.tensor(np.empty((0, 0), np.bool_) if image.valid is None else image.valid)
-        lengths = _ray_lengths(view_sets, image)
-        return EvaluationSample(images, target, torch.from_numpy(rotation), lengths, valid, index)
-
-
 def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Tensor, ...]:
     """Render the inputs of a network, before `normalize`.
 
     Args:
-        image: A `Panorama` or `Photo`, with `depth` if depth is an input.
+        image: A panorama or photo, with `depth` if depth is an input.
         views: Views of the image.
         inputs: See `Input`.
 
@@ -151,7 +83,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
         RGB ``(n, h, w, 3)`` uint8; with depth, ``(n, h, w)`` int16 steps up to `MAX_DEPTH_M`; with
         elevation, ``(n, h, w)`` float32.
     """
-    rendered = [_tensor(views.render(image.rgb, "bilinear"))]
+    rendered = [as_tensor(views.render(image.rgb, "bilinear"))]
     if "depth" in inputs and image.depth is not None:
         steps = np.minimum(views.render(image.depth, "nearest"), int(MAX_DEPTH_M * STEPS_PER_M))
         # torch has few operations on uint16.
@@ -160,7 +92,7 @@ def render_inputs(image: Any, views: Views, inputs: Sequence[Input]) -> tuple[Te
         shape = (image.rgb.shape[0], image.rgb.shape[1])
         up = image.up
         elevations = _upright_elevations(shape) if up is None else equirect_elevations(shape, up)
-        rendered.append(_tensor(views.render(elevations, "bilinear")))
+        rendered.append(as_tensor(views.render(elevations, "bilinear")))
     return tuple(rendered)
 
 
@@ -182,19 +114,21 @@ def _upright_elevations(shape: tuple[int, int]) -> NDArray[np.float32]:
     return elevations
 
 
-def _tensor(array: NDArray[Any]) -> Tensor:
+def as_tensor(array: NDArray[Any]) -> Tensor:
+    """Return a rendered array as a tensor."""
     # The rendered array may be the panorama itself, shared or a read-only file: copy it.
     return torch.from_numpy(array) if array.flags.owndata else torch.tensor(array)
 
 
-def _ray_lengths(view_sets: Sequence[Views], image: Any) -> Tensor:
+def view_ray_lengths(view_sets: Sequence[Views], image: Image) -> Tensor:
     """Return the ray lengths of sets of views if the labels are distances; else a 1."""
     if image.labels.dtype != np.uint16:
         return torch.ones(1, 1, 1)
     return torch.from_numpy(np.concatenate([views.ray_lengths() for views in view_sets]))
 
 
-def _for_torch(labels: NDArray[Any]) -> NDArray[Any]:
+def for_torch(labels: NDArray[Any]) -> NDArray[Any]:
+    """Return labels as a type that torch computes with."""
     # torch has few operations on uint16.
     return labels.astype(np.int32) if labels.dtype == np.uint16 else labels
 

@@ -3,37 +3,41 @@
 On disk::
 
     root/
-      classes.json                  see `read_classes`
+      classes.json                  see `read_label_map`
       images/[scene/]…/name.jpg     or .png, .tif, .webp
       labels/[scene/]…/name.png     values or colors of the classes, at the size of the image
       depth/[scene/]…/name.png      or .tif, .npy, .exr, if depth is an input, see `read_depth_m`
+      cameras.json                  of photos, if wanted, see `read_folder_cameras`
       train.txt val.txt test.txt    if wanted, names one per line, see `FolderSplits`
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, NonNegativeInt, PositiveFloat
 
-from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.index import Split
+from datamodules.core.data_module import data_set
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
+from datamodules.core.images import ImageFiles, meters_to_steps
 from datamodules.core.inputs import Input
-from datamodules.core.labeled_data import print_on_rank_zero
-from datamodules.core.panoramas import ImageFiles
-from datamodules.core.problems import Problems
-from datamodules.folder.cameras import read_folder_cameras
-from datamodules.folder.classes import NO_CLASSES, UNKNOWN_NAME, read_classes
-from datamodules.folder.reader import FolderReader, list_images, note_ignored, read_codes
+from datamodules.core.label_map import LabelMap, read_label_map
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import Split
+from datamodules.folder.cameras import FolderCameras, read_folder_cameras
 from datamodules.folder.splits import FolderSplits
-from tangent_train.errors import DataError
-from tangent_train.io.image_files import image_paths
+from tangent_train.errors import DataError, SettingError
+from tangent_train.io import image_files
+from tangent_train.io.masks import Masks
+from tangent_train.io.pixel_files import read_depth_m
 
-_TRIED = 4
 
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class LabeledFolder(ImageDataModule):
     """Files, splits and classes of a user-defined data set. Depth is clipped to 4 m.
 
@@ -44,127 +48,130 @@ class LabeledFolder(ImageDataModule):
             different seeds share their splits.
         depth_units_per_m: Units per meter of integer depth files, 1000 for millimeters.
 
-    Attributes:
-        class_names: "unknown", then those of ``classes.json``.
-
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
-        SettingError: A setting is invalid.
     """
 
     inputs: Sequence[Input] = ("rgb",)
-    test_fraction: float = 0.2
-    split_seed: int = 0
-    depth_units_per_m: float = 1000
+    test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
+    split_seed: NonNegativeInt = 0
+    depth_units_per_m: PositiveFloat = 1000
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("depth_units_per_m", self.depth_units_per_m > 0, "more than 0")
-        self.require("test_fraction", 0 < self.test_fraction < 1, "above 0 to below 1")
-        self.require("split_seed", self.split_seed >= 0, "0 or more")
-        self._classes = NO_CLASSES
-        if not self.has_distances:
-            # Read now, not with the images: the network needs the number of classes.
-            self._classes = read_classes(self.root / "classes.json")
-            self.class_names = (UNKNOWN_NAME, *self._classes.names)
+    def find_label_map(self) -> LabelMap:
+        """Return the classes of ``classes.json``: the network needs their number early."""
+        return read_label_map(self.root / "classes.json")
 
-    def find_images(self, problems: Problems) -> tuple[FolderReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
-        with_labels = not self.has_distances
-        images = list_images(
-            self.root, problems, with_labels=with_labels, with_depth=self.reads_depth
-        )
-        # Before broken images are left out, so that the splits do not depend on them.
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        return self._divided[split]
+
+    @cached_property
+    def _divided(self) -> dict[Split, list[ImageFiles]]:
+        images = self._list_images()
+        self._note_ignored(images)
         division = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
-        splits: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
-        # The images are checked even if these checks fail.
-        with problems.noted():
-            splits = division.divide(images, problems)
-        with problems.noted():
-            some = problems.without(images)[:_TRIED] if with_labels else ()
-            self._check_classes(some, problems)
-        return self.make_reader(images, problems), splits
+        with self.problems.noted():
+            return division.divide(images, self.problems)
+        return {"train": images, "val": [], "test": []}  # checked even without splits
 
-    def prepare_data(self) -> None:
-        """See `SplitDataModule`; files that are not images are counted."""
-        super().prepare_data()
-        image_paths(self.root / "images", tell=print_on_rank_zero)
-
-    def check(self) -> tuple[Problems, int]:
-        """See `LabeledData`; also names files that training ignores."""
-        problems, count = super().check()
-        with problems.noted():
-            note_ignored(self.root, "depth" if self.has_distances else "labels", problems)
-        return problems, count
-
-    def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
-        """Return the reader of the images.
-
-        Args:
-            images: All images of the data set.
-            problems: Collects problems of the other files that it reads.
+    def _list_images(self) -> list[ImageFiles]:
+        """Return all images, in the order of their names: paths below ``images/`` without suffix.
 
         Raises:
-            DataError: The data set as a whole cannot be used.
+            DataError: A folder is missing, or there are no images.
         """
-        del images, problems
-        return FolderReader(self._classes, self.depth_units_per_m)
+        root, with_labels = self.root, not self.has_distances
+        for folder in (root / "images", root / ("labels" if with_labels else "depth")):
+            if not folder.is_dir():
+                expected = "a data set: images/, labels/ or depth/, see docs/how-to/own_data.md"
+                raise DataError(folder, found="no such folder", expected=expected)
+        found: dict[str, ImageFiles] = {}
+        labels = image_files.NamedFiles(root / "labels")
+        depths = image_files.NamedFiles(root / "depth")
+        for rgb in image_files.image_paths(root / "images"):
+            name = _name(root / "images", rgb)
+            files = ImageFiles(name, rgb)
+            with self.problems.noted(name):
+                if name in found:
+                    expected = f"one image of each name, not also {found[name].rgb.name}"
+                    raise DataError(rgb, found="another suffix", expected=expected)
+                if with_labels:
+                    files = files._replace(labels=labels.path(f"{name}.png"))
+                if self.reads_depth:
+                    remedy = "Or train without depth: data.inputs=[rgb]." if with_labels else ""
+                    files = files._replace(depth=image_files.find_depth(depths, name, remedy))
+            found.setdefault(name, files)
+        return [found[name] for name in sorted(found)]
 
-    def _check_classes(self, images: Sequence[ImageFiles], problems: Problems) -> None:
-        """Check the class list against the first few label images."""
-        classes = self._classes
-        reader = FolderReader(classes, self.depth_units_per_m)
-        seen: set[int] = set()
-        for files in images:
-            with problems.noted(files.name):
-                labels = files.parts["labels"]
-                reader.size("labels", labels)  # a later check refuses it less clearly
-                stored = read_codes(labels, in_colors=classes.in_colors)
-                if classes.decode(stored, labels).any():
-                    return
-                seen |= set(np.unique(classes.pack(stored)).tolist())
-        if seen:
-            shown = classes.describe(np.array(sorted(seen), np.int32))
-            raise DataError(
-                images[0].labels,
-                found=f"{shown}, in this file and the next",
-                expected=f"{classes.describe(classes.codes)}, from classes.json",
-                remedy="Correct classes.json: no pixel would have a class.",
-            )
+    def _note_ignored(self, images: Sequence[ImageFiles]) -> None:
+        """Warn of files that training passes over: labels of no image, and no images."""
+        names = {files.name for files in images}
+        folder = self.root / ("depth" if self.has_distances else "labels")
+        paths = list(image_files.walk_files(folder))
+        self.problems.note_absent(str(folder), {_name(folder, path) for path in paths} - names)
+        folder = self.root / "images"
+        others = {_name(folder, path) for path in image_files.walk_files(folder)} - names
+        self.problems.note_absent(str(folder), others)
+
+    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """See `ImageDataModule`."""
+        path: Any = files.depth
+        return meters_to_steps(read_depth_m(path, self.depth_units_per_m))
+
+    def decode_settings(self) -> dict[str, Any]:
+        """See `DataModule`."""
+        return {**super().decode_settings(), "units": self.depth_units_per_m}
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class FolderPanoramas(LabeledFolder, PanoramaDataModule):
-    """User-defined panoramas, with the classes of ``classes.json``.
-
-    Raises:
-        DataError: ``classes.json`` is missing or cannot be used.
-        SettingError: A setting is invalid.
-    """
+    """User-defined panoramas, with the classes of ``classes.json``."""
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class FolderPhotos(LabeledFolder, PhotoDataModule):
     """User-defined photos, with the classes of ``classes.json``.
 
     Args:
         fov: Horizontal field of view, in degrees, of photos that ``cameras.json`` does not name;
             None to read it from EXIF data.
-
-    Raises:
-        DataError: ``classes.json`` is missing or cannot be used.
-        SettingError: A setting is invalid.
     """
 
-    fov: float | None = None
+    fov: Annotated[float, Field(gt=0, lt=180)] | None = None
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        fine = self.fov is None or 0 < self.fov < 180
-        self.require("fov", fine, "degrees, more than 0 and less than 180")
+    @cached_property
+    def cameras(self) -> FolderCameras:
+        """Cameras of the photos."""
+        return read_folder_cameras(self.root / "cameras.json", self.fov)
 
-    def make_reader(self, images: Sequence[ImageFiles], problems: Problems) -> FolderReader:
-        """See `LabeledFolder`."""
-        cameras = read_folder_cameras(self.root / "cameras.json", self.fov)
-        cameras.check_names(images, problems)
-        return FolderReader(self._classes, self.depth_units_per_m, cameras)
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """Return the camera by ``cameras.json``, the field of view or the EXIF data."""
+        return self.cameras.matrix(files)
+
+    def decode_settings(self) -> dict[str, Any]:
+        """See `DataModule`."""
+        return {**super().decode_settings(), "cameras": repr(self.cameras)}
+
+
+def _name(folder: Path, path: Path) -> str:
+    return image_files.composed(path.relative_to(folder).with_suffix("").as_posix())
+
+
+def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
+    """Return masks that ignore all pixels of some classes.
+
+    Args:
+        folder: Folder with ``labels/`` and ``classes.json``, as for ``data=folder``.
+        ignored: Names of the classes.
+
+    Raises:
+        DataError: ``classes.json`` or ``labels/`` is missing or cannot be used.
+        SettingError: ``classes.json`` lacks one of the classes.
+    """
+    classes = read_label_map(folder / "classes.json")
+    names, ignored = classes.names, list(map(image_files.composed, ignored))
+    if set(ignored) - set(names):
+        found = ", ".join(sorted(set(ignored) - set(names)))
+        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
+    labels = [names.index(name) + 1 for name in ignored]
+    return Masks(folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels))

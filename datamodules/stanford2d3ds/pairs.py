@@ -1,6 +1,7 @@
 """Pairs of Stanford2D3DS's panoramas: the paper's sixty pairs of area 1, or all pairs in a room.
 
-``pairs.csv`` holds the paper's tables of pairs and of single results as they are printed:
+``tables/stanford2d3ds_pairs.csv`` holds the paper's tables of pairs and of single results as they
+are printed:
 number, split, images, overlap of the fields of view, then PMR, MS and P on the equirectangular
 image and at base levels 0, 1 and 2. Inconsistencies in print are kept: the means of
 the overlaps are 0.896 (easy) and 0.836 (hard) where the paper's text has 89.35 % and 83.35 %, and
@@ -10,26 +11,38 @@ hard although six easy pairs have the same overlap, 0.86: the split uses figures
 
 from __future__ import annotations
 
-import csv
 from collections import defaultdict
 from collections.abc import Collection, Sequence
+from dataclasses import field
 from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 from typing import Literal
 
+from pydantic import PositiveInt
+
+from datamodules.core.data_module import data_set
+from datamodules.core.images import resize_depth, steps_to_meters
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
     PanoramaPairs,
     PublishedPair,
     paired_shape,
 )
-from datamodules.core.panoramas import resize_area, resize_depth, steps_to_meters
 from datamodules.core.problems import Problems
-from datamodules.stanford2d3ds.files import AREAS, GET_IT, PictureFiles, list_pictures
-from datamodules.stanford2d3ds.reader import read_depth, read_panorama_pose
-from tangent_train.errors import DataError, SettingError
+from datamodules.stanford2d3ds.files import AREAS
+from datamodules.stanford2d3ds.panoramas import (
+    GET_IT,
+    PictureFiles,
+    list_pictures,
+    pose_file,
+    read_depth,
+    read_panorama_pose,
+)
+from datamodules.tables import read_table
+from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
 _SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
@@ -37,10 +50,9 @@ _SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
 
 def published_pairs() -> list[PublishedPair]:
     """Read the paper's pairs in the order of their numbers."""
-    with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
-        rows = list(csv.reader(file))[1:]
     pairs = []
-    for number, split, left, right, overlap, *printed in rows:
+    for row in read_table("stanford2d3ds_pairs"):
+        number, split, left, right, overlap, *printed = row.values()
         figures = list(map(float, printed))
         scores = {
             name: tuple(figures[3 * k : 3 * k + 3]) for k, name in enumerate(_REPRESENTATIONS)
@@ -49,32 +61,25 @@ def published_pairs() -> list[PublishedPair]:
     return pairs
 
 
+@data_set
 class StanfordPairs(PanoramaPairs):
     """Pairs of Stanford2D3DS's panoramas with depth and pose; see `read_panorama_pose`.
 
     Args:
         root: Folder with ``area_1`` …; ``pano/rgb``, ``pano/depth`` and ``pano/pose`` are read.
-        pairs: `paper`, the sixty pairs of area 1; or `rooms`, any two panoramas of a room.
+        selection: `paper`, the sixty pairs of area 1; or `rooms`, any two panoramas of a room.
         areas: Areas to search with `rooms`; by default all present.
         erp_height: Rows to downsample the panoramas to; by default unchanged.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        pairs: Literal["paper", "rooms"] = "paper",
-        areas: Sequence[str] | None = None,
-        erp_height: int | None = None,
-    ) -> None:
-        if pairs not in ("paper", "rooms"):
-            raise SettingError("data.pairs", found=pairs, expected="paper or rooms")
-        self.root = Path(root)
-        self.published = {str(p.number): p for p in published_pairs()} if pairs == "paper" else {}
-        self._areas = areas
-        self._height = erp_height
+    root: Path = field(kw_only=False)
+    selection: Literal["paper", "rooms"] = "paper"
+    areas: Sequence[str] | None = None
+    erp_height: PositiveInt | None = None
+
+    def __post_init__(self) -> None:
+        is_paper = self.selection == "paper"
+        self.published = {str(p.number): p for p in published_pairs()} if is_paper else {}
 
     @cached_property
     def pairs(self) -> list[tuple[str, PictureFiles, PictureFiles]]:
@@ -83,7 +88,7 @@ class StanfordPairs(PanoramaPairs):
         Raises:
             DataError: Panoramas are missing.
         """
-        areas = self._areas or [a for a in AREAS if (self.root / f"area_{a}").is_dir()]
+        areas = self.areas or [a for a in AREAS if (self.root / f"area_{a}").is_dir()]
         problems = Problems()
         files = [
             files
@@ -112,20 +117,21 @@ class StanfordPairs(PanoramaPairs):
     def panorama(self, files: PictureFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
         image = files.image
-        rgb = read_rgb(image.rgb)
-        shape = paired_shape(image.rgb, rgb, self._height)
-        steps = resize_depth(read_depth(image.parts["depth"]), shape)
-        pose = read_panorama_pose(files.pose)
-        small = resize_area(rgb, shape)
-        return PairedPanorama(image.name, small, image.rgb, steps_to_meters(steps), pose)
+        rgb, depth = read_rgb(image.rgb), image.depth
+        shape = paired_shape(image.rgb, rgb, self.erp_height)
+        steps = resize_depth(read_depth(depth), shape) if depth else None
+        distance_m = None if steps is None else steps_to_meters(steps)
+        pose = read_panorama_pose(pose_file(image))
+        small = resize(rgb, shape, "bilinear")
+        return PairedPanorama(image.name, small, image.rgb, distance_m, pose)
 
 
 def _room(files: PictureFiles) -> str:
-    return f"{files.name.room}_{files.name.room_number}"
+    return f"{files.room[1]}_{files.room[2]}"
 
 
 def _camera(files: PictureFiles) -> str:
-    return files.name.camera[:_SHORT]
+    return files.camera[:_SHORT]
 
 
 def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
@@ -144,6 +150,6 @@ def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str,
             files[0].image.rgb.parent,
             found=", ".join(wrong),
             expected="one panorama for each image of the paper's pairs",
-            remedy="Copy or extract area_1 again; data.pairs=rooms uses the panoramas present.",
+            remedy="Copy or extract area_1 again; data.selection=rooms uses the panoramas present.",
         )
     return {name: by_name[name][0] for name in names}

@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.panoramas import distance_from_z_depth
+from datamodules.core.images import distance_from_z_depth
 from datamodules.core.problems import Problems
 from datamodules.synthia import reader
 from tangent_train.geometry import (
@@ -176,15 +176,15 @@ def _make(
     target = reader.panorama_files(root, sequence, frame, with_depth=True)
     views = [reader.view_files(root, sequence, frame, v, with_depth=True) for v in reader.VIEWS]
     with problems.noted(target.name):
-        depth = [reader.read_first_channel(view.parts["depth"]) for view in views]
+        depth = [reader.read_first_channel(view.depth) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
-        ids = [reader.read_ids(view.parts["labels"]) for view in views]
-        parts = {
-            "depth": stitcher.stitch(far, "nearest"),
-            "labels": stitcher.stitch(ids, "nearest", reader.INVALID),
-            "rgb": stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
+        ids = [reader.read_first_channel(view.labels).astype(np.uint8) for view in views]
+        parts: dict[Any, NDArray[Any]] = {
+            target.depth: stitcher.stitch(far, "nearest"),
+            target.labels: stitcher.stitch(ids, "nearest", reader.INVALID),
+            target.rgb: stitcher.stitch([read_rgb(view.rgb) for view in views], "bilinear"),
         }
-        for part, image in parts.items():
-            write_pixels(target.parts[part], image)
+        for path, image in parts.items():
+            write_pixels(path, image)
         return frame
     return None

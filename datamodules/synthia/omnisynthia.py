@@ -16,28 +16,52 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain
-from typing import ClassVar
+from typing import Annotated, Any, ClassVar, Literal
 
-from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
-from datamodules.core.index import DatasetIndex, Split
-from datamodules.core.inputs import Input
-from datamodules.core.panoramas import ImageFiles
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field, PositiveInt
+
+from datamodules.core.data_module import data_set
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule
+from datamodules.core.images import ImageFiles, units_to_steps
+from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.problems import Problems
+from datamodules.core.splits import Split
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
+from tangent_train.io.pixel_files import read_image_size
 
-SEQUENCES: tuple[str, ...] = ("01", "02", "04", "05", "06")
-"""Available sequences; OmniSYNTHIA uses the summer versions."""
+# YAML reads 01 as a number.
+Sequences = Sequence[
+    Annotated[
+        Literal["01", "02", "04", "05", "06"], BeforeValidator(lambda given: str(given).zfill(2))
+    ]
+]
+"""Names of sequences; OmniSYNTHIA uses the summer versions."""
 
-TRAIN: tuple[str, ...] = ("01", "02", "05", "06")
-TEST: tuple[str, ...] = ("04",)
-"""The split of Zhang et al. 2019."""
+_MEAN, _STD = (0.4512, 0.4257, 0.3920), (0.2601, 0.2680, 0.2931)
+_NORMALIZATIONS = (
+    Normalization(_MEAN, _STD),
+    Normalization((*_MEAN, RGBD_NORMALIZATION.mean[3]), (*_STD, RGBD_NORMALIZATION.std[3])),
+)
+"""RGB as in the released code of the paper. For depth, where
+nothing is published, the values of Stanford2D3DS are used, with the same clipping."""
+
+_LABELS = LabelMap.of(
+    # Traffic lights are 15. The reserved 13 and 14 are unknown: the published panoramas were
+    # averaged where views overlap, which may have made some.
+    dict(zip(reader.CLASSES, (*range(1, 13), 15), strict=True)),
+    [0, 13, 14, reader.INVALID],
+)
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthiaSequences(ImageDataModule):
     """The training and test sequences of OmniSYNTHIA's authors.
 
@@ -48,96 +72,64 @@ class SynthiaSequences(ImageDataModule):
         train_sequences: Sequences for training, e.g. ``01``.
         test_sequences: Sequences for the test, e.g. ``04``.
         frames: Approximate number of frames per sequence, see `choose_frames`.
-
-    Attributes:
-        formats: Formats of the files.
-        remedy: Remedy if there are no images.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *reader.CLASSES)
-    normalizations = reader.NORMALIZATIONS
-    formats: ClassVar[reader.Formats]
-    remedy: ClassVar[str] = reader.GET_IT
-
+    label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": _LABELS}
+    normalizations = _NORMALIZATIONS
+    units_per_m = 100
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
     inputs: Sequence[Input] = ("rgb",)
-    train_sequences: Sequence[str] = TRAIN
-    test_sequences: Sequence[str] = TEST
-    frames: int = reader.FRAMES
+    train_sequences: Annotated[Sequences, Field(min_length=1)] = ("01", "02", "05", "06")
+    test_sequences: Annotated[Sequences, Field(min_length=1)] = ("04",)
+    frames: PositiveInt = reader.FRAMES
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name, others in (("train_sequences", ()), ("test_sequences", self.train_sequences)):
-            # YAML reads 01 as a number.
-            some = tuple(str(sequence).zfill(2) for sequence in getattr(self, name))
-            setattr(self, name, some)
-            fine = some and set(some) <= set(SEQUENCES) - {str(o).zfill(2) for o in others}
-            expected = f"some of {', '.join(SEQUENCES)}, none for both training and test"
-            self.require(name, bool(fine), expected)
-
-    @property
-    def sequences(self) -> tuple[str, ...]:
-        """Training sequences, then test sequences."""
-        return (*self.train_sequences, *self.test_sequences)
+        if both := set(self.train_sequences) & set(self.test_sequences):
+            expected = "sequences that are not for training"
+            raise SettingError("data.test_sequences", found=", ".join(both), expected=expected)
 
     @abstractmethod
-    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+    def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """Return the images of every frame of a sequence, if any."""
 
-    def find_images(
-        self, problems: Problems
-    ) -> tuple[reader.SynthiaReader, dict[Split, list[ImageFiles]]]:
+    def files(self, split: Split) -> Sequence[ImageFiles]:
+        """See `DataModule`."""
+        return self._divided[split]
+
+    @cached_property
+    def _divided(self) -> dict[Split, list[ImageFiles]]:
+        splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
+        for sequence in (*self.train_sequences, *self.test_sequences):
+            found = self.list_images(sequence)
+            if not found:
+                folder, expected = reader.sequence_folder(self.root, sequence), "000000.png …"
+                raise DataError(
+                    folder, found=f"no {self.noun}", expected=expected, remedy=reader.GET_IT
+                )
+            if sequence in self.test_sequences:
+                splits["test"] += chain.from_iterable(found)
+                continue
+            # Neighboring frames are nearly identical: validation takes those at the end.
+            held = min(max(1, round(self.val_fraction * len(found))), len(found) - 1)
+            last = len(found) - held if self.val_fraction else len(found)
+            splits["train"] += chain.from_iterable(found[:last])
+            splits["val"] += chain.from_iterable(found[last:])
+        return splits
+
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`."""
-        found: dict[str, list[list[ImageFiles]]] = {}
-        for sequence in self.sequences:
-            found[sequence] = []
-            with problems.noted():
-                found[sequence] = self.list_images(sequence, with_depth=self.reads_depth)
-                if not found[sequence]:
-                    raise DataError(
-                        reader.sequence_folder(self.root, sequence),
-                        found=f"no {self.noun}",
-                        expected="000000.png and others",
-                        remedy=self.remedy,
-                    )
-        splits = divide(found, self.test_sequences, self.val_fraction)
-        return reader.SynthiaReader(self.formats), splits
+        path: Any = files.labels
+        return _LABELS.decode(reader.read_first_channel(path), path)
+
+    def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
+        """See `ImageDataModule`: centimeters in the first channel."""
+        path: Any = files.depth
+        return units_to_steps(reader.read_first_channel(path), self.units_per_m)
 
 
-def divide(
-    frames: Mapping[str, Sequence[Sequence[ImageFiles]]],
-    test: Sequence[str],
-    val_fraction: float,
-) -> dict[Split, list[ImageFiles]]:
-    """Assign frames to splits.
-
-    Neighboring frames are nearly identical, so validation takes those at the end of each training
-    sequence.
-
-    Args:
-        frames: Images of each frame, by sequence and in order.
-        test: Sequences for the test; all others are for training.
-        val_fraction: Share of each training sequence for validation: at least one frame,
-            at most all but one; 0 for no validation.
-    """
-    splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
-    for sequence, found in frames.items():
-        count = len(found)
-        if sequence in test:
-            splits["test"] += chain.from_iterable(found)
-            continue
-        held = min(max(1, round(val_fraction * count)), count - 1)
-        last = count - held if val_fraction else count
-        splits["train"] += chain.from_iterable(found[:last])
-        splits["val"] += chain.from_iterable(found[last:])
-    return splits
-
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class OmniSynthia(SynthiaSequences, PanoramaDataModule):
     """OmniSYNTHIA, 13 classes, with the training and test sequences of its authors.
 
@@ -147,68 +139,50 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
 
     Args:
         panorama_height: Rows of generated panoramas.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    formats = reader.PANORAMA_FORMATS
     no_distances = "published panoramas of OmniSYNTHIA have z-depth of the four views"
-    remedy = f"Run tangent-prepare to generate them from the views. {reader.GET_IT}"
 
-    panorama_height: int = HEIGHT
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self._not_made = Problems()
+    panorama_height: PositiveInt = HEIGHT
 
     def make_files(self) -> None:
         """Generate missing panoramas of all sequences.
 
         Raises:
-            DataError: The views are missing or broken.
+            DataError: A view is broken.
         """
-        self._not_made = Problems()
-        make_panoramas(
-            self.root,
-            self.sequences,
-            self._not_made,
-            frames=self.frames,
-            height=self.panorama_height,
-        )
+        broken = Problems()
+        sequences = (*self.train_sequences, *self.test_sequences)
+        size = {"frames": self.frames, "height": self.panorama_height}
+        make_panoramas(self.root, sequences, broken, **size)
+        vars(self).pop("_divided", None)  # listed before there were files
         if not self.skip_broken:
-            self._not_made.refuse(self.root, "data.skip_broken=true leaves out these frames.")
+            broken.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
-    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `LabeledData`; panoramas that could not be generated are broken."""
-        problems.add_all(self._not_made)
-        return super().find(problems)
-
-    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+    def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
+        folder = reader.sequence_folder(self.root, sequence)
         return [
-            [reader.panorama_files(self.root, sequence, frame, with_depth=with_depth)]
-            for frame in reader.list_panorama_frames(reader.sequence_folder(self.root, sequence))
+            [reader.panorama_files(self.root, sequence, frame, with_depth=self.reads_depth)]
+            for frame in reader.list_panorama_frames(folder)
         ]
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
-    """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA.
+    """SYNTHIA's views, 13 classes, in the frames and splits of OmniSYNTHIA."""
 
-    Raises:
-        SettingError: A setting is invalid.
-    """
-
-    formats = reader.VIEW_FORMATS
-
-    def list_images(self, sequence: str, *, with_depth: bool) -> list[list[ImageFiles]]:
+    def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
         frames = reader.list_frames(reader.sequence_folder(self.root, sequence))
         return [
             [
-                reader.view_files(self.root, sequence, frame, v, with_depth=with_depth)
-                for v in reader.VIEWS
+                reader.view_files(self.root, sequence, frame, view, with_depth=self.reads_depth)
+                for view in reader.VIEWS
             ]
             for frame in reader.choose_frames(frames, self.frames)
         ]
+
+    def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
+        """See `ImageDataModule`: the camera of all views of the sequence."""
+        return reader.read_view_camera(files.rgb.parents[3], read_image_size(files.rgb))

@@ -20,17 +20,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.inputs import RGBD_NORMALIZATION, Normalization
-from datamodules.core.panoramas import ImageFiles, PngReader, meters_to_steps, resize_nearest
-from tangent_train.errors import DataError, at_least
+from datamodules.core.images import ImageFiles
+from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_pixels
 
 VIEWS: tuple[str, ...] = ("F", "R", "B", "L")
@@ -69,52 +66,14 @@ CLASSES: tuple[str, ...] = (
 INVALID = 255
 """Label in panoramas for pixels outside of all views."""
 
-NORMALIZATIONS = (
-    Normalization(mean=(0.4512, 0.4257, 0.3920), std=(0.2601, 0.2680, 0.2931)),
-    Normalization(
-        mean=(0.4512, 0.4257, 0.3920, RGBD_NORMALIZATION.mean[3]),
-        std=(0.2601, 0.2680, 0.2931, RGBD_NORMALIZATION.std[3]),
-    ),
-)
-"""RGB as in the released code of the paper. For depth, where
-nothing is published, the values of Stanford2D3DS are used, with the same clipping."""
-
-Formats = dict[str, tuple[int, tuple[str, ...]]]
-"""Bits and color types by part."""
-
-VIEW_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (16, ("RGB", "RGBA")),
-    "depth": (16, ("gray", "RGB", "RGBA")),
-}
-"""Pixel formats of a view."""
-
-PANORAMA_FORMATS: Formats = {
-    "rgb": (8, ("RGB", "RGBA")),
-    "labels": (8, ("gray",)),
-    "depth": (16, ("gray",)),
-}
-"""Pixel formats of a panorama."""
-
-_LAST_ID = 15
-_LABELS = np.zeros(256, np.uint8)
-# Traffic lights, 15, become 13. The reserved 13 and 14 are unknown: the published panoramas were
-# averaged where views overlap, which may have made some.
-_LABELS[: _LAST_ID + 1] = [*range(13), 0, 0, 13]
-
 
 def sequence_folder(root: Path, sequence: str) -> Path:
     """Return the folder of a sequence.
-
-    Raises:
-        DataError: The data set is missing.
 
     >>> from pathlib import Path
     >>> sequence_folder(Path("."), "01").name
     'SYNTHIA-SEQS-01-SUMMER'
     """
-    if not root.is_dir():
-        raise DataError(root, found="no such folder", expected="the data set", remedy=GET_IT)
     return root / f"SYNTHIA-SEQS-{sequence}-SUMMER"
 
 
@@ -164,13 +123,9 @@ def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:
     The choice of OmniSYNTHIA's authors (Zhang et al. 2019): n is the number of frames divided by
     `count`, rounded half up.
 
-    Raises:
-        SettingError: `count` is less than 1.
-
     >>> len(choose_frames([str(i) for i in range(1250)]))
     417
     """
-    at_least("data.frames", count, 1)
     step = math.floor(len(frames) / count + 0.5) if len(frames) > count else 1
     return list(frames[::step])
 
@@ -206,31 +161,6 @@ def _camera_file(folder: Path) -> Path:
     return folder / "CameraParams" / "intrinsics.txt"
 
 
-@dataclass(frozen=True)
-class SynthiaReader(PngReader):
-    """Reader of views and panoramas.
-
-    Attributes:
-        formats: `VIEW_FORMATS` or `PANORAMA_FORMATS`.
-    """
-
-    formats: Formats
-
-    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """Return the labels by `CLASSES`, 0 where unknown."""
-        ids = read_ids(files.parts["labels"])
-        return cv2.LUT(resize_nearest(ids, shape or (ids.shape[0], ids.shape[1])), _LABELS)
-
-    def depth(self, files: ImageFiles) -> NDArray[np.uint16]:
-        """Read depth in steps of 1/512 m."""
-        centimeters = read_first_channel(files.parts["depth"])
-        return meters_to_steps((centimeters / 100).astype(np.float32))
-
-    def camera(self, files: ImageFiles) -> NDArray[np.float64]:
-        """Read the camera matrix of the view's sequence."""
-        return read_view_camera(files.rgb.parents[3], self.size("rgb", files.rgb))
-
-
 def read_first_channel(path: Path) -> NDArray[Any]:
     """Decode the red or only channel of an image unchanged, ``(H, W)``.
 
@@ -239,21 +169,3 @@ def read_first_channel(path: Path) -> NDArray[Any]:
     """
     image = read_pixels(path, indices=True)
     return image if image.ndim == 2 else image[..., 0]
-
-
-def read_ids(path: Path) -> NDArray[np.uint8]:
-    """Read the labels in the file, ``(H, W)``: 0 to 15, or `INVALID`.
-
-    Raises:
-        DataError: The file is broken or holds other labels.
-    """
-    ids = read_first_channel(path)
-    strange = ids[(ids > _LAST_ID) & (ids != INVALID)]
-    if strange.size:
-        raise DataError(
-            path,
-            found=f"labels {', '.join(map(str, np.unique(strange)[:5]))}",
-            expected=f"0 to {_LAST_ID}, and {INVALID} in panoramas",
-            remedy="Use the files as released (GT/LABELS, not GT/COLOR).",
-        )
-    return ids.astype(np.uint8)

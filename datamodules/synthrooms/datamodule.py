@@ -2,101 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from dataclasses import field
 from typing import Any
 
-from datamodules.core.index import DatasetIndex
-from datamodules.core.panoramas import ImageFiles
-from datamodules.core.problems import Problems
+from datamodules.core.data_module import data_set
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
-    StanfordAreas,
+    StanfordImages,
 )
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class SynthRoomsAreas(StanfordAreas):
-    """Areas of synthetic rooms, generated on first use.
+@data_set
+class SynthRoomsImages(StanfordImages):
+    """Images of synthetic rooms, generated on first use.
 
     Args:
         rooms: Rooms to generate; their areas are the areas used.
     """
 
-    areas: Sequence[str] = field(init=False, default=())
-    rooms: RoomSettings | Mapping[str, int | str | Mapping[str, int]]
+    areas: Any = field(init=False, default=())
+    rooms: RoomSettings
 
     def __post_init__(self) -> None:
-        self.rooms = rooms = RoomSettings.of(self.rooms)
-        self.areas = rooms.areas
+        self.areas = self.rooms.areas
         super().__post_init__()
 
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
-        generate_rooms(self.root, RoomSettings.of(self.rooms))
-
-    def find(self, problems: Problems) -> DatasetIndex[ImageFiles]:
-        """See `LabeledData`."""
-        if not self.root.is_dir():
-            remedy = "Run tangent-prepare with the same settings."
-            raise DataError(self.root, found="no such folder", expected="rooms", remedy=remedy)
-        return super().find(problems)
+        generate_rooms(self.root, self.rooms)
+        vars(self).pop("_divided", None)  # listed before there were files
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class SynthRooms(SynthRoomsAreas, Stanford2D3DS):
-    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+@data_set
+class SynthRooms(SynthRoomsImages, Stanford2D3DS):
+    """Panoramas of synthetic rooms, read as Stanford2D3DS: the data set that needs no download."""
 
 
-@dataclass(kw_only=True, eq=False, repr=False)
-class SynthRoomsPerspective(SynthRoomsAreas, Stanford2D3DSPerspective):
-    """Photos of synthetic rooms, read as those of Stanford2D3DS.
-
-    Raises:
-        SettingError: A setting is invalid.
-    """
+@data_set
+class SynthRoomsPerspective(SynthRoomsImages, Stanford2D3DSPerspective):
+    """Photos of synthetic rooms, read as those of Stanford2D3DS."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not RoomSettings.of(self.rooms).views_per_camera:
+        if not self.rooms.views_per_camera:
             raise SettingError("data.rooms.views_per_camera", found=0, expected="1 or more photos")
 
 
+@data_set
 class SynthRoomsPairs(StanfordPairs):
     """Any two panoramas of the same synthetic room, with exact depth and pose.
 
     Pairs are not divided into easy and hard, because overlaps are known only afterwards.
 
     Args:
-        root: Folder for the files.
         rooms: Rooms to generate, with two cameras or more.
-        erp_height: See `StanfordPairs`.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    def __init__(
-        self,
-        root: str | Path,
-        rooms: RoomSettings | Mapping[str, Any],
-        erp_height: int | None = None,
-    ) -> None:
-        self.rooms = RoomSettings.of(rooms)
-        if self.rooms.least_cameras < 2:
-            raise SettingError(
-                "data.rooms.least_cameras", found=self.rooms.least_cameras, expected="2 or more"
-            )
-        super().__init__(root, "rooms", self.rooms.areas, erp_height)
+    selection: Any = field(init=False, default="rooms")
+    areas: Any = field(init=False, default=None)
+    rooms: RoomSettings
 
     def make_files(self) -> None:
         """Generate the files, unless they are there."""

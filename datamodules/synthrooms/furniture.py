@@ -1,14 +1,15 @@
 """Room types, and their furniture: chairs, sofas, tables, boards, bookcases and clutter.
 
 In a frame against a wall x runs along the wall and y into the room; free-standing furniture has its
-back at +y. Items that do not fit raise `NoPlaceError`. Parts and sizes are in ``parts.csv``.
+back at +y. Items that do not fit raise `NoPlaceError`. Parts are in
+``tables/synthrooms_parts.csv``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from datamodules.synthrooms import structure
 from datamodules.synthrooms.layout import FloorPlan, Frame, NoPlaceError, Rectangle
 from datamodules.synthrooms.materials import Palette, Pattern
 from datamodules.synthrooms.room import Room, RoomItem
+from datamodules.tables import read_table
 
 _UNLABELED = 0.12  # share of clutter
 _BOARD = 0.035  # thickness of the boards of a bookcase in meters
@@ -306,28 +308,8 @@ def _add_row(room: Room, case: RoomItem, start: Frame, size: tuple[float, float,
         place += stretch
 
 
-class RoomType(NamedTuple):
-    """Share of rooms, and limits of the long and the short side in meters."""
-
-    share: float
-    long: tuple[float, float]
-    short: tuple[float, float]
-
-
-ROOM_TYPES = {
-    "office": RoomType(0.36, (4.0, 6.0), (3.4, 5.0)),
-    "hallway": RoomType(0.1, (6.0, 8.5), (2.7, 3.4)),
-    "conferenceRoom": RoomType(0.12, (5.0, 7.0), (4.0, 5.5)),
-    "lounge": RoomType(0.09, (4.5, 6.5), (4.0, 5.5)),
-    "storage": RoomType(0.06, (3.6, 5.0), (3.2, 4.2)),
-    "WC": RoomType(0.04, (3.4, 4.6), (3.0, 3.8)),
-    "copyRoom": RoomType(0.05, (3.8, 5.0), (3.2, 4.4)),
-    "lobby": RoomType(0.06, (5.5, 7.5), (4.5, 6.0)),
-    "pantry": RoomType(0.05, (3.8, 5.2), (3.2, 4.4)),
-    "openspace": RoomType(0.04, (6.0, 8.0), (5.0, 6.5)),
-    "auditorium": RoomType(0.03, (6.5, 8.5), (5.5, 7.0)),
-}
-"""Room types of Stanford2D3DS."""
+_TYPES = {row["type"]: row for row in read_table("synthrooms_types")}
+"""Room types of Stanford2D3DS: share of rooms, and limits of the sides in meters."""
 
 _PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
     (structure.add_column, 0.75, 1, 2),
@@ -348,9 +330,9 @@ _PROGRAM: tuple[tuple[Callable[[Room], None], float, int, int], ...] = (
 
 
 def draw_room_type(rng: np.random.Generator) -> str:
-    """Draw one of `ROOM_TYPES`."""
-    shares = np.array([kind.share for kind in ROOM_TYPES.values()])
-    return list(ROOM_TYPES)[rng.choice(len(shares), p=shares / shares.sum())]
+    """Draw a room type of Stanford2D3DS."""
+    shares = np.array([float(row["share"]) for row in _TYPES.values()])
+    return list(_TYPES)[rng.choice(len(shares), p=shares / shares.sum())]
 
 
 def build_empty_room(rng: np.random.Generator, plan: FloorPlan) -> Room:
@@ -365,10 +347,10 @@ def build_room(rng: np.random.Generator, room_type: str) -> Room:
 
     Args:
         rng: The room's source of randomness.
-        room_type: One of `ROOM_TYPES`.
+        room_type: From `draw_room_type`.
     """
-    limits = ROOM_TYPES[room_type]
-    long, short, notch = rng.uniform(*limits.long), rng.uniform(*limits.short), None
+    limits = [map(float, _TYPES[room_type][side].split()) for side in ("long", "short")]
+    (long, short), notch = (rng.uniform(*pair) for pair in limits), None
     size = (long, short, rng.uniform(*_HEIGHTS))
     if rng.random() < _L_SHAPED and short >= 3.2:
         notch = (long * rng.uniform(0.25, 0.5), short * rng.uniform(0.25, 0.45))

@@ -11,13 +11,15 @@ import json
 import math
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, field
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Annotated, Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, Field, NonNegativeInt, PositiveInt
+from pydantic.dataclasses import dataclass
 
 from datamodules.core.processes import in_processes
 from datamodules.stanford2d3ds.files import (
@@ -46,7 +48,7 @@ from datamodules.synthrooms.render import (
     draw_holes,
     render_picture,
 )
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes, write_text
 from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
@@ -61,13 +63,12 @@ PANORAMA = "equirectangular"
 """Frame of panoramas in file names and poses."""
 
 _VERSION = 1  # other versions render other pictures from the same settings
-_LEAST = {"seed": 0, "height": 8, "views_per_camera": 0, "view_size": 8, "supersample": 1}
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # shares of rooms with one, two and three cameras
 _DEPTH_UNITS = 512  # per meter
 _NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class RoomSettings:
     """Settings of a data set; the same settings give the same bytes.
 
@@ -87,31 +88,24 @@ class RoomSettings:
         SettingError: A setting is invalid.
     """
 
-    seed: int = 0
-    rooms: Mapping[str, int] = field(
+    seed: NonNegativeInt = 0
+    rooms: Mapping[str, NonNegativeInt] = field(
         default_factory=lambda: {a: 16 if a[0] == "5" else 40 for a in AREAS}
     )
-    height: int = 512
+    height: Annotated[int, Field(ge=8)] = 512
     views: ViewKind = "stanford"
-    views_per_camera: int = 0
-    view_size: int = 540
-    supersample: int = 2
-    least_cameras: int = 1
-
-    @classmethod
-    def of(cls, given: RoomSettings | Mapping[str, Any]) -> RoomSettings:
-        """Return settings from a config."""
-        return given if isinstance(given, RoomSettings) else cls(**given)
+    views_per_camera: NonNegativeInt = 0
+    view_size: Annotated[int, Field(ge=8)] = 540
+    supersample: PositiveInt = 2
+    least_cameras: PositiveInt = 1
 
     def __post_init__(self) -> None:
         rooms = {str(area).removeprefix("area_"): count for area, count in self.rooms.items()}
         if not set(rooms) <= set(AREAS) or not any(rooms.values()):
-            raise SettingError("rooms", found=rooms, expected=f"numbers of rooms by area: {AREAS}")
+            raise SettingError(
+                "data.rooms", found=rooms, expected=f"numbers of rooms by area: {AREAS}"
+            )
         object.__setattr__(self, "rooms", {area: rooms[area] for area in AREAS if area in rooms})
-        if self.views not in get_args(ViewKind):
-            raise SettingError("views", found=self.views, expected=get_args(ViewKind))
-        for name, least in _LEAST.items():
-            at_least(name, getattr(self, name), least)
 
     @property
     def areas(self) -> list[str]:

@@ -56,12 +56,8 @@ class Rectangle(NamedTuple):
 
     def meets(self, other: Rectangle, gap: float = 0.0) -> bool:
         """Return True if two rectangles are closer than `gap` meters along both axes."""
-        return (
-            self.x0 < other.x1 + gap
-            and other.x0 < self.x1 + gap
-            and self.y0 < other.y1 + gap
-            and other.y0 < self.y1 + gap
-        )
+        in_x = self.x0 < other.x1 + gap and other.x0 < self.x1 + gap
+        return in_x and self.y0 < other.y1 + gap and other.y0 < self.y1 + gap
 
     @classmethod
     def around(cls, frame: Frame, x: tuple[float, float], y: tuple[float, float]) -> Rectangle:
@@ -135,12 +131,8 @@ class FloorPlan:
 
     def contains(self, area: Rectangle, margin: float = 0.0) -> bool:
         """Return True if a rectangle is inside and `margin` meters away from every wall."""
-        inside = (
-            area.x0 >= margin
-            and area.y0 >= margin
-            and area.x1 <= self.width - margin
-            and area.y1 <= self.depth - margin
-        )
+        in_x = area.x0 >= margin and area.x1 <= self.width - margin
+        inside = in_x and area.y0 >= margin and area.y1 <= self.depth - margin
         return inside and not (self.notch is not None and area.meets(self.notch, margin))
 
     def claim(self, area: Rectangle, margin: float = 0.0, gap: float = 0.0) -> bool:
@@ -151,11 +143,11 @@ class FloorPlan:
             margin: Distance from every wall in meters.
             gap: Distance from everything else in meters.
         """
-        free = not any(area.meets(other, gap) for other in self._taken)
-        if not (free and self.contains(area, margin)):
-            return False
-        self._taken.append(area)
-        return True
+        is_free = not any(area.meets(other, gap) for other in self._taken)
+        if is_free and self.contains(area, margin):
+            self._taken.append(area)
+            return True
+        return False
 
     def against_wall(
         self, rng: np.random.Generator, width: float, depth: float, zone: Zone

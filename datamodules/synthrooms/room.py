@@ -1,19 +1,17 @@
 """Rooms under construction: items composed of boxes, cylinders and balls, with materials.
 
-``parts.csv`` is the table of parts of all furniture. A position or size in it is a sum such as
-``0.5wide-0.03``, in meters and in values of the piece. `mirror` repeats rows at −x (``x``), or at
-−x and −y (``xy``). ``body:0.6`` is the material `body`, shaded by 0.6.
+``tables/synthrooms_parts.csv`` is the table of parts of all furniture. A position or size in it
+is a sum such as ``0.5wide-0.03``, in meters and in values of the piece. `mirror` repeats rows at
+−x (``x``), or at −x and −y (``xy``). ``body:0.6`` is the material `body`, shaded by 0.6.
 """
 
 from __future__ import annotations
 
-import csv
 import math
 import re
 from dataclasses import dataclass, field
 from functools import cache, partialmethod
 from itertools import groupby
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,6 +20,7 @@ from trimesh import creation
 
 from datamodules.synthrooms.layout import FloorPlan, Frame
 from datamodules.synthrooms.materials import Material, Palette
+from datamodules.tables import read_table
 
 _SHAPES = {
     "box": creation.box((1, 1, 1)),
@@ -40,13 +39,11 @@ _Triple = tuple[float, float, float]
 
 @cache
 def _part_table() -> dict[str, list[tuple[str, list[_Row]]]]:
-    """Return the rows of ``parts.csv`` by key, as runs of rows that are mirrored together."""
-    with Path(__file__).with_name("parts.csv").open(encoding="utf-8", newline="") as file:
-        keys = groupby(csv.DictReader(file), key=lambda row: row["key"])
-        return {
-            key: [(mirror, list(run)) for mirror, run in groupby(rows, lambda row: row["mirror"])]
-            for key, rows in keys
-        }
+    """Return the rows of the table by key, as runs of rows that are mirrored together."""
+    return {
+        key: [(mirror, list(run)) for mirror, run in groupby(rows, lambda row: row["mirror"])]
+        for key, rows in groupby(read_table("synthrooms_parts"), lambda row: row["key"])
+    }
 
 
 @cache
@@ -116,7 +113,7 @@ class RoomItem:
     ball = partialmethod(add, "ball")
 
     def put(self, key: str, **values: Any) -> None:
-        """Add the parts of a key of ``parts.csv``.
+        """Add the parts of a key of the table.
 
         Args:
             key: Key of the rows.

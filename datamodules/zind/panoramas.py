@@ -34,63 +34,35 @@ Dataset: Annotated Floor Plans With 360º Panoramas and 3D Room Layouts", CVPR 2
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections.abc import Sequence
+from dataclasses import field
+from functools import cached_property
+from itertools import combinations
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field, NonNegativeInt, PositiveInt
 
-from datamodules.core.image_module import PanoramaDataModule
-from datamodules.core.index import SPLITS, Split, draw_groups
+from datamodules.core.data_module import data_set
+from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import Input
-from datamodules.core.panoramas import ImageFiles, ImageReader
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
 from datamodules.core.problems import Problems
+from datamodules.core.splits import Split, draw_groups
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
-from datamodules.zind.layout import CLASSES, DOOR, Layout
+from datamodules.zind.layout import CLASSES, DOOR
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.io.pixel_files import read_image_size, read_rgb
-
-Doors = Literal["class", "ignore"]
-"""Labels of doors: a class, or unknown."""
+from tangent_train.io.pixel_files import read_rgb
+from tangent_train.rendering.resampling import resize
 
 
-@dataclass(frozen=True, eq=False)
-class ZindReader(ImageReader):
-    """Reads the pictures, with labels from layouts.
-
-    Attributes:
-        layouts: Layouts by name of the panorama.
-        doors: Label of doors.
-    """
-
-    layouts: Mapping[str, Layout]
-    doors: Doors
-
-    @property
-    def settings(self) -> dict[str, str]:
-        """See `ImageReader`: label of doors."""
-        return {"doors": self.doors}
-
-    def size(self, part: str, path: Path) -> tuple[int, int] | None:
-        """See `ImageReader`; layouts have no size."""
-        return read_image_size(path) if part == "rgb" else None
-
-    def rgb(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """See `ImageReader`."""
-        return read_rgb(files.rgb)
-
-    def labels(self, files: ImageFiles, shape: tuple[int, int] | None = None) -> NDArray[np.uint8]:
-        """See `ImageReader`; labels are cast for the requested size."""
-        labels = self.layouts[files.name].labels(shape or read_image_size(files.rgb))
-        if self.doors == "ignore":
-            labels[labels == DOOR] = 0
-        return labels
-
-
-@dataclass(kw_only=True, eq=False, repr=False)
+@data_set
 class Zind(PanoramaDataModule):
     """ZInD, 5 classes.
 
@@ -103,54 +75,50 @@ class Zind(PanoramaDataModule):
             evaluate networks that were trained on other data.
         split_seed: Seed of the splits. Independent of the run's seed, so that runs with different
             seeds share their splits.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
-    class_names = ("unknown", *CLASSES)
+    label_maps = {"5": LabelMap.of(CLASSES, [0])}  # noqa: RUF012, never changed
     no_depth = "ZInD has no depth images"
     fact_settings = ("doors",)
 
     inputs: Sequence[Input] = ("rgb",)
-    doors: Doors = "class"
-    test_fraction: float = 0.2
-    split_seed: int = 0
+    doors: Literal["class", "ignore"] = "class"
+    test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
+    split_seed: NonNegativeInt = 0
 
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        self.require("doors", self.doors in ("class", "ignore"), "class or ignore")
-        self.require("test_fraction", 0 < self.test_fraction <= 1, "above 0 to 1")
-        self.require("split_seed", self.split_seed >= 0, "0 or more")
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        panoramas = zip(self._panoramas, self._split_of_each, strict=True)
+        if split == "val" and not self.val_fraction:
+            return []
+        return [ImageFiles(p.name, p.image, p.file) for p, part in panoramas if part == split]
 
-    def find_images(self, problems: Problems) -> tuple[ZindReader, dict[Split, list[ImageFiles]]]:
-        """See `ImageDataModule`."""
-        panoramas = [p for p in list_home_panoramas(self.root, problems) if p.record.layout_visible]
-        split_of = self._divided(panoramas)
-        layouts: dict[str, Layout] = {}
-        splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
-        for panorama, split in zip(panoramas, split_of, strict=True):
-            with problems.noted(panorama.name):
-                layouts[panorama.name] = panorama.layout()
-                files = ImageFiles(panorama.name, panorama.image, panorama.file)
-                splits[split].append(files)
-        if not self.val_fraction:
-            splits["val"] = []
-        return ZindReader(layouts, self.doors), splits
+    @cached_property
+    def _panoramas(self) -> list[HomePanorama]:
+        found = list_home_panoramas(self.root, self.problems)
+        return [panorama for panorama in found if panorama.record.layout_visible]
 
-    def _divided(self, panoramas: Sequence[HomePanorama]) -> list[Split]:
-        """Return the split of every panorama."""
+    @cached_property
+    def _by_name(self) -> dict[str, HomePanorama]:
+        return {panorama.name: panorama for panorama in self._panoramas}
+
+    @cached_property
+    def _split_of_each(self) -> list[Split]:
+        homes = {panorama.home for panorama in self._panoramas}
         partition = self.root / "zind_partition.json"
-        homes = {panorama.home for panorama in panoramas}
         if partition.is_file():
-            of_home = _read_partition(partition, homes)
-            return [of_home[panorama.home] for panorama in panoramas]
-        groups = [p.home if len(homes) > 1 else p.room for p in panoramas]
-        test = set(groups)
+            kind = dict[Split, list[str]]
+            lists = read_json(partition, "lists of homes for train, val and test", kind=kind)
+            of_home = {home: split for split, names in lists.items() for home in names}
+            if missing := sorted(homes - of_home.keys()):
+                found = f"no home {', '.join(missing[:5])}"
+                raise DataError(partition, found=found, expected=f"every home of {self.root}")
+            return [of_home[panorama.home] for panorama in self._panoramas]
+        groups = [p.home if len(homes) > 1 else p.room for p in self._panoramas]
+        test, held = set(groups), set[str]()
         if self.test_fraction < 1:
             test = draw_groups(groups, self.test_fraction, [self.split_seed, 0])
         rest = [group for group in groups if group not in test]
-        held: set[str] = set()
         if self.val_fraction:
             held = draw_groups(rest, self.val_fraction, [self.split_seed, 1])
         if not test or (rest and self.val_fraction and not held):
@@ -163,17 +131,81 @@ class Zind(PanoramaDataModule):
             )
         return ["test" if g in test else "val" if g in held else "train" for g in groups]
 
+    def check_files(self, files: ImageFiles) -> None:
+        """See `DataModule`: the layout is a room around the camera, too."""
+        super().check_files(files)
+        self._by_name[files.name].layout()
 
-def _read_partition(path: Path, homes: set[str]) -> dict[str, Split]:
-    """Return the split of every home in a ``zind_partition.json``."""
-    lists = read_json(path, "lists of homes for train, val and test", kind=dict[Split, list[str]])
-    split_of = {home: split for split, homes_of_split in lists.items() for home in homes_of_split}
-    missing = sorted(homes - split_of.keys())
-    if missing:
-        raise DataError(
-            path,
-            found=f"no home {', '.join(missing[:5])}",
-            expected=f"every home of {path.parent} in one of its lists",
-            remedy="Without the file, homes or rooms are drawn.",
-        )
-    return split_of
+    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
+        """See `ImageDataModule`; labels are cast at the size of the run, without resampling."""
+        labels = self._by_name[files.name].layout().labels(self.read_shape)
+        if self.doors == "ignore":
+            labels[labels == DOOR] = 0
+        return labels
+
+    def decode_settings(self) -> dict[str, object]:
+        """See `DataModule`."""
+        return {**super().decode_settings(), "doors": self.doors}
+
+
+@data_set
+class ZindPairs(PanoramaPairs):
+    """Any two panoramas of a complete room whose cameras are inside.
+
+    Floors whose unit is unknown in meters have no pairs. Distances are those of floor,
+    walls and ceiling of the layout; through doors, windows and openings they are unknown.
+
+    Args:
+        root: Folder with a folder for every home, see `datamodules.zind.panoramas`.
+        max_distance_m: Largest distance between the cameras; by default unlimited.
+        erp_height: Rows to downsample the panoramas to; by default unchanged.
+    """
+
+    root: Path = field(kw_only=False)
+    max_distance_m: float | None = field(kw_only=False, default=None)
+    erp_height: PositiveInt | None = None
+
+    @cached_property
+    def pairs(self) -> list[tuple[str, HomePanorama, HomePanorama]]:
+        """See `PanoramaPairs`; names are the room and both panoramas.
+
+        Raises:
+            DataError: There are no pairs, or a file is broken.
+        """
+        problems, root = Problems(), self.root
+        most_m = math.inf if self.max_distance_m is None else self.max_distance_m
+        listed = list_home_panoramas(root, problems)
+        problems.refuse(root)
+        usable = [p for p in listed if p.record.layout_visible and p.record.is_inside and p.unit_m]
+        location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
+        pairs = [
+            (
+                f"{one.room}/{one.name.rpartition('/')[2]} – {other.name.rpartition('/')[2]}",
+                one,
+                other,
+            )
+            for one, other in combinations(usable, 2)
+            if one.room == other.room
+            and math.dist(location_m[one.name], location_m[other.name]) <= most_m
+        ]
+        if not pairs:
+            raise DataError(
+                root,
+                found="no two panoramas of one room",
+                expected="layout_visible, is_inside and scale_meters_per_coordinate of some",
+                remedy="Set data.max_distance_m=null for any distance.",
+            )
+        return pairs
+
+    def image(self, files: HomePanorama) -> Path:
+        """See `PanoramaPairs`."""
+        return files.image
+
+    def panorama(self, files: HomePanorama) -> PairedPanorama:
+        """See `PanoramaPairs`."""
+        path = files.image
+        rgb = read_rgb(path)
+        shape = paired_shape(path, rgb, self.erp_height)
+        pose, unit_m = files.pose()
+        distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
+        return PairedPanorama(files.name, resize(rgb, shape, "bilinear"), path, distance_m, pose)

@@ -41,7 +41,7 @@ class PredictionPanels(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         task: Any = pl_module
-        source: Any = trainer.datamodule.source("test")  # type: ignore[attr-defined]
+        source: Any = trainer.datamodule.dataset("test")  # type: ignore[attr-defined]
         chosen = evenly_spread(self.count, len(source))
         predictions = zip(batch.index.tolist(), task.true_labels(batch), outputs, strict=True)
         for index, target, prediction in predictions:

@@ -46,7 +46,7 @@ class ValidationPictures(Callback):
             return
         task: Any = pl_module
         data: Any = trainer.datamodule  # type: ignore[attr-defined]
-        source, index = data.source("val"), int(batch.index[0])
+        source, index = data.dataset("val"), int(batch.index[0])
         labels = task.true_labels(batch)[0], outputs[0]
         panel = task.picture(source.read(index), *labels, most_rows=_MOST_ROWS)
         if panel is None:

@@ -17,10 +17,10 @@ def prepare(settings: PrepareSettings) -> None:
     shard = Shard.parse(settings.shard)
     data = open_data(settings)
     if shard is not None:
-        count = data.prepare_part(shard.part)
-        print_text(f"Shard {shard}: {count} {data.noun} are in {data.store}.")
+        count = data.fill_cache(shard.part)
+        print_text(f"Shard {shard}: {count} {data.noun} are in {data.cache}.")
     else:
         data.prepare_data()
         data.setup()
-        counts = ", ".join(f"{len(data.index().splits[s])} {s}" for s in ("train", "val", "test"))
+        counts = ", ".join(f"{len(data.splits()[s])} {s}" for s in ("train", "val", "test"))
         print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder.reader import class_masks
+from datamodules.folder.labeled import class_masks
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings
 from tangent_train.console import print_text

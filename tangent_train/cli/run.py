@@ -16,10 +16,10 @@ from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
+from datamodules.core.data_module import DataModule
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
-from datamodules.core.split_module import SplitDataModule
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.panels import PredictionPanels
 from tangent_train.callbacks.pictures import ValidationPictures
@@ -120,7 +120,7 @@ class Run:
         if getattr(self.data, "upright", None) == "auto" and by_classes:
             self.data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
         trainer.test(self.task, datamodule=self.data, verbose=False)
-        noun, total = self.data.noun, len(self.data.source("test"))
+        noun, total = self.data.noun, len(self.data.dataset("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
         result = self.task.evaluation_result(noun) if tested else None
         if result and result.images == total:
@@ -134,7 +134,7 @@ class Run:
 
     def _groups(self, world_size: int) -> list[dict[str, Any]]:
         """Return the scores of each group of test images, see `LabeledData.groups`."""
-        items, places = self.data.index().splits["test"], defaultdict(list)
+        items, places = self.data.splits()["test"], defaultdict(list)
         for place, index in enumerate(gathered_order(len(items), world_size)):
             for group in self.data.groups(items[index]):
                 places[group].append(place)
@@ -241,10 +241,9 @@ def open_data(settings: RunSettings) -> Any:
 def build_data(settings: RunSettings) -> Any:
     """Build the data module of a run, and check that it has the labels of the task."""
     data = open_data(settings)
-    if not isinstance(data, SplitDataModule):
+    if not isinstance(data, DataModule):
         expected = "labeled images or shapes; pairs are for tangent-keypoints"
         raise SettingError("data", found=type(data).__name__, expected=expected)
-    data.check_classes()
     needed = _head_class(settings).labels
     if needed != data.labels:
         raise SettingError(

@@ -60,7 +60,7 @@ def train(settings: TrainSettings) -> float | None:
     # Written before the test, whose errors must not cost a sweep the score.
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)
-    if len(run.data.source("test")):
+    if len(run.data.dataset("test")):
         run.task.load_state_dict(read_checkpoint(tested, ["state_dict"])["state_dict"])
         run.test(trainer, tested)
     else:

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from datamodules.core.images import STEPS_PER_M
 from datamodules.core.labels import DISTANCE
-from datamodules.core.panoramas import STEPS_PER_M
 from tangent_train.checkpoints.distances import (
     along_rays,
     depth_of_output,

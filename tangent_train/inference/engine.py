@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
+from datamodules.core.images import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
-from datamodules.core.panoramas import STEPS_PER_M, resize_depth
 from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.scores import ClassScoreNetwork, network_for_views, plain_scores

@@ -14,41 +14,21 @@ without source classes in the network is not predicted.
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from datamodules.core.label_map import LabelMap, plain_name, read_label_map
 from datamodules.core.labels import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.errors import DataError, SettingError
-from tangent_train.files import Text, check_fields, read_json
-from tangent_train.io.image_files import composed
+from tangent_train.errors import SettingError
 
 Unmapped = Literal["unknown", "never"]
 """Treatment of source classes that are not in a map: label 0 where they win, or they never win."""
 
 _FOLDER = Path(__file__).with_suffix("")
 """Folder with the maps of this package, ``label_maps/<name>.json``."""
-
-_EXPECTED = 'a label map: {"classes": {"wall": ["wall", "painting"], "floor": ["floor"]}}'
-_MOST_CLASSES = 255  # labels are uint8, and 0 is unknown
-
-
-@dataclass(frozen=True)
-class LabelMap:
-    """A mapping from classes of a source data set to classes of a target data set.
-
-    Attributes:
-        name: Name or file of the map.
-        source: Name of the source data set; None if the file does not name it.
-        classes: Names of the source classes of each target class.
-    """
-
-    name: str
-    source: str | None
-    classes: Mapping[str, Sequence[str]]
 
 
 @dataclass(frozen=True)
@@ -104,21 +84,7 @@ def load_label_map(given: str | Path) -> LabelMap:
         raise SettingError(
             "label_map", found=given, expected=f"{', '.join(shipped)}; or a file my_map.json"
         )
-    content = read_json(path, _EXPECTED)
-    fields = check_fields(path, content, {"source": Text | None, "classes": dict}, _EXPECTED)
-    classes = fields["classes"]
-    check_fields(path, {"names": list(classes)}, {"names": list[Text]}, _EXPECTED, "classes")
-    check_fields(path, classes, dict.fromkeys(classes, list[Text]), _EXPECTED, "classes")
-    named = Counter(_plain(name) for names in classes.values() for name in names)
-    twice = [name for name, count in named.items() if count > 1]
-    if twice or not named or len(classes) > _MOST_CLASSES:
-        found = f"{len(classes)} classes" if named else "no source class"
-        raise DataError(
-            path,
-            found=f"{', '.join(twice)} more than once" if twice else found,
-            expected=f"1 to {_MOST_CLASSES} classes, every source class in one of them",
-        )
-    return LabelMap(given, fields["source"], classes)
+    return read_label_map(path)
 
 
 def map_classes(
@@ -140,26 +106,28 @@ def map_classes(
         SettingError: The map contains no class of the network, or a target that is not in
             `targets`.
     """
-    targets = list(label_map.classes) if targets is None else targets
-    foreign = label_map.classes.keys() - set(targets)
+    targets = label_map.names if targets is None else targets
+    foreign = set(label_map.names) - set(targets)
     if foreign:
         raise SettingError(
-            f"label_map={label_map.name}",
+            "label_map",
             found=f"target classes {', '.join(sorted(foreign))}",
             expected=f"names among {', '.join(targets)}",
         )
-    target_of = {_plain(n): target for target, names in label_map.classes.items() for n in names}
+    target_of = {
+        str(key): label_map.names[label - 1] for key, label in label_map.labels.items() if label
+    }
     loaded.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
     names = loaded.class_names[1:]
     groups = loaded.groups or [[k] for k in range(len(names))]
     members: dict[str | None, list[int]] = {name: [] for name in (*targets, None)}
     for k, name in enumerate(names):
-        members[target_of.get(_plain(name))].append(k)
+        members[target_of.get(plain_name(name))].append(k)
     remaining = members.pop(None)
     if len(remaining) == len(names):
         raise SettingError(
-            f"label_map={label_map.name}",
-            found=f"no class of {label_map.source or 'the map'} in a network of {', '.join(names)}",
+            "label_map",
+            found=f"no class of the map in a network of {', '.join(names)}",
             expected="a map whose source classes include the network's",
         )
     if remaining and unmapped == "never" and loaded.score_kind == "labels":
@@ -177,13 +145,7 @@ def map_classes(
     return MappedNetwork(
         loaded=replace(loaded, class_names=("unknown", *targets), groups=scores),
         classes=found,
-        absent=[n for n in target_of if n not in map(_plain, names)],
+        absent=[n for n in target_of if n not in map(plain_name, names)],
         unmapped=[names[k] for k in remaining],
         unmapped_wins=unmapped == "unknown",
     )
-
-
-def _plain(name: str) -> str:
-    """Return the first synonym of a name in the form in which names are compared."""
-    first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
-    return " ".join(first.casefold().split())

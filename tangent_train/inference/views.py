@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from omegaconf import OmegaConf
 
-from datamodules.core.panoramas import distance_from_z_depth, resize_area, resize_depth
+from datamodules.core.images import distance_from_z_depth, resize_depth
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
@@ -27,6 +27,7 @@ from tangent_train.rendering import (
 )
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
 from tangent_train.rendering.representations.views import PinholeViews
+from tangent_train.rendering.resampling import resize
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -452,7 +453,7 @@ def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: floa
     least = np.ceil(wanted.image_size * per_pixel * scale[::-1] + 1e-6)
     top, left = (math.ceil(max(0, a - b) / 2) for a, b in zip(least, (rows, columns), strict=True))
     borders = (top, top, left, left, cv2.BORDER_REFLECT_101)
-    rgb = cv2.copyMakeBorder(resize_area(image.rgb, (rows, columns)), *borders)
+    rgb = cv2.copyMakeBorder(resize(image.rgb, (rows, columns), "bilinear"), *borders)
     if depth is not None:
         depth = cv2.copyMakeBorder(resize_depth(depth, (rows, columns)), *borders)
     offset, factor = np.tile((left, top), 2), np.tile(scale, 2)

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from datamodules.folder.classes import UNKNOWN_NAME
+from datamodules.core.label_map import UNKNOWN_NAME
 from tangent_train.errors import SettingError, counted
 from tangent_train.files import csv_text, write_text
 from tangent_train.io.image_files import composed

@@ -26,7 +26,7 @@ Part = str | Band | None
 _IGNORED = (
     *("choices", "checkpoint", "checkpoint_every_n_steps", "logger", "panels", "resume", "trust"),
     *("validation_images", "seed", "data.fold", "data.seed", "data.root", "data.label_table"),
-    *("data.cache", "data.in_memory", "data.num_workers", "data.store"),
+    *("data.cache", "data.in_memory", "data.num_workers"),
     *("task.channels_last", "task.compile", "task.eval_view_batch_size"),
     *("trainer.accelerator", "trainer.enable_model_summary", "trainer.enable_progress_bar"),
     *("trainer.log_every_n_steps", "trainer.num_sanity_val_steps", "trainer.strategy"),

@@ -29,7 +29,7 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
     elif broken := _not_finite(task):
         reason = f"from weights that were not finite before: {_some(broken)}"
     trainer: Any = task.trainer
-    names = [trainer.datamodule.source("train").name(k) for k in batch.index.tolist()]
+    names = [trainer.datamodule.dataset("train").name(k) for k in batch.index.tolist()]
     half = str(trainer.precision).startswith("16")
     precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
     raise SettingError(

@@ -20,9 +20,9 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 )
 from torch import nn
 
-from datamodules import Stanford2D3DS
 from datamodules.core.inputs import normalize
 from datamodules.core.samples import render_inputs
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
 from tangent_train.heads.pictures import prediction_panel
@@ -174,7 +174,7 @@ def test_the_same_images_are_shown_after_every_validation(
     trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
-    shown, source = _of_tensorboard(folder)[1], data.source("val")
+    shown, source = _of_tensorboard(folder)[1], data.dataset("val")
     assert len(source) == 3
     chosen = {_plain(f"val_images/{source.name(k)}"): k for k in (0, 2)}
     assert shown.keys() == chosen.keys(), "first and last of 3"
@@ -209,7 +209,7 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
     trained: tuple[Path, PixelTask, Stanford2D3DS],
 ) -> None:
     folder, task, data = trained
-    total, norm, source = 0.0, 0.0, data.source("val")
+    total, norm, source = 0.0, 0.0, data.dataset("val")
     normalization: Any = data.normalization
     for index in range(len(source)):
         panorama, (views,) = source.read(index), TANGENT.view_sets()

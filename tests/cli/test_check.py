@@ -89,7 +89,7 @@ def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> No
     assert f"{tmp_path}/depth/test.png: median distance 0.00391 m" in warning
     stores = tmp_path / "stores"
     settings = ["data=folder", "level=4", f"data.root='{tmp_path}'", "data.val_fraction=0"]
-    prepare(composed_settings("prepare", *settings, f"data.store='{stores}'", "task=depth"))
+    prepare(composed_settings("prepare", *settings, f"data.cache='{stores}'", "task=depth"))
     stored = np.load(next(stores.glob("32x64_*/a.npy")))
     assert stored.dtype.names == ("rgb", "labels")
     assert np.unique(stored["labels"]).tolist() == [0, 3 * 512]

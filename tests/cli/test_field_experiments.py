@@ -15,13 +15,13 @@ from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols
 from tests.cli.tiny_runs import Run, results
 from tests.conftest import fabricate
-from tests.datamodules.cityscapes.street_format import (
+from tests.datamodules.matterport_format import write_matterport
+from tests.datamodules.street_format import (
     write_cityscapes,
     write_densepass,
     write_synpass,
 )
-from tests.datamodules.matterport360.matterport_format import write_matterport
-from tests.datamodules.structured3d.structured3d_format import write_structured3d
+from tests.datamodules.structured3d_format import write_structured3d
 from tests.running import ROOT, command_of, composed_settings
 
 WRITERS: Mapping[str, Callable[[Path], Path]] = {

@@ -10,7 +10,7 @@ import pytest
 from datamodules.core.loading import gathered_order, share_of_process
 from tangent_train.results.evaluation_result import load_result
 from tests.cli.tiny_runs import Run, results
-from tests.datamodules.cityscapes.street_format import write_synpass
+from tests.datamodules.street_format import write_synpass
 
 
 def test_weathers_and_times_are_rows_of_the_results(run: Run, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback, RichModelSummary
 
-from datamodules import SynthRooms
+from datamodules.synthrooms.datamodule import SynthRooms
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.cli import main
 from tangent_train.cli.run import build_callbacks, build_loggers

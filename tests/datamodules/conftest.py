@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from datamodules.synthrooms.generate import RoomSettings, generate_rooms
-from datamodules.synthshapes.generate import ShapeSettings, generate_shapes
+from datamodules.synthshapes import ShapeSettings, generate_shapes
 from tangent_train.rendering import EquirectRepresentation
 
 TINY_ROOMS = RoomSettings(

@@ -13,9 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.index import Split
-from datamodules.core.panoramas import resize_nearest
-from datamodules.core.split_module import SplitDataModule
+from datamodules.core.data_module import DataModule
+from datamodules.core.splits import Split
+from tangent_train.rendering.resampling import resize
 
 GPANO_TAGS = {
     "ProjectionType": "equirectangular",
@@ -44,7 +44,7 @@ def read_png(path: Path) -> NDArray[Any]:
 
 def nearest_valid(depth: NDArray[np.uint16], shape: tuple[int, int]) -> NDArray[np.uint16]:
     """Reduce depth slowly: look at every source pixel of every footprint."""
-    out = resize_nearest(depth, shape).copy()
+    out = resize(depth, shape, "nearest").copy()
     (H, W), (h, w) = depth.shape, shape
     for i, j in np.ndindex(h, w):
         top, bottom, left, right = i * H / h, (i + 1) * H / h, j * W / w, (j + 1) * W / w
@@ -167,9 +167,9 @@ def contents(root: Path) -> dict[str, bytes]:
     return {path.relative_to(root).as_posix(): path.read_bytes() for path in files}
 
 
-def names_of(module: SplitDataModule[Any], split: Split) -> list[str]:
+def names_of(module: DataModule, split: Split) -> list[str]:
     """Names of the samples of a split."""
-    source: Any = module.source(split)
+    source: Any = module.dataset(split)
     return [source.name(index) for index in range(len(source))]
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from datamodules import SynthRooms, SynthShapes
+from datamodules.synthrooms.datamodule import SynthRooms
 from datamodules.synthrooms.generate import generate_rooms
-from datamodules.synthshapes.generate import generate_shapes
+from datamodules.synthshapes import SynthShapes, generate_shapes
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES

@@ -11,9 +11,9 @@ import pytest
 import torch
 from torch import nn
 
-from datamodules import FolderPanoramas
 from datamodules.core.class_weights import class_weights
 from datamodules.core.samples import valid_mask
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry.coverage import is_valid
 from tangent_train.geometry.equirect import area_mask
@@ -137,9 +137,9 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     of = "tangent" if kind == "context" else kind
     task = _task(of, network)
     data = _data(write_both(tmp_path)[1], task, fill="reflect")
-    panorama = data.source("test").read(0)
+    panorama = data.dataset("test").read(0)
     zenith = None if up is None else np.array(up) / np.linalg.norm(up)
-    data.source("test")._kept = [panorama._replace(up=zenith)] * 2
+    data.dataset("test")._kept = [panorama._replace(up=zenith)] * 2
     batch: Any = data.on_after_batch_transfer(next(iter(data.test_dataloader())), 0)
     expected = predict_labels(
         task,
@@ -168,7 +168,7 @@ def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -
         task = _task("tangent")
         task.representation = small
         data = _data(root, task)
-        image = data.source("test").read(0)
+        image = data.dataset("test").read(0)
         (views,) = image.sampler(small).view_sets(image.valid)
         rendered.append(
             [views.render(image.rgb, "bilinear"), views.render(image.labels, "nearest")]
@@ -208,7 +208,7 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
         "a quarter of the area is unknown, two thirds of the sphere"
     )
     assert losses[0] == pytest.approx(losses[1], rel=0.02)
-    stored = [np.bincount(np.asarray(data.source("train").labels(k)).ravel()) for k in range(2)]
+    stored = [np.bincount(np.asarray(data.dataset("train").labels(k)).ravel()) for k in range(2)]
     assert torch.equal(weights, class_weights(np.sum(stored, axis=0)[1:], "log"))
 
 

@@ -16,20 +16,20 @@ from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
 import datamodules
-from datamodules.cityscapes.classes import CLASSES as CITYSCAPES
-from datamodules.cityscapes.classes import THIRTEEN
-from datamodules.core.labels import ClassSet
-from datamodules.matterport360.panoramas import CLASSES as MATTERPORT
+from datamodules.cityscapes import CLASSES as CITYSCAPES
+from datamodules.cityscapes import THIRTEEN
+from datamodules.core.label_map import LabelMap
+from datamodules.matterport360 import CLASSES as MATTERPORT
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.stanford2d3ds.files import EIGHT
-from datamodules.structured3d.classes import CLASSES as STRUCTURED3D
-from datamodules.synpass.panoramas import CLASSES as SYNPASS
+from datamodules.structured3d import CLASSES as STRUCTURED3D
+from datamodules.synpass import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.scores import Groups
 from tangent_train.errors import DataError, SettingError
-from tangent_train.inference.label_maps import LabelMap, Unmapped, load_label_map, map_classes
+from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
 from tests.inference.trained import TANGENT, trained_network
 
 # ADE20K: objectInfo150.txt of the MIT Scene Parsing Benchmark; COCO-Stuff: labels.txt.
@@ -85,23 +85,24 @@ def test_a_map_names_published_classes(name: str) -> None:
 @pytest.mark.parametrize(
     ("name", "labels"),
     [
-        ("cityscapes_to_densepass13", datamodules.Cityscapes.class_sets["13"]),
-        ("synpass_to_densepass13", datamodules.SynPASS.class_sets["13"]),
-        ("stanford2d3ds_to_span8", datamodules.Stanford2D3DS.class_sets["8"]),
-        ("structured3d_to_span8", datamodules.Structured3D.class_sets["8"]),
+        ("cityscapes_to_densepass13", datamodules.cityscapes.Cityscapes.label_maps),
+        ("synpass_to_densepass13", datamodules.synpass.SynPASS.label_maps),
+        ("structured3d_to_span8", datamodules.structured3d.Structured3D.label_maps),
     ],
 )
-def test_a_map_maps_a_network_as_a_set_of_classes_the_labels(name: str, labels: ClassSet) -> None:
-    mapped = map_classes(_trained(labels.of), load_label_map(name))
-    key = labels.key[1 : 1 + len(labels.of)].tolist()
-    order = (*range(1, 1 + len(labels.names)), 0)
+def test_a_map_maps_a_network_as_label_maps_the_files(name: str, labels: Any) -> None:
+    of_all, *_ = every = list(labels.values())
+    mapped = map_classes(_trained(of_all.names), load_label_map(name))
+    values = {label: value for value, label in of_all.labels.items()}
+    key = [every[1].labels[values[label]] for label in range(1, 1 + len(of_all.names))]
+    order = (*range(1, 1 + len(every[1].names)), 0)
     groups = [[k for k, to in enumerate(key) if to == label] for label in order]
     assert [list(group) for group in mapped.loaded.groups] == groups
 
 
 def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:
     names = ["Swivel_Chair", "WINDOWPANE, window ", "floor-wood", "floor"]
-    given = LabelMap("m", None, {"seat": ["swivel chair"], "hole": ["window", "windowpane"],
+    given = LabelMap.of({"seat": ["swivel chair"], "hole": ["window", "windowpane"],
                                  "ground": ["floor wood"]})  # fmt: skip
     mapped = map_classes(_trained(names), given)
     assert mapped.classes == {"seat": names[:1], "hole": names[1:2], "ground": names[2:3]}
@@ -115,7 +116,7 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
     """Labels and probabilities agree with NumPy."""
     names = ["bed", "wall", "painting", "floor", "sky", "tree"]
     groups = None if nothing is None else [*([k] for k in range(6)), nothing]
-    given = LabelMap("m", None, {"wall": ["painting", "wall"], "beam": ["rafter"],
+    given = LabelMap.of({"wall": ["painting", "wall"], "beam": ["rafter"],
                                  "floor": ["floor", "rug"], "rest": ["bed"]})  # fmt: skip
     trained = map_classes(_trained(names, groups), given, unmapped).loaded
     assert trained.class_names == ("unknown", "wall", "beam", "floor", "rest")
@@ -138,7 +139,7 @@ def test_probabilities_of_a_class_add_up(unmapped: Unmapped, nothing: list[int] 
 def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
     """Scores of pixels and images are averaged with weights that may be 0."""
     trained = map_classes(
-        _trained(["a", "b"]), LabelMap("m", None, {"none": [], "b": ["b"]}), "never"
+        _trained(["a", "b"]), LabelMap.of({"none": [], "b": ["b"]}), "never"
     ).loaded
     found = trained.network(1e4 * torch.randn(64, 2, 1, 1))[..., 0, 0]
     weights = torch.rand(256, 64) * (torch.rand(256, 64) < 0.5)
@@ -147,7 +148,7 @@ def test_a_class_without_scores_wins_in_no_mean_of_pixels() -> None:
 
 
 def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
-    given = LabelMap("m", None, {"floor": ["floor"], "wall": ["wall"]})
+    given = LabelMap.of({"floor": ["floor"], "wall": ["wall"]})
     trained = map_classes(_trained(["wall", "floor"]), given, targets=("wall", "sofa", "floor"))
     assert trained.loaded.class_names == ("unknown", "wall", "sofa", "floor")
     assert [list(group) for group in trained.loaded.groups] == [[0], [], [1]]
@@ -157,12 +158,12 @@ def test_the_order_and_the_number_of_classes_can_be_those_of_data() -> None:
 
 def test_a_map_can_follow_a_map() -> None:
     """Scores of the innermost network, with its image size."""
-    first = LabelMap("m", None, {"indoor": ["bed", "wall"], "outdoor": ["sky"]})
+    first = LabelMap.of({"indoor": ["bed", "wall"], "outdoor": ["sky"]})
     names = ["bed", "wall", "sky", "tree"]
     trained = replace(_trained(names, [[3], [2], [1], [0]]), fixed_size=(8, 8))
     once = map_classes(trained, first).loaded
     assert [list(group) for group in once.groups] == [[3, 2], [1], [0]]
-    twice = map_classes(once, LabelMap("n", None, {"all": ["outdoor"]})).loaded
+    twice = map_classes(once, LabelMap.of({"all": ["outdoor"]})).loaded
     assert [list(group) for group in twice.groups] == [[1], [0, 3, 2]]
     assert twice.network(torch.randn(1, 4, 12, 20)).shape == (1, 2, 12, 20)
 

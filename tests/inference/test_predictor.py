@@ -15,10 +15,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules import Stanford2D3DS
+from datamodules.core.images import distance_from_z_depth
 from datamodules.core.inputs import normalize
-from datamodules.core.panoramas import distance_from_z_depth
 from datamodules.core.samples import render_inputs
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from models import make_distortion_aware
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
@@ -136,7 +136,7 @@ def test_labels_are_those_of_an_evaluation(
     batch = data.on_after_batch_transfer(batch, 0)
     shape, rotation = tuple(batch.target[0].shape), batch.rotation[0].numpy()
     expected = predict_labels(task, batch.images[0], shape, rotation).numpy()
-    read = data.source("test").read(int(batch.index[0]))
+    read = data.dataset("test").read(int(batch.index[0]))
     assert (read.up is None) == (upright is None)
     labels = _labels(trained, InputImage(read.rgb, read.depth, read.up), 7, **settings)
     assert len(np.unique(expected)) > 1

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules import FolderPanoramas
-from datamodules.core.transforms import RotatedPanoramas
+from datamodules.core.panorama_module import draw_rotation
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.gpano import PanoramaArea, area_of_angles, whole_area
@@ -137,11 +137,11 @@ def test_labels_are_unknown_there_and_pixels_stay(
     for split in ("train", "val", "test"):
         for index, name in enumerate(names_of(masked, split)):
             expected = stored_labels(root, name)
-            read, before = masked.source(split).read(index), plain.source(split).read(index)
+            read, before = masked.dataset(split).read(index), plain.dataset(split).read(index)
             np.testing.assert_array_equal(before.labels, expected)
             expected[BELOW] = 0
             np.testing.assert_array_equal(read.labels, expected)
-            np.testing.assert_array_equal(masked.source(split).labels(index), expected)
+            np.testing.assert_array_equal(masked.dataset(split).labels(index), expected)
             np.testing.assert_array_equal(read.rgb, before.rgb)
 
 
@@ -154,8 +154,8 @@ def test_the_mask_rotates_with_the_panorama(root: Path, tmp_path: Path) -> None:
     masked = FolderPanoramas(root, ERP, mask=tmp_path / "mask.png", **settings)
     for index, name in enumerate(names_of(masked, "test")):
         labels = np.where(patches[1::2, 1::2], stored_labels(root, name), 0).astype(np.uint8)
-        expected = rotate_equirect(labels, RotatedPanoramas("so3", 3).rotation(index), "nearest")
-        np.testing.assert_array_equal(masked.source("test").read(index).labels, expected)
+        expected = rotate_equirect(labels, draw_rotation("so3", 3, index), "nearest")
+        np.testing.assert_array_equal(masked.dataset("test").read(index).labels, expected)
 
 
 def test_missing_masks_are_listed_before_training(root: Path, tmp_path: Path) -> None:

@@ -118,7 +118,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     path = write_linear(tmp_path / "net.onnx", *arrays, *[SOFTMAX] * softmax)
     loaded = _imported(path, list(map(str, range(60))))
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
-    merged = LabelMap("pairs", None, {f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
+    merged = LabelMap.of({f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network in (loaded, map_classes(loaded, merged).loaded):
         predictor = Predictor(network, PanoramaViews(network), min_confidence=0.5)
         mosaic = predictor.predict(InputImage(rgb))

@@ -21,7 +21,7 @@ SETTINGS = {
     "seed": 0,
     "level": 7,
     "data": {
-        "_target_": "datamodules.Stanford2D3DS",
+        "_target_": "datamodules.stanford2d3ds.panoramas.Stanford2D3DS",
         "fold": 1,
         "inputs": ["rgb", "depth"],
         "test_rotation": None,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.core.panoramas import Panorama
+from datamodules.core.images import Image
 from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads.pictures import (
     colorize,
@@ -60,7 +60,7 @@ def test_the_panel_shows_input_truth_prediction_and_error(rows: int, scale: int)
 def test_a_partial_panorama_is_shown_cut_or_black_around() -> None:
     valid = area_mask((90, -90, -45, 22.5), (32, 64))
     rng = np.random.default_rng(0)
-    image = Panorama(
+    image = Image(
         rng.integers(1, 256, (32, 64, 3), np.uint8), None, np.ones((32, 64), np.uint8), valid=valid
     )
     labels = torch.ones(32, 64, dtype=torch.uint8)

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.folder.classes import read_classes
-from datamodules.folder.reader import class_masks
+from datamodules.core.label_map import read_label_map
+from datamodules.folder.labeled import class_masks
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads import ClassesHead, PredictedImage
 from tangent_train.inference.images import InputImage
@@ -50,7 +50,7 @@ def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
     PredictionFolder(tmp_path, ClassesHead(names), ["labels"]).write_summary({}, [])
     labels = np.array([list(range(8))] * 4, np.uint8)
     write_pixels(tmp_path / "labels" / "a.png", labels)
-    classes = read_classes(tmp_path / "classes.json")
+    classes = read_label_map(tmp_path / "classes.json")
     assert classes.names == ("door", "wall", "ü", "Wall")
     assert classes.decode(labels)[0].tolist() == [0, 1, 2, 1, 3, 0, 4, 3]
     area = whole_area(Path("a"), (4, 8))

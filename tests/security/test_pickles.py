@@ -14,7 +14,6 @@ import torch
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from datamodules.core.store import Store
 from models.pretrained import read_tensors
 from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.loaded import load_network
@@ -68,12 +67,6 @@ def created(tmp_path: Path) -> Path:
     return tmp_path / "created"
 
 
-def _read_store(path: Path) -> None:
-    copy = path.with_name("copy.npy")
-    copy.write_bytes(path.read_bytes())
-    Store(path.parent, {}).read("copy", {})
-
-
 @pytest.mark.parametrize("make", CREATORS)
 def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
     readers: tuple[Any, ...] = (
@@ -81,7 +74,6 @@ def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
         read_checkpoint,
         read_tensors,
         read_array,
-        _read_store,
     )
     for name in NAMES:
         path = tmp_path / name

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from datamodules.modelnet40.shape_samples import ShapeSample
+from datamodules.modelnet40.shapes import ShapeSample
 from tangent_train.heads import ImageClassHead
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import ShapeTask

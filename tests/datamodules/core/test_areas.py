@@ -8,9 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import FolderPanoramas
-from datamodules.core.panoramas import ImageFiles, Panorama
-from datamodules.core.transforms import EstimatedUp, RotatedPanoramas, placed
+from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError, SettingError
 from tangent_train.io.gpano import Fill, PanoramaArea
 from tangent_train.rendering import EquirectRepresentation
@@ -26,7 +24,7 @@ def test_native_pixels_are_placed_unchanged(tmp_path: Path, level: int) -> None:
     root = write_strips(tmp_path, (100, 512), depth=True)
     erp = EquirectRepresentation(level)
     data = FolderPanoramas(root, erp, inputs=["rgb", "depth"], area=AREA, fill="edge")
-    source = data.source("test")
+    source = data.dataset("test")
     panorama, name = source.read(0), source.name(0)
     rows = 2 ** (level + 1)
     top, height = round(78 * rows / 256), 100 * rows // 256
@@ -46,7 +44,9 @@ def test_native_pixels_are_placed_unchanged(tmp_path: Path, level: int) -> None:
         assert panorama.depth is not None
         assert not panorama.depth[outside].any()
         assert panorama.rgb[outside].any()
-    labels = FolderPanoramas(root, erp, labels="distance", inputs=["rgb"], area=AREA).source("test")
+    labels = FolderPanoramas(root, erp, labels="distance", inputs=["rgb"], area=AREA).dataset(
+        "test"
+    )
     np.testing.assert_array_equal(labels.read(0).labels, panorama.depth)
 
 
@@ -93,29 +93,30 @@ def test_the_area_rotates_with_the_panorama(
         save(path, np.ones(size, np.uint8))
     erp = EquirectRepresentation(5)
     data = FolderPanoramas(root, erp, area=angles, test_rotation="so3", seed=seed)
-    panorama = data.source("test").read(0)
+    panorama = data.dataset("test").read(0)
     np.testing.assert_array_equal(panorama.valid, panorama.labels > 0)
 
 
-def test_a_store_holds_the_pixels_of_the_area_and_memory_the_same_panoramas(tmp_path: Path) -> None:
+def test_a_cache_holds_the_pixels_of_the_area_and_memory_the_same_panoramas(
+    tmp_path: Path,
+) -> None:
     root = write_strips(tmp_path / "data", (100, 512))
     settings: Any = {"area": AREA, "fill": "reflect", "test_rotation": 20}
     erp = EquirectRepresentation(7)
-    plain, stored, kept = (
+    plain, cached, kept = (
         FolderPanoramas(root, erp, **settings, **how)
-        for how in ({}, {"store": tmp_path / "store"}, {"in_memory": True})
+        for how in ({}, {"cache": tmp_path / "cache"}, {"in_memory": True})
     )
-    stored.prepare_data()
-    file = next((tmp_path / "store").rglob("*.npy"))
+    cached.prepare_data()
+    file = next((tmp_path / "cache").rglob("*.npy"))
     assert np.load(file)["rgb"].shape == (100, 512, 3)
     assert file.stat().st_size < 1.05 * 100 * 512 * 4
     for split in ("train", "test"):
-        expected = plain.source(split).read(0)
-        for data in (stored, kept):
-            found = data.source(split).read(0)
-            np.testing.assert_array_equal(found.rgb, expected.rgb)
-            np.testing.assert_array_equal(found.labels, expected.labels)
-            np.testing.assert_array_equal(found.valid, expected.valid)
+        expected = plain.dataset(split).read(0)
+        for data in (cached, kept):
+            found = data.dataset(split).read(0)
+            for name in ("rgb", "labels", "valid"):
+                np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 @pytest.mark.parametrize("size", [(50, 256), (100, 512), (128, 256)])
@@ -130,44 +131,36 @@ def test_a_mask_is_of_the_part_or_of_the_whole_sphere(
     plain, masked = (
         FolderPanoramas(root, erp, area=AREA, mask=m) for m in (None, tmp_path / "mask.png")
     )
-    before, after = (data.source("train").read(0).labels for data in (plain, masked))
+    before, after = (data.dataset("train").read(0).labels for data in (plain, masked))
     counts = mask[:: size[1] // 256, :: size[1] // 256]
     if size[0] == 128:
         counts = counts[39:89]
     np.testing.assert_array_equal(after[39:89], before[39:89] * counts)
 
 
-@pytest.mark.parametrize("rows", [1024, 128])
+@pytest.mark.parametrize("rotation", [None, "so3"])
 def test_the_estimate_of_up_does_not_see_the_fill(
-    rows: int, monkeypatch: pytest.MonkeyPatch
+    rotation: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither at the size that is read nor from the file, whatever the rotation."""
+    """The file is read again, because the panorama is small."""
     seen: list[Any] = []
     monkeypatch.setattr(
-        "datamodules.core.transforms.estimate_up", lambda *given: seen.append(given)
+        "datamodules.core.panorama_module.estimate_up", lambda *given: seen.append(given)
     )
-    area = (-180, 180, -45, 30)
-    canvas = PanoramaArea.on_canvas(area, rows)
-    image = np.full((*canvas.image_shape, 3), 200, np.uint8)
-    files = ImageFiles("a", Path("a"), Path("a"))
-    labels = np.ones(canvas.image_shape, np.uint8)
-    rotated = RotatedPanoramas("so3", 0)
-    panorama = placed(canvas, "reflect", Panorama(image, None, labels), 0, files)
-    panorama = rotated(panorama, 0)
-    assert panorama.rgb.min() == 200
+    root = write_strips(tmp_path, (100, 512))
+    settings: Any = {"area": AREA, "fill": "reflect", "upright": "auto", "test_rotation": rotation}
+    data = FolderPanoramas(root, EquirectRepresentation(5), **settings)
     judged: list[Any] = []
-    native = np.full((427, 2048, 3), 200, np.uint8)
-    judge: Any = lambda of, _: judged.append(of)  # noqa: E731
-    upright = EstimatedUp(60, lambda _: native, rotated, judge, area)(panorama, 0, files)
-    assert upright.rgb.min() == 200
+    data.estimate_up(lambda of, _: judged.append(of))  # type: ignore[arg-type, return-value]
+    panorama = data.dataset("test").read(0)
+    assert panorama.rgb.any(axis=-1).all()
     ((rgb, _, judge),) = seen
     judge(None)
-    assert len(rgb) == max(512, rows)
+    assert len(rgb) == 256
+    assert panorama.valid is not None
     for colors in (rgb, judged[0].rgb):
-        inside = (colors == 200).all(axis=-1)
-        assert (colors[~inside] == 0).mean() > 0.98
-        assert panorama.valid is not None
-        assert abs(inside.mean() - panorama.valid.mean()) < 0.02
+        share = colors.any(axis=-1).mean()
+        assert share == pytest.approx(panorama.valid.mean(), abs=0.02)
 
 
 @pytest.mark.parametrize(
@@ -186,4 +179,4 @@ def test_files_and_settings_that_do_not_fit_are_refused(
     root = write_strips(tmp_path, (50, 256))
     erp = EquirectRepresentation(settings.pop("level", 6))
     with pytest.raises(error, match=message):
-        FolderPanoramas(root, erp, **settings).source("train")
+        FolderPanoramas(root, erp, **settings).dataset("train")

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules import Stanford2D3DS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tests.conftest import fabricate
 
 

@@ -9,14 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules import (
-    Cityscapes,
-    DensePASS,
-    Stanford2D3DS,
-    Stanford2D3DSPerspective,
-    SynPASS,
-)
+from datamodules.cityscapes import Cityscapes
 from datamodules.core.image_module import ImageDataModule
+from datamodules.densepass import DensePASS
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.synpass import SynPASS
 from tangent_train.errors import SettingError
 from tests.conftest import fabricate
 
@@ -50,7 +47,7 @@ def test_panoramas_and_photos_are_read_in_a_set(tmp_path: Path, erp: Any) -> Non
         for data in (every, eight):
             data.prepare_data()
         assert (every.num_classes, eight.num_classes) == (13, 8)
-        before, after = (data.source("test").read(1).labels for data in (every, eight))
+        before, after = (data.dataset("test").read(1).labels for data in (every, eight))
         for label, class_name in enumerate(every.class_names):
             known = class_name in eight.class_names
             expected = eight.class_names.index(class_name) if known else 0

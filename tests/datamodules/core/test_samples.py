@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import colorsys
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -8,9 +9,10 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
+from datamodules.core.dataset import ImageDataset
+from datamodules.core.images import Image
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
-from datamodules.core.panoramas import Panorama
-from datamodules.core.samples import TrainingImages, jitter_colors, render_inputs, world_rays
+from datamodules.core.samples import jitter_colors, render_inputs, world_rays
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tangent_train.rendering.representations.views import Representation
@@ -18,22 +20,18 @@ from tangent_train.rendering.representations.views import Representation
 DEPTH: tuple[Input, ...] = ("rgb", "depth")
 
 
-def _positions(index: int) -> Panorama:
+def _positions(index: int) -> Image:
     """A panorama whose every pixel has its own red, depth and label."""
     place = np.arange(16 * 32).reshape(16, 32) % 251
     labels = (place + index).astype(np.uint8)
-    return Panorama(np.stack([labels] * 3, axis=-1), labels.astype(np.uint16) * 4, labels)
+    return Image(np.stack([labels] * 3, axis=-1), labels.astype(np.uint16) * 4, labels)
 
 
-class _Positions:
-    def __len__(self) -> int:
-        return 3
+class _Positions(ImageDataset):
+    """Three panoramas in memory."""
 
-    def read(self, index: int) -> Panorama:
+    def read(self, index: int) -> Image:
         return _positions(index)
-
-
-POSITIONS: Any = _Positions()
 
 
 # --- normalization -----------------------------------------------------------------------------
@@ -72,7 +70,7 @@ def test_elevation_is_how_far_a_pixel_looks_up(
     """Against directions rendered as three pictures: the same pixels, another way to the angle."""
     shape = (64, 128)
     zenith = None if up is None else np.array(up)
-    image = Panorama(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8), zenith)
+    image = Image(np.zeros((*shape, 3), np.uint8), None, np.zeros(shape, np.uint8), zenith)
     for seed in range(4):
         views = representation.sample(np.random.default_rng(seed))
         elevation = render_inputs(image, views, ("rgb", "elevation"))[1].numpy()
@@ -102,8 +100,13 @@ def test_rays_of_a_tilted_panorama_point_where_its_pixels_are_in_the_world(tilt_
 # --- samples -----------------------------------------------------------------------------------
 
 
-def _training(erp: Representation, seed: int = 0) -> TrainingImages:
-    return TrainingImages(POSITIONS, erp, seed, DEPTH)
+def _training(erp: Representation, seed: int = 0, color_jitter: float = 0) -> ImageDataset:
+    settings = {"seed": seed, "sampling_seed": 0, "color_jitter": color_jitter, "inputs": DEPTH}
+    files: Any = {"train": [None] * 3}
+    data = SimpleNamespace(
+        **settings, representation=erp, in_memory=False, splits=lambda: files, cache=None
+    )
+    return _Positions(data, "train")
 
 
 def test_a_training_sample_holds_the_rendered_views(erp: Representation) -> None:
@@ -133,7 +136,7 @@ def test_views_are_those_of_seed_epoch_and_index(erp: Representation) -> None:
 
 def test_jitter_changes_the_colors_and_nothing_else(erp: Representation) -> None:
     before = _training(erp)[2, 1]
-    after, again = (TrainingImages(POSITIONS, erp, 0, DEPTH, 0.5)[2, 1] for _ in range(2))
+    after, again = (_training(erp, color_jitter=0.5)[2, 1] for _ in range(2))
     assert not torch.equal(before.images[0], after.images[0])
     assert torch.equal(before.images[1], after.images[1])
     assert torch.equal(before.labels, after.labels)

@@ -7,22 +7,18 @@ from typing import Any
 
 import pytest
 
-from datamodules import (
-    Cityscapes,
-    DensePASS,
-    FolderPanoramas,
-    Matterport360,
-    ModelNet40,
-    OmniSynthia,
-    Stanford2D3DS,
-    Stanford2D3DSPerspective,
-    Structured3DPerspective,
-    SynPASS,
-    SynthRooms,
-    SynthRoomsPerspective,
-    Zind,
-)
+from datamodules.cityscapes import Cityscapes
 from datamodules.core.inputs import RGB_NORMALIZATION
+from datamodules.densepass import DensePASS
+from datamodules.folder.labeled import FolderPanoramas
+from datamodules.matterport360 import Matterport360
+from datamodules.modelnet40.shapes import ModelNet40
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
+from datamodules.structured3d import Structured3DPerspective
+from datamodules.synpass import SynPASS
+from datamodules.synthia.omnisynthia import OmniSynthia
+from datamodules.synthrooms.datamodule import SynthRooms, SynthRoomsPerspective
+from datamodules.zind.panoramas import Zind
 from tangent_train.errors import SettingError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.datamodules.folder.folder_format import write_classes

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.folder.classes import read_classes
+from datamodules.core.label_map import read_label_map
 from tangent_train.errors import DataError
 
 
@@ -16,7 +16,7 @@ def _write_json(path: Path, text: str) -> Path:
 
 
 def test_a_list_of_classes_and_values_without_one(tmp_path: Path) -> None:
-    listed = read_classes(_write_json(tmp_path, '["wall", null, "floor"]'))
+    listed = read_label_map(_write_json(tmp_path, '["wall", null, "floor"]'))
     assert listed.names == ("wall", "floor")
     assert listed.decode(np.array([0, 1, 2, 255])).tolist() == [1, 0, 2, 0]
     with pytest.raises(DataError, match="found value 3 in 1 pixel; expected 0 to 2, the places"):
@@ -48,6 +48,6 @@ def test_a_list_of_classes_and_values_without_one(tmp_path: Path) -> None:
 def test_class_lists_that_cannot_be_used(tmp_path: Path, text: str, message: str) -> None:
     path = _write_json(tmp_path, text)
     with pytest.raises(DataError, match=r"classes\.json: found") as info:
-        read_classes(path)
+        read_label_map(path)
     assert message in str(info.value)
     assert len(str(info.value)) < 600

@@ -28,7 +28,7 @@ from tests.datamodules.folder.folder_format import (
 
 def test_pixels_are_those_of_the_files(root: Path, erp: Any) -> None:
     module = FolderPanoramas(root, erp, inputs=["rgb", "depth"], depth_units_per_m=2000)
-    source = module.source("train")
+    source = module.dataset("train")
     classes = np.zeros(256, np.uint8)
     classes[list(CLASS_OF_STORED)] = list(CLASS_OF_STORED.values())
     assert module.class_names == ("unknown", *NAMES)
@@ -60,7 +60,7 @@ def _one_panorama(root: Path, stored: Image.Image, classes: Any, **settings: Any
 
 
 def _test_labels(root: Path, erp: Any) -> NDArray[np.uint8]:
-    return FolderPanoramas(root, erp).source("test").read(0).labels
+    return FolderPanoramas(root, erp).dataset("test").read(0).labels
 
 
 @pytest.mark.parametrize(("colors", "transparent"), [(4, False), (16, True), (256, True)])
@@ -168,8 +168,8 @@ def test_names_that_look_the_same_are_the_same(
     (tmp_path / "test.txt").write_text(f"{forms[-1]}\n", "utf-8")
     module = FolderPanoramas(tmp_path, erp, inputs=["rgb", "depth"], mask=tmp_path / "masks")
     assert module.check()[0].listed() == []
-    assert module.source("test").name(0) == NFC
-    assert module.source("test").read(0).labels.any()
+    assert module.dataset("test").name(0) == NFC
+    assert module.dataset("test").read(0).labels.any()
 
 
 @pytest.mark.parametrize("folder", FOLDERS)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.panoramas import Photo
+from datamodules.core.images import Image
 from datamodules.folder.labeled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
@@ -22,10 +22,10 @@ def _photos(root: Path, **settings: Any) -> FolderPhotos:
     return FolderPhotos(root, CROPS, val_fraction=0, **settings)
 
 
-def _only(root: Path, name: str, **settings: Any) -> Photo:
+def _only(root: Path, name: str, **settings: Any) -> Image:
     """A photo, of a data set with another one for training."""
     (root / "test.txt").write_text(name)
-    return _photos(root, **settings).source("test").read(0)
+    return _photos(root, **settings).dataset("test").read(0)
 
 
 def _found(root: Path, **settings: Any) -> list[tuple[str, str, str]]:
@@ -75,7 +75,7 @@ def test_the_nearest_camera_counts(tmp_path: Path) -> None:
     (tmp_path / "train.txt").write_text("five")
 
     def focal_lengths(**settings: Any) -> list[float]:
-        source = _photos(tmp_path, **settings).source("test")
+        source = _photos(tmp_path, **settings).dataset("test")
         by_name = {source.name(i): source.read(i).camera_matrix for i in range(len(source))}
         for name in ("a/b/one", "a/b/two", "a/three"):
             assert by_name[name][:2, 2].tolist() == [9, 8]

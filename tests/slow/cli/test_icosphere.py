@@ -27,7 +27,7 @@ def test_a_run_from_the_store_labels_panoramas_of_any_size(
     (tmp_path / "own/network").mkdir(parents=True)
     (tmp_path / "own/network/pointwise.yaml").write_text(POINTWISE)
     of_data = [text for text in SMALL_ROOMS if not text.startswith("trainer.")]
-    data = ["data=synthrooms", rooms, *of_data, "data.store=store", "data.inputs=[rgb]"]
+    data = ["data=synthrooms", rooms, *of_data, "data.cache=store", "data.inputs=[rgb]"]
     signals = ["representation=icosphere", f"representation.elements={elements}"]
     run("prepare", *data, *signals)
     augmented = ["representation.random_rotation=so3", "representation.mirror=true"]

@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.core.problems import Problems
-from datamodules.folder.classes import read_classes
-from datamodules.folder.reader import FolderReader, list_images
+from datamodules.core.splits import SPLITS
+from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Run, predicted, results, run_command
 from tests.datamodules.data_files import read_png
-from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_panorama
+from tests.datamodules.stanford_pairs_format import write_panorama
 from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 
 ROWS = 64
@@ -42,12 +41,12 @@ def test_folders_of_images_with_depth(run: Run, tmp_path: Path, kind: str) -> No
     shutil.copytree("in", root / "images")
     shutil.copytree("out/depth", root / "depth")
     (root / "classes.json").write_text('["wall"]')
-    reader = FolderReader(read_classes(root / "classes.json"), 1000)
-    files = list_images(root, Problems(), with_labels=False, with_depth=True)
-    assert [one.name for one in files] == ["flat/kitchen", "hall"]
+    data = FolderPanoramas(root, labels="distance", level=2)
+    files = [one for split in SPLITS for one in data.files(split)]
+    assert sorted(one.name for one in files) == ["flat/kitchen", "hall"]
     for one in files:
         expected = read_depth_m(tmp_path / "out" / "depth" / f"{one.name}.{kind}", 1000)
-        np.testing.assert_allclose(reader.depth(one) / 512, expected, atol=1 / 1024 + 1e-6)
+        np.testing.assert_allclose(data.decode_depth(one) / 512, expected, atol=1 / 1024 + 1e-6)
     write_checkpoint(tmp_path / "rgbd.ckpt", channels=4)
     run("predict", "checkpoint=rgbd.ckpt", "input=in", "output=labels", "depth=out/depth")
     assert predicted(Path("labels")).keys() == {"hall", "flat/kitchen"}
@@ -82,7 +81,7 @@ def test_keypoints_are_compared_with_predicted_depth(run: Run, tmp_path: Path) -
     for path in (tmp_path / "out" / "depth").iterdir():
         shutil.copy(path, pano / "depth" / path.name.replace("_rgb", "_depth"))
     assert (read_png(next((pano / "depth").iterdir())) != true).any()
-    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.pairs=rooms")
+    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.selection=rooms")
     run("keypoints", *data, "base_level=0", "controls=false", "pictures=0", "output=keypoints")
     assert {row["visible_by"] for row in results(tmp_path / "keypoints")["rows"]} == {"depth"}
     pair = StanfordPairs(root, pairs="rooms").read(0)

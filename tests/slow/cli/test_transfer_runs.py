@@ -10,13 +10,13 @@ from pathlib import Path
 import pytest
 import torch
 
-from datamodules.cityscapes.classes import CLASSES
+from datamodules.cityscapes import CLASSES
 from tangent_train.results.published import facts
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
 from tests.cli.tiny_runs import Run, results
-from tests.datamodules.cityscapes.street_format import write_cityscapes, write_densepass
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photo, write_photos
+from tests.datamodules.street_format import write_cityscapes, write_densepass
 
 
 def test_real_runs_from_photos_to_panoramas(

@@ -23,22 +23,22 @@ import numpy as np
 import pytest
 from PIL import ExifTags, Image
 
-from datamodules.cityscapes.classes import CLASSES
+from datamodules.cityscapes import CLASSES
 from tangent_train.geometry import TangentGrid
 from tangent_train.io.camera_files import write_rig
 from tests.conftest import fabricate
-from tests.datamodules.cityscapes.street_format import (
+from tests.datamodules.folder.folder_format import write_data_set, write_strips
+from tests.datamodules.folder.photo_format import write_photos
+from tests.datamodules.matterport_format import write_matterport
+from tests.datamodules.stanford_pairs_format import write_paper_pairs
+from tests.datamodules.street_format import (
     write_cityscapes,
     write_densepass,
     write_synpass,
 )
-from tests.datamodules.folder.folder_format import write_data_set, write_strips
-from tests.datamodules.folder.photo_format import write_photos
-from tests.datamodules.matterport360.matterport_format import write_matterport
-from tests.datamodules.stanford2d3ds.stanford_pairs_format import write_paper_pairs
-from tests.datamodules.structured3d.structured3d_format import write_structured3d
-from tests.datamodules.synthia.synthia_format import write_panoramas, write_views
-from tests.datamodules.zind.zind_format import write_homes
+from tests.datamodules.structured3d_format import write_structured3d
+from tests.datamodules.synthia_format import write_panoramas, write_views
+from tests.datamodules.zind_format import write_homes
 from tests.inference.trained import write_depth_checkpoint
 from tests.photo_networks import depth_networks
 from tests.photo_networks import huggingface_networks as networks

@@ -16,17 +16,18 @@ import numpy as np
 import pytest
 from lightning.pytorch.trainer.states import TrainerFn
 
-from datamodules import FolderPanoramas, ModelNet40, Stanford2D3DS
-from datamodules.core import index as index_module
-from datamodules.core.index import SPLITS
-from datamodules.core.split_module import SplitDataModule
+from datamodules.core.data_module import DataModule
+from datamodules.core.splits import SPLITS
+from datamodules.folder.labeled import FolderPanoramas
+from datamodules.modelnet40.shapes import ModelNet40
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation
 from tests.cli.tiny_runs import run_command
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
 from tests.datamodules.folder.folder_format import write_data_set
-from tests.datamodules.modelnet40.shapes_format import write_tree
+from tests.datamodules.shapes_format import write_tree
 
 _ERP = EquirectRepresentation(level=3)
 _BOTH: Any = ("rgb", "depth")
@@ -41,7 +42,7 @@ def _write(kind: str, root: Path) -> Path:
     return write_tree(root) if kind == "shapes" else fabricate(root)
 
 
-def _module(kind: str, root: Path, **settings: Any) -> SplitDataModule[Any]:
+def _module(kind: str, root: Path, **settings: Any) -> DataModule:
     """Its data module, with depth."""
     if kind == "shapes":
         return ModelNet40(root, _ERP, **settings)
@@ -207,7 +208,7 @@ def test_broken_files_are_refused_or_left_out_and_counted(
         left += len(after)
         assert [name for name in before[split] if name in after] == after
         for index in range(len(after)):
-            read = data.source(split).read(index)
+            read = data.dataset(split).read(index)
             assert kind == "shapes" or read.rgb.shape == (16, 32, 3)
     assert left == total - 2
 
@@ -215,29 +216,12 @@ def test_broken_files_are_refused_or_left_out_and_counted(
 # --- as training begins -------------------------------------------------------------------------
 
 
-def _as_in_training(data: SplitDataModule[Any]) -> SplitDataModule[Any]:
+def _as_in_training(data: DataModule) -> DataModule:
     """Return a data module in the state in which `Trainer.fit` prepares its data."""
     trainer: Any = SimpleNamespace(state=SimpleNamespace(fn=TrainerFn.FITTING))
     data.trainer = trainer
     return data
 
-
-@pytest.mark.parametrize("kind", ["stanford"])
-def test_training_begins_with_a_look_at_some_images_of_all_splits(
-    kind: str, root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(index_module, "SAMPLED", 100)
-    _as_in_training(_module(kind, root)).prepare_data()
-    broken = [_partner(kind, path, "labels") for path in _colors(kind, root)[1::3]]
-    for path in broken:
-        _corrupt(path)
-    assert len(broken) > 2
-    with pytest.raises(DataError, match=f"found {len(broken)} problems") as caught:
-        _as_in_training(_module(kind, root)).prepare_data()
-    text = str(caught.value)
-    assert all(str(path) in text for path in broken), "all of these are looked at"
-    assert "tangent-check" in text
-    assert "data.skip_broken=true" in text
 
 
 # --- the command --------------------------------------------------------------------------------

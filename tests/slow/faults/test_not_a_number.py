@@ -47,7 +47,7 @@ def test_a_loss_that_is_not_finite_stops_before_the_step(
             small_task(network, **settings), datamodule=data
         )
     batches = step * trainer.get("accumulate_grad_batches", 1) + (1 if trainer else 0)
-    name = data.source("train").name(int(list(data.train_dataloader())[batches].index))
+    name = data.dataset("train").name(int(list(data.train_dataloader())[batches].index))
     place = f"loss of step {step} (epoch 0, {name})"
     for word in (place, "optimizer.lr", "trainer.gradient_clip_val"):
         assert word in str(caught.value)

@@ -1,1 +1,0 @@
-"""Cityscapes (Cordts et al. 2016)."""

@@ -1,0 +1,85 @@
+"""DensePASS (Ma et al. 2021): 100 labeled and 2,000 unlabeled panoramas of streets, 19 classes.
+
+Features: 400×2048 RGB, all around and about 70° high, with the classes of Cityscapes.
+
+On disk, as released::
+
+    root/
+      leftImg8bit/val/cs/1_.png  or  1.png          8 bit
+      gtFine/val/cs/1_labelTrainIds.png             8 bit, 0 to 18, 255 = unknown
+      leftImg8bit/train/<city>/1.png                unlabeled, for adaptation: not read here
+
+Pixels are square in angle: 400 rows span 400 / 2048 · 360° = 70.3°. The row of the horizon is not
+published. The default is the middle, so that the panoramas reach from -35.15° to 35.15°.
+
+License: not stated by its page, https://github.com/chma1024/DensePASS; ask the authors.
+
+Citation: C. Ma, J. Zhang, K. Yang, A. Roitberg, R. Stiefelhagen: "DensePASS: Dense Panoramic
+Semantic Segmentation via Unsupervised Domain Adaptation with Attention-Augmented Context Exchange",
+ITSC 2021.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated
+
+from pydantic import Field
+
+from datamodules.cityscapes import CLASSES, class_maps
+from datamodules.core.data_module import data_set
+from datamodules.core.images import ImageFiles
+from datamodules.core.inputs import Input
+from datamodules.core.label_map import LabelMap
+from datamodules.core.panorama_module import PanoramaDataModule
+from datamodules.core.splits import Split
+from tangent_train.errors import DataError, SettingError
+
+_GET_IT = (
+    "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
+    "with leftImg8bit and gtFine."
+)
+_HEIGHT, _WIDTH = 400, 2048
+_LABELS = "_labelTrainIds.png"
+
+
+@data_set
+class DensePASS(PanoramaDataModule):
+    """DensePASS, 19 or 13 classes.
+
+    All labeled panoramas are for the test; training and validation are empty.
+
+    Args:
+        horizon_row: Rows above the horizon, which define `area`.
+    """
+
+    label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
+    no_depth = "DensePASS has no depth images"
+
+    inputs: Sequence[Input] = ("rgb",)
+    horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
+
+    def __post_init__(self) -> None:
+        if self.area is not None:
+            expected = "null: horizon_row defines it"
+            raise SettingError("data.area", found=list(self.area), expected=expected)
+        south, north = self.horizon_row - _HEIGHT, self.horizon_row
+        self.area = (-180, 180, south * 360 / _WIDTH, north * 360 / _WIDTH)
+        super().__post_init__()
+
+    def files(self, split: Split) -> list[ImageFiles]:
+        """See `DataModule`."""
+        if split != "test":
+            return []
+        images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
+        # Two spellings are in circulation: 1_.png and 1.png.
+        found = list(images.glob("[!.]*.png"))
+        paths = {path.stem.removesuffix("_"): path for path in found}
+        if not paths or len(paths) < len(found):
+            text = "panoramas in both spellings" if found else "no panoramas"
+            expected = "1_.png or 1.png, and others"
+            raise DataError(images, found=text, expected=expected, remedy=_GET_IT)
+        test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
+        self.problems.compare_counts({"test": test}, {"test": 100})
+        self.problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
+        return test

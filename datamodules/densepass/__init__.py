@@ -1,1 +1,0 @@
-"""DensePASS (Ma et al. 2021)."""

@@ -1,1 +1,0 @@
-"""Panoramas of Matterport3D (Chang et al. 2017)."""

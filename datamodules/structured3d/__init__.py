@@ -1,1 +1,0 @@
-"""Structured3D (Zheng et al. 2020)."""

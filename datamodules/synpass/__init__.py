@@ -1,1 +1,0 @@
-"""SynPASS (Zhang et al. 2022)."""

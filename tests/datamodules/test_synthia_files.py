@@ -1,0 +1,50 @@
+"""Cameras, labels and frames of SYNTHIA."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datamodules.synthia.reader import choose_frames, read_view_camera
+from tangent_train.errors import DataError
+
+
+def _write_camera(folder: Path, text: str) -> Path:
+    path = folder / "CameraParams" / "intrinsics.txt"
+    path.parent.mkdir(exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["532.740352\n640\n380\n0.8\n", "532.740352, 640, 380", None],
+)
+def test_cameras_are_read(tmp_path: Path, text: str | None) -> None:
+    if text is not None:
+        _write_camera(tmp_path, text)
+    camera = read_view_camera(tmp_path, (760, 1280))
+    # Counted from pixel corners the center is the middle of the image; so it is here.
+    expected = [[532.740352, 0, 639.5], [0, 532.740352, 379.5], [0, 0, 1]]
+    np.testing.assert_array_equal(camera, expected)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["focal 532 640 380", "532 640"],
+)
+def test_strange_cameras_are_refused(tmp_path: Path, text: str) -> None:
+    _write_camera(tmp_path, text)
+    with pytest.raises(DataError, match=r"intrinsics\.txt: found .* expected focal"):
+        read_view_camera(tmp_path, (760, 1280))
+
+
+@pytest.mark.parametrize(
+    ("count", "step"),
+    [(1, 1), (749, 1), (750, 2), (1250, 3)],
+)
+def test_every_nth_frame(count: int, step: int) -> None:
+    frames = [f"{i:06d}" for i in range(count)]
+    assert choose_frames(frames) == [f"{i:06d}" for i in range(0, count, step)]

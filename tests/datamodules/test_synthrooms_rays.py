@@ -1,0 +1,124 @@
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from datamodules.synthrooms.camera import (
+    PanoramaRays,
+    PerspectiveRays,
+    Pose,
+    draw_rays,
+    euler_angles,
+    euler_rotation,
+)
+from datamodules.synthrooms.furniture import build_empty_room
+from datamodules.synthrooms.layout import FloorPlan
+from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, RayScene, render_picture
+from datamodules.synthrooms.room import Light, Room
+from tangent_train.geometry import FLIP_Y, equirect_directions, random_rotation, rotation_about
+
+SIZE = np.array([5.0, 4.0, 3.0])
+HERE = np.array([1.5, 2.2, 1.4])
+NO_HOLES = Holes(np.zeros((0, 3)), np.zeros(0))
+
+
+def empty_room() -> Room:
+    """A lamp under the ceiling, which can be seen by its light only."""
+    rng = np.random.default_rng(0)
+    room = build_empty_room(rng, FloorPlan((5.0, 4.0, 3.0)))
+    room.parts[:] = [
+        part for part in room.parts if len(part.triangles) and _is_slab(part.triangles)
+    ]
+    down = np.array([0, 0, -1.0])
+    sides = np.array([[0.2, 0, 0], [0, 0.2, 0]])
+    room.lights.append(Light(np.array([2.5, 2.0, 2.9]), sides, down, 2.0))
+    return room
+
+
+def _is_slab(triangles: NDArray[Any]) -> bool:
+    """Walls, floor and ceiling are 10 cm thick; carpets and skirting are not."""
+    return bool(np.isclose(np.ptp(triangles, axis=(0, 1)).min(), 0.1))
+
+
+def take(
+    view: PanoramaRays, holes: Holes = NO_HOLES, caps: tuple[float, float] = (0.0, 0.0)
+) -> Picture:
+    camera = Camera(HERE, 0.0, caps, np.full(3, 3.0, np.float32), 0.0)
+    return render_picture(RayScene(empty_room()), view, camera, holes, 2, np.random.default_rng(0))
+
+
+def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
+    view = PanoramaRays(Pose.looking(HERE, heading=0.7), 64)
+    rays = view.rays().astype(np.float64)
+    with np.errstate(divide="ignore"):
+        expected = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays).min(axis=-1)
+    depth = take(view).depth_m
+    seen = ~np.isnan(depth)
+    assert seen.mean() > 0.99
+    np.testing.assert_allclose(depth[seen], expected[seen], atol=1e-4)
+
+
+def test_unscanned_surfaces_have_a_color_but_no_label_or_depth() -> None:
+    view = PanoramaRays(Pose.looking(HERE, 0.0), 64)
+    whole = take(view)
+    wall = HERE + np.array([3.5, 0, 0])
+    holed = take(view, Holes(wall[None], np.array([0.5])))
+    # The ball meets the wall in a disc; its ragged radius is between 0.43 and 0.56 m.
+    points = HERE + view.rays() * np.nan_to_num(whole.depth_m)[..., None]
+    away = np.linalg.norm(points - wall, axis=-1)
+    assert np.isnan(holed.depth_m[away < 0.4]).all()
+    assert (holed.items[away < 0.4] == MISSING).all()
+    np.testing.assert_array_equal(holed.items[away > 0.6], whole.items[away > 0.6])
+    np.testing.assert_array_equal(holed.rgb, whole.rgb)
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+PLACE = np.array([1.0, 2.0, 1.5])
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_euler_angles_give_their_rotation_back(seed: int) -> None:
+    rotation = random_rotation(np.random.default_rng(seed))
+    down = euler_rotation(np.array([0.3, math.pi / 2, 0.8]))  # two axes coincide
+    np.testing.assert_allclose(euler_rotation(euler_angles(down)), down, atol=1e-9)
+    np.testing.assert_allclose(euler_rotation(euler_angles(rotation)), rotation, atol=1e-12)
+
+
+def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
+    view = PanoramaRays(Pose.looking(PLACE, heading=0.7), 16)
+    expected = equirect_directions((16, 32)) @ (rotation_about((0, 0, 1), 0.7) @ FLIP_Y).T
+    np.testing.assert_allclose(view.rays(), expected, atol=1e-6)
+
+
+def test_perspective_rays_project_to_their_pixels() -> None:
+    view = PerspectiveRays(Pose.looking(PLACE, 0.4, 0.2, 0.1), 9, math.radians(60))
+    rays = view.rays()
+    projected = rays @ view.pose.world_from_camera @ view.camera_matrix.T
+    pixels = projected[..., :2] / projected[..., 2:]
+    columns, rows = np.meshgrid(np.arange(9), np.arange(9))
+    np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=1e-4)
+    np.testing.assert_allclose(rays[4, 4], view.pose.world_from_camera[:, 2], atol=1e-6)
+    # The edge columns' outer sides span the field of view.
+    edges = [view.rays(dx=dx)[4, j] for dx, j in ((-0.5, 0), (0.5, 8))]
+    assert math.acos(float(edges[0] @ edges[1])) == pytest.approx(math.radians(60), abs=1e-3)
+
+
+def test_views_look_around_as_asked() -> None:
+    rng = np.random.default_rng(0)
+    up = {
+        kind: np.array(
+            [draw_rays(rng, kind, PLACE, 8).pose.world_from_camera[2, 2] for _ in range(2000)]
+        )
+        for kind in ("uniform", "stanford", "wide")
+    }
+    # Archimedes: the height of uniform directions is uniform in [-1, 1], with variance 1/3.
+    assert up["uniform"].var() == pytest.approx(1 / 3, abs=0.02)
+    assert abs(up["uniform"].mean()) < 0.05
+    assert np.degrees(np.arcsin(up["stanford"])).std() == pytest.approx(20, abs=1.5)
+    assert np.degrees(np.arcsin(up["wide"])).std() == pytest.approx(34, abs=2)
