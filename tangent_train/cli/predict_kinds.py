@@ -20,7 +20,13 @@ from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.inference.views import PanoramaViews, PhotoViews
 
-_OF_HEADS = {"min_confidence": 0, "min_share": 0, "align": None, "depth_format": None, "points": None}
+_OF_HEADS = {
+    "min_confidence": 0,
+    "min_share": 0,
+    "align": None,
+    "depth_format": None,
+    "points": None,
+}
 """Settings of single heads, with the value that is not read."""
 
 

@@ -155,7 +155,9 @@ def test_files_get_the_labels_and_scores_of_tangent_predict(
     for given in ("room.png", tmp_path / "room.png"):
         np.testing.assert_array_equal(network.labels(given, **settings), expected)
     without = {name: value for name, value in settings.items() if name != "mask"}
-    np.testing.assert_allclose(network.probabilities("room.png", **without), probabilities, atol=1e-3)
+    np.testing.assert_allclose(
+        network.probabilities("room.png", **without), probabilities, atol=1e-3
+    )
     assert (expected == 0).any() == ("mask" in settings)
     if not tags and not Path(str(settings.get("mask"))).is_dir():
         np.testing.assert_array_equal(network.labels(rgb, **settings), expected)
@@ -173,7 +175,9 @@ def test_the_zenith_of_a_tilted_panorama_matters(
     _write(sphere(50), POSE)
     upright = network.probabilities("room.png", upright="pose")
     np.testing.assert_array_equal(network.probabilities("room.png", upright="auto"), upright)
-    assert np.abs(upright - network.probabilities("room.png")).max() > 0.01, "other images, other scores"
+    assert np.abs(upright - network.probabilities("room.png")).max() > 0.01, (
+        "other images, other scores"
+    )
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "CMYK", "1", "I;16"])
