@@ -50,7 +50,7 @@ class Prediction:
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
-            print_text(f"Label map {label_map.name}: {mapped}.")
+            print_text(f"Label map {settings.label_map}: {mapped}.")
             loaded = mapped.loaded
         has_confidences = loaded.predicts == PIXEL_CLASSES
         if settings.upright == "auto" and not has_confidences:
