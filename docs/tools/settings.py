@@ -9,7 +9,14 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
-from tangent_train.config.help import Setting, bases, description, read_settings
+from tangent_train.config.help import (
+    Setting,
+    bases,
+    command_settings,
+    description,
+    read_settings,
+)
+from tangent_train.config.settings import SETTINGS, RunSettings
 from tangent_train.files import config_folder
 from tangent_train.results.published import facts, protocols, published_lines
 
@@ -21,7 +28,7 @@ GROUPS = ("data", "representation", "network", "task", "optimizer", "scheduler",
           "logger", "callbacks", "recipe", "debug", "sweep", "launcher")  # fmt: skip
 _SETTINGS = """# Settings
 
-Every setting of every command, generated from the config files and their comments.
+Every setting of every command, generated from their declarations and from the config files.
 `<command> --help` prints the same comments.
 
 Settings are given as `name=value`, e.g. `tangent-train level=6 trainer.max_epochs=3`. A *group*
@@ -108,9 +115,12 @@ def _protocol(name: str) -> str:
 
 def _command(name: str) -> str:
     file = CONFIGS / f"{name}.yaml"
-    settings = [s for s in read_settings(file) if not s.name.startswith("hydra")]
-    names = [f"[tangent-{base}](#tangent-{base})" for base in _bases(file)]
-    note = _based_on("It has the settings of", names, settings)
+    settings, note = command_settings(name), ""
+    if name != "train" and issubclass(SETTINGS[name], RunSettings):
+        of_training = command_settings("train")
+        settings = [setting for setting in settings if setting not in of_training]
+        note = "It has the settings of [tangent-train](#tangent-train), except for `init_from` and "
+        note += f"`resume`{', with:' if settings else '.'}\n\n"
     return f"### tangent-{name}\n\n{_text(description(file)[0])}\n\n{note}{_table(settings)}"
 
 

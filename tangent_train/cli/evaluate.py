@@ -20,6 +20,7 @@ from tangent_train.cli.run import (
     write_settings,
 )
 from tangent_train.config.settings import EvaluateSettings
+from tangent_train.errors import SettingError
 from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
 
@@ -30,7 +31,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     Raises:
         SettingError: The network does not fit the data.
     """
-    folder = Path(HydraConfig.get().runtime.output_dir)
+    hydra = HydraConfig.get()
+    typed = [text for text in hydra.overrides.task if text.startswith(("data=", "experiment="))]
+    if "data" in hydra.runtime.choices and not typed:
+        expected = "the data set of the evaluation, data=… or experiment=…"
+        raise SettingError("data", found="nothing", expected=expected)
+    folder = Path(hydra.runtime.output_dir)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."

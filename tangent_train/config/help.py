@@ -59,6 +59,8 @@ def command_settings(command: str) -> list[Setting]:
         if not one.name.startswith("hydra"):
             known = settings.get(one.name, one)
             settings[one.name] = known._replace(value=one.value or known.value)
+    for name, value in re.findall(r"- override (\w+): (\w+)", file.read_text("utf-8")):
+        settings[name] = settings[name]._replace(value=value)
     return list(settings.values())
 
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
+import yaml  # type: ignore[import-untyped]
 from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError
+from tangent_train.files import read_json
 from tangent_train.metrics.score_columns import ScoreColumn
 from tangent_train.metrics.segmentation import Interval
 
@@ -107,13 +107,9 @@ class EvaluationResult:
 
     def json(self) -> str:
         """Return the content of ``results.json``."""
-        content = _adapter().dump_json(self, indent=1, exclude={"settings", "folder"})
+        adapter = TypeAdapter(EvaluationResult)
+        content = adapter.dump_json(self, indent=1, exclude={"settings", "folder"})
         return content.decode() + "\n"
-
-
-@cache
-def _adapter() -> TypeAdapter[EvaluationResult]:
-    return TypeAdapter(EvaluationResult)
 
 
 def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
@@ -134,15 +130,14 @@ def load_result(folder: Path) -> EvaluationResult:
     Raises:
         DataError: A file is missing, or was not written by ``tangent-train``.
     """
-    path = folder / RESULTS_FILE
+    expected = "results written by tangent-train or tangent-evaluate"
+    result: EvaluationResult = read_json(folder / RESULTS_FILE, expected, kind=EvaluationResult)
+    path = folder / "config.yaml"
     try:
-        result = _adapter().validate_json(path.read_bytes())
-        path = folder / "config.yaml"
-        settings: Any = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, ValueError) as error:
-        expected = "results written by tangent-train or tangent-evaluate"
-        raise DataError(path, found=error, expected=expected) from error
-    return replace(result, settings=flat_settings(settings), folder=folder)
+        settings = flat_settings(yaml.safe_load(path.read_bytes()))
+    except (OSError, yaml.YAMLError) as error:
+        raise DataError(path, found=error, expected="the settings of a run") from error
+    return replace(result, settings=settings, folder=folder)
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:

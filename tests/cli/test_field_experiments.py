@@ -78,7 +78,7 @@ def test_an_experiment_of_the_field_follows_its_protocol(
     name = _class_of(settings.data)
     section = settings.data | {"root": str(folders[name])}
     data, task = build(settings.model_copy(update={"data": section}))
-    assert {**data.facts, **task.facts} == protocol
+    assert {**data.facts, **task.head.facts} == protocol
     arguments += [f"data.root={folders[name]}", *SIZES.get(name, SIZE)]
     if command == "transfer":
         photos = folders[_class_of(settings.photos.data)]
@@ -109,6 +109,6 @@ def test_experiments_of_the_paper_have_the_facts_of_its_scores(name: str, experi
     if name == "paper_photos":
         settings = settings.model_copy(update=dict(settings.photos))
     protocol = facts(name)
-    assert settings.task.get("absent_class") == protocol.pop("absent_class", None)
+    assert settings.task["head"].get("absent_class") == protocol.pop("absent_class", None)
     assert protocol.pop("weighting", "pixels") == "pixels"
     assert build_data(settings).facts == protocol

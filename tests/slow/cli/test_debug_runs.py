@@ -60,7 +60,7 @@ def test_debug_runs_end_and_tell_what_was_not_measured(
         "fast": ["+trainer.detect_anomaly=true"],
         "limit": ["trainer.limit_train_batches=2", "trainer.limit_test_batches=1"],
         "overfit": ["trainer.max_epochs=2", "+trainer.limit_predict_batches=1"],
-        "profile": ["trainer.check_val_every_n_epoch=1", "logger=null"],
+        "profile": ["trainer.check_val_every_n_epoch=1", "logger=none"],
     }.items():
         capsys.readouterr()
         run("train", *common, f"debug={option}", *more, f"hydra.run.dir={option}")
