@@ -11,9 +11,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules import Stanford2D3DS
 from datamodules.core.cache import Cache
 from datamodules.core.images import ImageFiles
+from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.manifest import Shard
 from tests.conftest import fabricate
 
