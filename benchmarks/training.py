@@ -21,13 +21,13 @@ import lightning
 import torch
 from hydra import compose, initialize_config_dir
 from lightning.pytorch.callbacks import Callback
-from omegaconf import OmegaConf
 from torch import nn
 from torch.nn import functional
 
 from benchmarks.measuring import Alternative, Goal, Row, Table, measure
 from tangent_train.callbacks.checkpoints import LastCheckpoint
 from tangent_train.cli.run import build
+from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
 
 OURS = "tangent-train"
@@ -49,11 +49,11 @@ def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tup
     settings = [f"data.rooms.rooms.area_{area}={number}" for area, number in counts.items()]
     settings += [f"data.rooms.height={rows}", "data.rooms.supersample=1", f"data.root={root}"]
     settings += ["data.val_fraction=0", "trainer.accelerator=cpu", "seed=0"]
+    name = config_name("train", ())
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", ["data=synthrooms", *settings, *overrides])
-    plain: Any = OmegaConf.to_container(config, resolve=True)
+        config = compose(name, ["data=synthrooms", *settings, *overrides])
     lightning.seed_everything(0, verbose=False)
-    data, task = build(plain)
+    data, task = build(validate("train", config))
     data.prepare_data()
     data.setup("fit")
     return data, task

@@ -7,20 +7,17 @@ from __future__ import annotations
 
 import argparse
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
-from omegaconf import OmegaConf
-from torch import nn
 
 from datamodules.core.images import STEPS_PER_M
-from tangent_train.cli.run import build_data
-from tangent_train.config.build import build_from_config
+from tangent_train.cli.run import build_data, build_head
+from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
-from tangent_train.results.evaluation import summary_lines
+from tangent_train.results.evaluation import evaluation_result, summary_lines
 
 
 def constants(steps: NDArray[np.int32]) -> dict[str, NDArray[np.float64]]:
@@ -38,24 +35,24 @@ def main() -> None:
     """Print the scores of each constant."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("settings", nargs="+", metavar="<setting>=<value>")
+    name = config_name("train", ())
     with initialize_config_dir(str(config_folder()), version_base="1.3"):
-        config = compose("train", parser.parse_args().settings)
-    settings: Any = OmegaConf.to_container(config, resolve=True)
+        config = compose(name, parser.parse_args().settings)
+    settings = validate("train", config)
     data = build_data(settings)
     data.make_files()
     train, test, view = data.dataset("train"), data.dataset("test"), data.representation
     targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
-    empty: dict[str, Any] = {"network": nn.Identity(), "class_names": (), "optimizer": None}
+    head = build_head(settings, data)
     for name, meters in constants(np.stack(targets)).items():
-        task = build_from_config(settings["task"], "task", representation=view, **empty)
+        metric = head.build_metric()
         for index in range(len(test)):
-            truth = task.meters(torch.from_numpy(test.read(index).target(view).astype(np.int32)))
+            truth = head.truth(torch.from_numpy(test.read(index).target(view).astype(np.int32)))
             guess = torch.from_numpy(meters).float().expand(truth.shape)
-            task.metric.update(task.protocol.aligned(guess, truth), truth)
-        task.evaluated = len(test)
-        record = task.evaluation_result(task.metric.compute(), data.noun)
-        record = replace(record, protocol={**data.facts, **task.facts})
-        print(f"{name}, {np.median(meters):.2f} m:", *summary_lines(record), sep="\n  ")
+            metric.update(head.comparable(guess, truth), truth)
+        result = evaluation_result(head, metric.compute(), data.noun, len(test))
+        result = replace(result, protocol={**data.facts, **head.facts})
+        print(f"{name}, {np.median(meters):.2f} m:", *summary_lines(result), sep="\n  ")
 
 
 if __name__ == "__main__":

@@ -179,7 +179,7 @@ class Run:
             protocol={**self.data.facts, **self.task.head.facts},
             checkpoint=name,
             label_map=self.plain_settings().get("label_map"),
-            folds=getattr(self.data, "folds", ()),
+            folds=self.data.folds,
             settings=flat_settings(self.plain_settings()),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(result)

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry.sphere import checked_rotation
 
 
-@dataclass(frozen=True, eq=False, init=False)
 class PanoramaPose:
     """Pose of a panorama in a world frame in meters.
 
@@ -25,22 +21,14 @@ class PanoramaPose:
         location_m: ``(3,)`` position of the center.
 
     Raises:
-        SettingError: The matrix is not orthogonal, or the center is not three finite numbers.
+        SettingError: The matrix is not orthogonal.
     """
 
-    world_from_panorama: NDArray[np.float64]
-    location_m: NDArray[np.float64]
-
     def __init__(self, world_from_panorama: ArrayLike, location_m: ArrayLike) -> None:
-        matrix = np.array(world_from_panorama, np.float64)
-        location = np.array(location_m, np.float64)
-        if location.shape != (3,) or not np.isfinite(location).all():
-            raise SettingError("location_m", found=location.tolist(), expected="3 finite numbers")
-        mirrored = matrix.shape == (3, 3) and np.linalg.det(matrix) < 0
-        checked_rotation(-matrix if mirrored else matrix)
-        for array in (matrix, location):
-            array.setflags(write=False)
-        vars(self).update(world_from_panorama=matrix, location_m=location)
+        self.world_from_panorama = np.array(world_from_panorama, np.float64)
+        self.location_m = np.array(location_m, np.float64)
+        is_mirrored = np.linalg.det(self.world_from_panorama) < 0
+        checked_rotation(-self.world_from_panorama if is_mirrored else self.world_from_panorama)
 
     def points_m(self, directions_xyz: ArrayLike, distance_m: ArrayLike) -> NDArray[np.float64]:
         """Return world points ``(…, 3)`` in directions ``(…, 3)`` at distances ``(…)``."""
@@ -64,15 +52,6 @@ class PanoramaPose:
 
         Returns:
             R ``(3, 3)``, a rotation, and t ``(3,)`` in meters: the position of the other's center.
-
-        Raises:
-            SettingError: Only one of the two matrices is a reflection.
         """
         rotation = self.world_from_panorama.T @ other.world_from_panorama
-        if np.linalg.det(rotation) < 0:
-            raise SettingError(
-                "poses",
-                found="one in a right-handed world and one in a left-handed world",
-                expected="both in the same world",
-            )
         return rotation, (other.location_m - self.location_m) @ self.world_from_panorama

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import math
 from itertools import chain
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError
 from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.rendering.backward import tangent_to_equirect
-from tangent_train.rendering.checks import Blend, blend_of, check_choice, check_panorama
+from tangent_train.rendering.checks import Blend, blend_of, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
@@ -83,20 +83,7 @@ def apply(
     """
     blend = blend_of(blend, is_overlapping=grid.is_overlapping)
     check_panorama(panorama, "bilinear")
-    if isinstance(panorama, Tensor) and panorama.ndim > 3:
-        raise SettingError(
-            "panorama",
-            found=f"shape {tuple(panorama.shape)}",
-            expected="(C, H, W)",
-            remedy="Call apply for each panorama of a batch.",
-        )
-    check_choice("kind", kind or "metric_z", get_args(DepthKind))
-    if kind is not None and align is None:
-        expected = "None without align="
-        raise SettingError("kind", found=kind, expected=expected, remedy="For depth: align='scale'")
-    step = max(1, _PIXELS_PER_CALL // math.prod(grid.size))
-    if images_per_call is not None:
-        step = at_least("images_per_call", images_per_call, 1)
+    step = images_per_call or max(1, _PIXELS_PER_CALL // math.prod(grid.size))
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     parts: Iterator[_Part] = _results(function, panorama, grid, step)
     if align is not None:
@@ -126,20 +113,10 @@ def apply(
 def _results(
     function: Callable[[Pixels], Pixels], panorama: Pixels, grid: PinholeGrid, step: int
 ) -> Iterator[_Part]:
-    """Yield the faces and the results of each call; all must be of the kind of the first."""
-    first: Any = None
+    """Yield the faces and the results of each call."""
     for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
         images = equirect_to_tangent(panorama, grid, faces)
-        results = _as_array(function(images), images)
-        kind = results.shape[3:], results.dtype.kind
-        first = first or kind
-        if kind != first:
-            raise SettingError(
-                "result of the function",
-                found=f"K = {kind[0]} of {results.dtype} for some images",
-                expected=f"K = {first[0]} and the kind of numbers of the first images",
-            )
-        yield faces, results
+        yield faces, _as_array(function(images), images)
 
 
 def _mean(

@@ -143,7 +143,7 @@ def map_classes(
     scores += [unknown] if unknown else []
     found = {str(target): [names[k] for k in group] for target, group in members.items()}
     return MappedNetwork(
-        loaded=replace(loaded, class_names=("unknown", *targets), groups=scores),
+        loaded=replace(loaded, class_names=("unknown", *targets), groups=tuple(map(tuple, scores))),
         classes=found,
         absent=[n for n in target_of if n not in map(plain_name, names)],
         unmapped=[names[k] for k in remaining],

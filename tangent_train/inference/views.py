@@ -132,28 +132,15 @@ class PanoramaViews:
     def description(self, area: Sequence[float] | None = None) -> str:
         """Return number and size of the views; of pinhole images also their angle and resolution.
 
-        Signals on an icosphere are described by their number of values.
-
         Args:
             area: Area that the panoramas show, see `check_area`; None for the whole sphere.
         """
         rows, columns = self.image_size
         sets = self.representation.view_sets(PanoramaArea.on_canvas(area, _MASK_ROWS).valid)
-        count = sum(map(len, sets))
-        if rows == 1:  # signals on an icosphere
-            return f"{counted(count, 'signals')} of {columns} values"
-        text = f"{counted(count, 'views')} of {columns} × {rows}"
-        grids: Sequence[PinholeGrid] = getattr(self.representation, "grids", ())
-        tangent = {grid.level: grid for grid in grids if isinstance(grid, TangentGrid)}
-        if not tangent:
-            needed = (views.grid for views in sets if isinstance(views, PinholeViews))
-            parts = list(dict.fromkeys(map(_described, needed)))
-            return f"{text} ({'; '.join(parts)})" if parts else text
-        parts = [f"level {level}: {_described(grid)}" for level, grid in tangent.items()]
-        if len(parts) > 1:
-            parts.append(f"levels={next(iter(tangent))} alone takes 1/{len(parts)} of the time")
-        base_level = next(iter(tangent.values())).base_level
-        return f"{text} at base level {base_level} ({'; '.join(parts)})"
+        text = f"{counted(sum(map(len, sets)), 'views')} of {columns} × {rows}"
+        grids = (views.grid for views in sets if isinstance(views, PinholeViews))
+        parts = "; ".join(dict.fromkeys(map(_described, grids)))
+        return f"{text} ({parts})" if parts else text
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
         """Return the sets of views of the valid pixels of one panorama."""

@@ -176,9 +176,9 @@ def test_a_part_of_a_panorama_is_labeled_as_that_part(
     write_pixels(part, sphere(64)[rows][:, columns])
     common = {"blend": "nearest", "write": "[labels,probabilities]"}
     predict(**common, input=whole, output=tmp_path / "w")
-    assert "A panorama is labeled in 20 views" in capsys.readouterr().out
+    assert "A panorama is predicted in 20 views" in capsys.readouterr().out
     predict(**common, input=part, output=tmp_path / "p", area="[135,-135,-45,45]", fill="edge")
-    assert "A panorama is labeled in 3 views" in capsys.readouterr().out
+    assert "A panorama is predicted in 3 views" in capsys.readouterr().out
     assert json.loads((tmp_path / "p" / "summary.json").read_text())["fill"] == "edge"
     inner = slice(8, -8)
     for read in (

@@ -79,7 +79,7 @@ def test_files_of_a_panorama(
     assert 2900 < len(pixels) <= 3000
 
     printed = capsys.readouterr().out
-    assert "The depth of a panorama is predicted in 20 views" in printed
+    assert "A panorama is predicted in 20 views" in printed
     assert "Mean over the images (depth in meters)" in printed
     assert re.search(rf"median, m +│ +{entry['median']:.3g} │", printed)
     with (output / "summary.csv").open(newline="") as file:

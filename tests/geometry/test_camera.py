@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     camera_matrix_from_fov,
-    is_camera_matrix,
     perspective_directions,
     ray_lengths,
     shift_range,
@@ -77,20 +76,6 @@ def test_fov_is_between_the_outer_pixel_edges(fov_deg: float, size: tuple[int, i
     assert math.degrees(math.acos(cosine)) == pytest.approx(fov_deg, abs=1e-9)
     assert left[1] == pytest.approx(0)  # the middle row looks neither up nor down
     assert matrix[0, 0] == matrix[1, 1]
-
-
-def test_a_camera_matrix_consists_of_focal_lengths_and_a_center() -> None:
-    assert is_camera_matrix(K)
-    for place, value in (
-        *(((0, 0), 0), ((1, 1), -520), ((0, 1), 1), ((1, 0), 1), ((2, 0), 1), ((2, 1), 1)),
-        *(((2, 2), 2), ((0, 2), math.nan), ((1, 2), math.inf)),
-    ):
-        other = K.copy()
-        other[place] = value
-        assert not is_camera_matrix(other), place
-    assert not is_camera_matrix(K[:2])
-    assert not is_camera_matrix(K[None])
-    assert not is_camera_matrix(np.eye(4))
 
 
 def test_perspective_directions_project_to_their_pixel() -> None:

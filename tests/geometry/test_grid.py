@@ -14,6 +14,7 @@ from scipy.spatial import SphericalVoronoi
 from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
+    PinholeGrid,
     RingGrid,
     TangentGrid,
     rotation_about,
@@ -45,7 +46,12 @@ def test_impossible_faces_are_refused(faces: list[int]) -> None:
 
 def test_grids_are_compared_by_value() -> None:
     grid, cube = TangentGrid(0, 5), CubeGrid(32)
-    different = [grid, TangentGrid(1, 5), TangentGrid(0, 6), TangentGrid(0, 5, 30)]
+    different: list[PinholeGrid] = [
+        grid,
+        TangentGrid(1, 5),
+        TangentGrid(0, 6),
+        TangentGrid(0, 5, 30),
+    ]
     different += [cube, CubeGrid(33), CubeGrid(32, margin=1), RingGrid(RINGS, (100, 100), (8, 8))]
     different += [grid.with_rotation(ROTATION), cube.with_rotation(ROTATION)]
     different += [grid.resized((33, 33)), grid.subset([3, 4]), grid.subset([3, 5])]

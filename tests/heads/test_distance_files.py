@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
 from tangent_train.heads import DistanceHead, PredictedImage
 from tangent_train.heads.distance import points_of, spread_pixels
@@ -105,20 +103,3 @@ def test_a_video_has_one_range_of_colors() -> None:
     assert not painted[2].any()
     (row,) = head.table(summaries[2:3]).rows
     assert row == ["known pixels, % of the solid angle", "0"]
-
-
-def test_formats_are_refused_before_work(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "OpenEXR", None)
-    with pytest.raises(SettingError, match=r"depth_format: found a missing package.*\[exr\]"):
-        DistanceHead(depth_format="exr")
-    with pytest.raises(SettingError, match="depth_scale: found inf; expected more than 0"):
-        DistanceHead(depth_scale=math.inf)
-
-
-def test_the_table_counts_images_whose_views_agree_less_than_before() -> None:
-    head = DistanceHead()
-    steps = [{"step_before": 0.2, "step_after": after} for after in (0.1, 0.201, 0.3, 0.4)]
-    rows = head.table([*steps, {"step_before": None}]).rows
-    assert [row for row in rows if "agree less" in row[0]] == [
-        ["images whose views agree less than before: try another align", "2"]
-    ]

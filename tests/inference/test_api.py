@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from PIL import ExifTags, Image
+from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 import tangent_train as tt
@@ -166,35 +166,6 @@ def test_files_get_the_labels_and_scores_of_tangent_predict(
             np.testing.assert_array_equal(network.labels(rgb, mask=array), expected)
 
 
-def test_the_zenith_of_a_tilted_panorama_matters(
-    tmp_path: Path, network: Network, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    _write(sphere(50), POSE)
-    upright = network.probabilities("room.png", upright="pose")
-    np.testing.assert_array_equal(network.probabilities("room.png", upright="auto"), upright)
-    assert np.abs(upright - network.probabilities("room.png")).max() > 0.01, "other images, other scores"
-
-
-@pytest.mark.parametrize("mode", ["RGB", "RGBA", "L", "LA", "P", "CMYK", "1", "I;16"])
-@pytest.mark.parametrize("orientation", [1, 6, 3])
-def test_images_of_pillow_get_what_their_files_get(
-    mode: str, orientation: int, tmp_path: Path, network: Network
-) -> None:
-    image = Image.fromarray(sphere(24)[:, :31])
-    image = image.convert("L" if mode == "I;16" else mode)
-    if mode == "I;16":
-        image = Image.fromarray(np.asarray(image).astype(np.uint16) * 256 + 77)
-    exif = Image.Exif()
-    exif[ExifTags.Base.Orientation] = orientation
-    path = tmp_path / ("photo.jpg" if mode == "CMYK" else "photo.png")
-    image.save(path, exif=exif)
-    expected = network.labels(path, fov=60)
-    assert expected.shape == ((31, 24) if orientation == 6 else (24, 31))
-    with Image.open(path) as opened:
-        np.testing.assert_array_equal(network.labels(opened, fov=60), expected)
-
-
 def test_a_network_has_a_description(network: Network) -> None:
     assert repr(network) == (
         "<Network of 3 classes (dark, green, bright), inputs rgb, trained at level 4 on 16×16 "
@@ -302,13 +273,3 @@ def test_settings_that_do_not_suit_the_network_are_refused(tmp_path: Path) -> No
         tt.load(path, align="scale")
     with pytest.raises(SettingError, match="rotations: found 2; expected 1 for photos"):
         tt.load(path, rotations=2).labels(_RGB, fov=60)
-
-
-def test_photos_without_a_field_of_view_are_explained(network: Network, tmp_path: Path) -> None:
-    """A file too: the argument comes before the setting of the command."""
-    Image.fromarray(_RGB[:, :30]).save(tmp_path / "photo.png")
-    for method in (network.labels, network.probabilities):
-        with pytest.raises(DataError, match=r"photo, give fov=, its horizontal field of view"):
-            method(tmp_path / "photo.png")
-    with pytest.raises(SettingError, match=r"fov: found 200; .* less than 180 degrees"):
-        network.labels(_RGB, fov=200)

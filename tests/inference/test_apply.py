@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import CubeGrid, TangentGrid, equirect_directions, rotation_about
+from tangent_train.geometry import TangentGrid, equirect_directions, rotation_about
 from tangent_train.inference.applying import apply
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 
@@ -94,28 +94,6 @@ def test_tensors_and_arrays_agree(blend: Blend) -> None:
     np.testing.assert_allclose(depth.numpy(), panorama[..., 0], atol=0.05)
 
 
-def test_labels_of_tensors_keep_their_dtype() -> None:
-    tensor = torch.from_numpy(_smooth(32)).movedim(-1, 0)
-    labels = apply(lambda images: images.argmax(dim=1), tensor, TangentGrid(0, 5), "nearest")
-    assert (labels.dtype, labels.shape) == (torch.int64, (32, 64))
-    masks = apply(lambda images: images > 0, tensor, TangentGrid(0, 5), "nearest")
-    assert (masks.dtype, masks.shape) == (torch.bool, (3, 32, 64))
-    assert (labels == tensor.argmax(dim=0)).double().mean() > 0.97
-    assert (masks == (tensor > 0)).double().mean() > 0.97
-
-
-def test_images_that_do_not_overlap_are_not_feathered() -> None:
-    panorama, grid = np.random.default_rng(0).random((32, 64, 2)), CubeGrid(16)
-    nearest = apply(lambda images: images, panorama, grid, "nearest")
-    np.testing.assert_array_equal(apply(lambda images: images, panorama, grid), nearest)
-    assert not np.isnan(nearest).any()
-
-
-def _other_after_the_first(shapes: list[tuple[int, ...]], dtypes: list[Any]) -> Function:
-    results = iter([np.zeros(s, t) for s, t in zip(shapes, dtypes, strict=True)])
-    return lambda _: next(results)
-
-
 _ARRAY = np.zeros((8, 16, 3), np.float32)
 
 
@@ -127,29 +105,8 @@ _ARRAY = np.zeros((8, 16, 3), np.float32)
         (torch.from_numpy, "found a Tensor"),
         (lambda _: None, "found a NoneType"),
         (lambda images: images.astype(np.uint8), "blend: found 'feather' for results of uint8"),
-        (
-            _other_after_the_first([(10, 16, 16, 2), (10, 16, 16, 3)], [float, float]),
-            r"found K = \(3,\)",
-        ),
-        (_other_after_the_first([(10, 16, 16), (10, 16, 16)], [float, int]), "int64"),
     ],
 )
 def test_other_results_are_refused(function: Function, message: str) -> None:
     with pytest.raises(SettingError, match=message):
         apply(function, _ARRAY, TangentGrid(0, 4), images_per_call=10)
-
-
-@pytest.mark.parametrize(
-    ("panorama", "settings", "message"),
-    [
-        (torch.zeros(2, 3, 8, 16), {}, "each panorama of a batch"),
-        (torch.zeros(3, 8, 16, dtype=torch.uint8), {}, "uint8"),
-        (_ARRAY, {"blend": "linear"}, "blend"),
-        (_ARRAY, {"images_per_call": 0}, "images_per_call: found 0"),
-    ],
-)
-def test_unusable_arguments_are_refused(
-    panorama: Any, settings: dict[str, Any], message: str
-) -> None:
-    with pytest.raises(SettingError, match=message):
-        apply(lambda images: images, panorama, **{"grid": TangentGrid(0, 4)} | settings)

@@ -210,9 +210,3 @@ def test_batches_are_collated_and_losses_ignore_the_fill(
     assert losses[0] == pytest.approx(losses[1], rel=0.02)
     stored = [np.bincount(np.asarray(data.dataset("train").labels(k)).ravel()) for k in range(2)]
     assert torch.equal(weights, class_weights(np.sum(stored, axis=0)[1:], "log"))
-
-
-def test_the_description_has_the_kinds_of_views_that_see_the_area() -> None:
-    views = PanoramaViews(trained_network(RING), views="horizontal_wide")
-    assert views.description().count("° wide") == 2
-    assert views.description((-180, 180, -30, 30)).count("° wide") == 1

@@ -10,7 +10,6 @@ import pytest
 import torch
 from numpy.typing import NDArray
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 from torch import Tensor, nn
 
 import tangent_train as tt
@@ -36,7 +35,6 @@ from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import PanoramaViews, PhotoViews, view_settings
 from tangent_train.rendering.representations.views import PinholeViews
-from tests.datamodules.data_files import gpano_xmp
 from tests.inference.trained import CUBE, ERP, ICOSPHERE, TANGENT, trained_network
 
 SHAPE = 96, 192
@@ -128,29 +126,6 @@ def test_relative_distances_have_the_median_1_by_solid_angle() -> None:
         values: Any = found[inside]
         weight = np.broadcast_to(equirect_solid_angles(shape)[:, None], shape)[inside]
         assert weight[values < 1].sum() / weight.sum() == pytest.approx(0.5, abs=0.015)
-
-
-def test_far_pixels_do_not_count_for_the_median_of_relative_depth() -> None:
-    """A third of the sphere is 10⁴ times as far, and becomes unknown; z-depth of a photo."""
-    outputs = []
-    for views, depth in _true_depth(VIEWS["horizontal"], "relative_disparity"):
-        up = torch.from_numpy(views.grid.directions()[..., 2])[:, None]
-        outputs.append((views, depth.where(up < 1 / 3, depth / 1e4)))
-    found = _combined(outputs, SHAPE, "relative_disparity", "nearest", "none")
-    known, weight = (
-        np.isfinite(found),
-        np.broadcast_to(equirect_solid_angles(SHAPE)[:, None], SHAPE),
-    )
-    assert weight[known].sum() == pytest.approx(4 * np.pi * 2 / 3, rel=0.03)
-    nearer = weight[known & (found < 1)].sum() / weight[known].sum()
-    assert nearer == pytest.approx(0.5, abs=0.02)
-
-    photo, _ = _photo((60, 90), 70)
-    trained = depth_network("relative_depth")
-    result = Predictor(trained, head_of(trained), PhotoViews(trained)).predict(photo)
-    depth = result.pixels()
-    angle = (depth / result.distances()) ** 3
-    assert angle[depth < 1].sum() / angle.sum() == pytest.approx(0.5, abs=0.02)
 
 
 def test_the_sky_and_unknown_pixels_are_unknown() -> None:
@@ -294,16 +269,6 @@ def test_parts_of_panoramas_get_their_depth(network: Network, tmp_path: Path) ->
     np.testing.assert_allclose(depth[inside], _truth()[part][inside], rtol=0.02)
 
 
-def test_tilted_panoramas_get_depth_in_their_own_frame(network: Network, tmp_path: Path) -> None:
-    tags = {"PosePitchDegrees": 30, "PoseRollDegrees": -20}
-    text = PngInfo()
-    text.add_itxt("XML:com.adobe.xmp", gpano_xmp(tags).decode())
-    Image.fromarray(far_image(_truth())).save(tmp_path / "room.png", pnginfo=text)
-    depth = network.depth(tmp_path / "room.png", upright="pose")
-    np.testing.assert_allclose(depth, _truth(), atol=0.04)
-    assert np.abs(depth - network.depth(tmp_path / "room.png")).max() > 1e-3, "other views"
-
-
 def test_networks_name_the_method_that_suits_them(
     network: Network, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -350,8 +315,3 @@ def test_functions_that_return_depth_are_aligned(as_tensor: bool) -> None:
         apply(lambda images: images.repeat(2, axis=-1), distance[..., None], grid, align="scale")
     with pytest.raises(SettingError, match="no depth that metric_z with align=scale can use"):
         apply(lambda images: -images[..., 0], distance[..., None], grid, align="scale")
-    unknown: Any = "relative_dispartiy"
-    with pytest.raises(SettingError, match="kind: found 'relative_dispartiy'; expected"):
-        apply(z_depth, panorama, grid, align="scale", kind=unknown)
-    with pytest.raises(SettingError, match="kind: found metric_z; expected None without align"):
-        apply(z_depth, panorama, grid, kind="metric_z")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import weakref
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,12 +22,11 @@ from models import make_distortion_aware
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, camera_matrix_from_fov, rotation_about
+from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import PanoramaViews, PhotoViews
-from tangent_train.rendering import rotate_equirect
 from tests.inference.trained import (
     CUBE,
     ERP,
@@ -76,24 +74,6 @@ def test_images_share_memory_only_one_after_the_other() -> None:
     third = predictor.predict(InputImage(bright))
     assert third.sums.ctypes.data == address
     np.testing.assert_array_equal(third.probabilities(slice(None)), expected)
-
-
-@pytest.mark.parametrize("in_memory", [True, False])
-def test_memory_of_another_size_or_on_a_disk_is_released(
-    in_memory: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if not in_memory:
-        monkeypatch.setattr("tangent_train.rendering.numba_sums._IN_MEMORY_BYTES", 0)
-    trained = trained_network(TANGENT)
-    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained, blend="feather"))
-    first = predictor.predict(InputImage(_blocks(64, 128)))
-    kept = weakref.ref(first.sums)
-    del first
-    assert (kept() is not None) == in_memory
-    during = []
-    predictor.predict(InputImage(_blocks(32, 64)), lambda _: during.append(kept()))
-    assert during
-    assert set(map(type, during)) == {type(None)}
 
 
 # Panoramas.
@@ -191,15 +171,6 @@ def test_elevation_follows_the_zenith() -> None:
     assert (tilted[:, 20:44] == 2).mean() > 0.85, "around the middle column"
     with pytest.raises(SettingError, match="image: found a photo; expected a panorama"):
         PhotoViews(trained)
-
-
-def test_panoramas_that_are_not_upright_are_seen_upright() -> None:
-    trained, rgb = trained_network(TANGENT), sphere(64)
-    rotation = rotation_about((1, 2, 0), np.radians(40))
-    upright = _labels(trained, InputImage(rgb))
-    tilted = InputImage(rotate_equirect(rgb, rotation), up=rotation @ [0, 0, 1])
-    labels = _labels(trained, tilted)
-    assert (labels == rotate_equirect(upright, rotation, "nearest")).mean() > 0.93
 
 
 @pytest.mark.parametrize(("representation", "height"), [(TANGENT, 16), (CUBE, 50), (ERP, 96)])
@@ -312,34 +283,7 @@ def test_crops_have_the_angular_resolution_the_network_was_trained_with() -> Non
     assert _radians_per_pixel(trained_network(CUBE)) == pytest.approx(2 / 16)
 
 
-def test_a_photo_of_a_telescope_needs_little_memory() -> None:
-    """The photo is far smaller than a crop: mirrored at full resolution it has 14,000² pixels."""
-    trained = trained_network(PERSPECTIVE, module=color_network(kernel=1))
-    rgb = np.zeros((600, 800, 3), np.uint8)
-    rgb[:, 400:] = 255
-    (views,) = PhotoViews(trained)(_photo(rgb, 2.5))
-    assert max(views.image.rgb.shape) < 100
-    labels = _labels(trained, _photo(rgb, 2.5))
-    assert (labels[:, :330] == labels[0, 0]).all()
-    assert (labels[:, 470:] == labels[0, -1]).all()
-    assert labels[0, 0] != labels[0, -1]
-
-
 # Invalid settings.
-
-
-def test_impossible_settings_are_refused() -> None:
-    trained = trained_network(TANGENT)
-    for representation in (ERP, CUBE):
-        with pytest.raises(SettingError, match=r"levels: .*tangent images.*views=tangent"):
-            PanoramaViews(trained_network(representation), levels=(4, 5))
-    strided = trained_network(TANGENT, size_multiple=16)
-    with pytest.raises(SettingError, match="multiples of 16"):
-        PanoramaViews(strided, levels=(3,))
-    with pytest.raises(SettingError, match=r"at least 48 × 24 \(width"):
-        PanoramaViews(trained_network(ERP, fixed_size=(24, 48)), levels=(3,))
-    with pytest.raises(SettingError, match="device"):
-        Predictor(trained, head_of(trained), PanoramaViews(trained), "nonsense")
 
 
 @pytest.mark.parametrize(("representation", "size"), [(ICOSPHERE, (1, 2562)), (ERP, (32, 64))])
@@ -355,10 +299,3 @@ def test_a_network_of_whole_spheres_takes_only_those_of_its_training(
     with pytest.raises(SettingError, match=expected):
         PhotoViews(trained)
     assert PanoramaViews(trained, 4).image_size == size
-
-
-def test_signals_are_not_views_of_photo_networks() -> None:
-    assert PanoramaViews(trained_network(ICOSPHERE)).description() == "1 signal of 2562 values"
-    for views in ("icosphere", "icosphere_faces"):
-        with pytest.raises(SettingError, match=f"views: found {views}; expected an option"):
-            PanoramaViews(trained_network(TANGENT), views=views)

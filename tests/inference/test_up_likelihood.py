@@ -91,23 +91,6 @@ def test_networks_with_elevation_give_no_evidence() -> None:
 
 
 @pytest.mark.parametrize(
-    ("network", "changes", "side", "count"),
-    [
-        (Sky(), {}, 29, 4),
-        (Sky(), {"size_multiple": 16}, 32, 4),
-        (Sky(), {"fixed_size": (64, 64)}, 64, 4),
-        (WholeSky(), {}, 32, 20),
-    ],
-)
-def test_views_have_a_size_that_the_network_takes(
-    network: Sky, changes: dict[str, Any], side: int, count: int
-) -> None:
-    likely = _judge(network, **changes)(InputImage(_bright_above(AXES[2])), AXES)
-    assert likely.argmax() == 2
-    assert network.shapes == {(count, 3, side, side)}
-
-
-@pytest.mark.parametrize(
     ("representation", "network", "size"),
     [(ICOSPHERE, SkyOfVertices(), (1, 2562)), (ERP, Sky(), (32, 64))],
 )

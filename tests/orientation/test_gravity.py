@@ -15,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation, rotation_about
 from tangent_train.orientation.gravity import (
-    cues,
     estimate_up,
     up_from_pose,
     upright_rotation,
@@ -28,27 +27,6 @@ from tangent_train.orientation.manhattan import (
 from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.textures import texture
 from tests.rendering.drawn_room import draw_room
-
-_NO_SEGMENTS = LineSegments(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
-
-
-def test_cues_of_known_segments_have_known_values() -> None:
-    level = np.radians([0, 90, 180, 270])
-    around = np.stack([np.cos(level), np.sin(level), np.zeros(4)], axis=-1)
-    middles = np.concatenate([around, [[0, 0, -1.0], [0.6, 0, -0.8]]])
-    upright = np.stack([-np.sin(level), np.cos(level), np.zeros(4)], axis=-1)
-    oblique = np.array([[1, 1, 1], [2, 3, -4]]) / np.array([[3**0.5], [29**0.5]])
-    segments = LineSegments(np.concatenate([upright, oblique]), middles, np.full(6, 0.2))
-    image = np.full((64, 128, 3), 90, np.uint8)
-    even, odd = cues(image, segments, np.eye(3))
-    # The planes of the four hold the vertical, and a level axis as well: each counts once.
-    assert even.shape == (3, 5)
-    np.testing.assert_allclose(even[:, 0].sum(), 1)
-    np.testing.assert_allclose(even[0, 3], 1)  # what follows the first axis lies on it
-    np.testing.assert_allclose(even[2, 1], 4 / 6)
-    np.testing.assert_allclose(even[2, 2], (1 / 6) / 0.15)
-    np.testing.assert_allclose(odd[2, 1], -0.9)  # clutter, at −1 and −0.8
-    np.testing.assert_allclose(odd[:, 2], 0, atol=1e-12)
 
 
 def test_rims_of_missing_parts_are_not_edges() -> None:

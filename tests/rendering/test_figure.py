@@ -33,12 +33,3 @@ def test_images_are_at_their_positions(base_level: int) -> None:
     assert sorted(faces) == list(range(grid.num_images))
     z = grid.with_rotation(None).centers_xyz[faces, 2].reshape(-1, columns)
     assert (z[:-1].min(axis=1) >= z[1:].max(axis=1) - 1e-6).all()
-
-
-def test_gray_of_16_bits_is_drawn_with_numbers() -> None:
-    page = tangent_figure(np.full((32, 64), 100 * 257, np.uint16), TangentGrid(0, 4))
-    assert page[TOP + 6, 6].tolist() == [100, 100, 100]
-    # Images of 156 px every 160; in the middle of each its number, white on black.
-    middles = page[TOP + 4 :].reshape(2, 160, 10, 160, 3)[:, 66:90, :, 66:94]
-    assert (middles.max(axis=(1, 3, 4)) == 255).all()
-    assert (middles.min(axis=(1, 3, 4)) < 80).all()

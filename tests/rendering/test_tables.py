@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -95,15 +94,6 @@ def test_the_cache_is_bounded_by_bytes() -> None:
     assert get("c") == 5
     get("too large", 101)
     assert cache.nbytes == 80
-
-
-def test_threads_may_render_at_the_same_time() -> None:
-    grid, shape = TangentGrid(0, 5), (256, 512)
-    scores = np.random.default_rng(0).random((20, 5, 32, 32), np.float32)
-    with ThreadPoolExecutor(4) as pool:
-        runs = [pool.submit(tangent_to_labels, scores, grid, shape) for _ in range(8)]
-    expected = tangent_to_labels(scores, grid, shape)
-    assert all(np.array_equal(run.result(), expected) for run in runs)
 
 
 @pytest.mark.filterwarnings("ignore:This process:DeprecationWarning")  # Python 3.12 warns of forks

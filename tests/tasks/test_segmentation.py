@@ -158,18 +158,3 @@ def test_scores_that_do_not_fit_are_refused() -> None:
     received = r"output of the network: found \(1, 3, 16, 16\); expected \(1, 2, 16, 16\)"
     with pytest.raises(SettingError, match=received):
         task(torch.zeros(1, 2, 16, 16))
-
-
-@pytest.mark.parametrize(
-    ("name", "value"),
-    [
-        ("view_batch_size", 0),
-        ("eval_view_batch_size", 0),
-        ("absent_class", "drop"),
-        ("class_weights", "logg"),
-        ("class_weights", [0.0, 1.0, 2.0]),
-    ],
-)
-def test_impossible_settings_are_refused(name: str, value: object) -> None:
-    with pytest.raises(SettingError, match=name):
-        _task(nn.Conv2d(2, 2, 1), **{name: value})
