@@ -13,8 +13,7 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.cli.settings import check_unread
-from tangent_train.config.settings import ImportSettings
+from tangent_train.config.settings import ImportSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.files import check_new
@@ -40,8 +39,14 @@ _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
     "relative_disparity": "1 / z-depth up to a scale and a shift of each view",
 }
 
-_OF_CLASSES = {"classes": None, "unknown_classes": (), "unknown_wins": True, "scores": None}
-"""Settings that depth networks do not have, and their defaults."""
+_OF_CLASSES = {"unknown_classes", "unknown_wins", "scores"}
+"""Settings that only networks of classes have."""
+
+_READ = {
+    *("library", "network", "normalization", "image_size", "views", "levels", "base_level", "fov"),
+    *("output", "overwrite"),
+}
+"""Settings that all networks have."""
 
 
 def import_network(settings: ImportSettings) -> None:
@@ -63,10 +68,6 @@ def import_network(settings: ImportSettings) -> None:
     check_new(output, overwrite=settings.overwrite)
     with get_console().status(Text(f"Writing {printable(output.name)} …")):
         network = _load(settings)
-        if network.depth_kind is None:
-            check_unread(settings, "for networks of classes", depth=None)
-        else:
-            check_unread(settings, "for depth networks", **_OF_CLASSES)
         trained = photo_networks.import_network(
             network,
             output,
@@ -106,11 +107,11 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
         load = partial(own_files.load_config, settings.network)
     else:
         raise SettingError("library", found="null", expected="a library, or network=<option>")
-    read = signature(load).parameters
-    unread = dict.fromkeys(name for name in _OF_LIBRARIES if name not in read)
-    check_unread(settings, f"for library={settings.library}", **unread)
-    given = {name: getattr(settings, name) for name in _OF_LIBRARIES if name in read}
-    return load(**given, normalization=settings.normalization)
+    given = {n: getattr(settings, n) for n in signature(load).parameters if n in _OF_LIBRARIES}
+    network = load(**given, normalization=settings.normalization)
+    read = _READ | given.keys()
+    check_read(settings, (read | _OF_CLASSES) if network.depth_kind is None else read - {"classes"})
+    return network
 
 
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from tangent_train.cli.jobs import Shard
 from tangent_train.cli.run import open_data
 from tangent_train.config.settings import PrepareSettings
 from tangent_train.console import print_text
+from tangent_train.manifest import Shard
 
 
 def prepare(settings: PrepareSettings) -> None:

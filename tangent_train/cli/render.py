@@ -12,7 +12,7 @@ import numpy as np
 
 from datamodules.folder.labeled import class_masks
 from tangent_train.config.build import build_from_config
-from tangent_train.config.settings import RenderSettings
+from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
@@ -38,7 +38,6 @@ from tangent_train.io.tangent_folders import (
     write_tangent_folder,
 )
 from tangent_train.io.tangent_results import TangentResults, result_files
-from tangent_train.io.videos import VIDEO_SUFFIXES
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
@@ -61,7 +60,9 @@ def render(settings: RenderSettings) -> None:
         )
     if settings.output is None and settings.figure is None:
         raise SettingError("output", found="null", expected="a folder, or with back= a file")
-    _MODES[modes[0]](settings, settings.model_dump(mode="json", exclude=_NOT_CONTENT))
+    run, read = _MODES[modes[0]]
+    check_read(settings, {*read, modes[0], "output"})
+    run(settings, settings.model_dump(mode="json", exclude=_NOT_CONTENT))
 
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
@@ -134,8 +135,7 @@ def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
 
 def _file_name(job: Job) -> str:
     """Return the file of a panorama below the input; of a frame, its name."""
-    is_frame = job.path.suffix.lower() in VIDEO_SUFFIXES
-    return job.name if is_frame else job.name.removesuffix(job.path.suffix) + job.path.suffix
+    return job.name if job.is_frame else job.name.removesuffix(job.path.suffix) + job.path.suffix
 
 
 def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
@@ -237,7 +237,16 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     _print_written(output, list(folders), failed)
 
 
-_MODES = {"input": _render_views, "back": _render_back, "poses": _write_poses}
+_MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
+    "input": (
+        _render_views,
+        {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation", "format"}
+        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "overwrite"},
+    ),
+    "back": (_render_back, {"cameras", "blend", "height", "kind", "z_depth", "overwrite"}),
+    "poses": (_write_poses, {"cameras", "overwrite"}),
+}
+"""Function of each mode, and the settings that it reads."""
 
 _NOT_CONTENT = {"figure", "output", "overwrite"}
 """Settings that do not change the files in an output folder."""

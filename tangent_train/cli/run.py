@@ -221,7 +221,9 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
     head = build_head(settings, data)
     # Pretrained weights are not fetched if a checkpoint replaces them.
     restored = getattr(settings, "resume", None) is not None
-    section = completed_settings(settings.network, data.in_channels, head.num_outputs, restored=restored)
+    section = completed_settings(
+        settings.network, data.in_channels, head.num_outputs, restored=restored
+    )
     if file is None:
         network = build_from_config(section, "network")
     else:

@@ -7,7 +7,7 @@ YAML files; their types are those of the class that they build.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
@@ -126,10 +126,6 @@ class PredictSettings(ImageSettings):
     (PLY); null = all but the last of either; color and overlay of a video are videos"""
     report: int = 12
     """images to show in report.html; 0 = no report"""
-    overwrite: bool = False
-    """true: replace earlier results"""
-    resume: bool = False
-    """true: keep existing results and predict the other images"""
     shard: str | int | None = None
     """part of the images to predict, e.g. 3/16, for several machines; null = all"""
     view_batch_size: int | None = None
@@ -500,6 +496,26 @@ def _defaults(kind: type[Settings]) -> dict[str, Any]:
         elif not (config_folder() / name).is_dir():
             values[name] = "???" if field.is_required() else plain(field.default)
     return values
+
+
+def check_read(settings: Settings, read: Collection[str]) -> None:
+    """Refuse changed settings that nothing reads beside the others.
+
+    Args:
+        settings: Settings of a command.
+        read: Names of the settings that are read.
+
+    Raises:
+        SettingError: Another setting has not its default.
+    """
+    for name in settings.model_dump(exclude_defaults=True):
+        if name not in read:
+            default = type(settings).model_fields[name].default
+            raise SettingError(
+                name,
+                found=getattr(settings, name),
+                expected=f"{'null' if default is None else default}: nothing reads it here",
+            )
 
 
 def plain(value: Any) -> Any:

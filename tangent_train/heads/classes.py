@@ -207,6 +207,7 @@ class ClassesHead(Head):
         mosaic = LabelMosaic(
             self, shape, blend, averaged=averaged or self.min_share > 0, device=device, spare=spare
         )
+        mosaic.valid = valid
         if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic
@@ -245,9 +246,10 @@ class ClassesHead(Head):
             return ""
         counts = np.zeros((len(self.class_names), _BINS), np.int64)
         for mosaic in mosaics:
-            counts += count_confidences(
-                mosaic.pixels().cpu().numpy(), mosaic.confidences(), len(self.class_names) - 1
-            )
+            valid = ... if mosaic.valid is None else mosaic.valid
+            labels, confidences = mosaic.pixels().cpu().numpy(), mosaic.confidences()
+            count = len(self.class_names) - 1
+            counts += count_confidences(labels[valid], confidences[valid], count)
         self.thresholds = class_thresholds(counts, self.min_confidence, self.min_share)
         least = zip(self.class_names[1:], self.thresholds[1:], strict=True)
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
@@ -318,9 +320,13 @@ class LabelMosaic(ScoreMosaic):
         shape: See `ScoreMosaic`.
         blend: See `ScoreMosaic`.
         **settings: See `ScoreMosaic`.
+
+    Attributes:
+        valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
     """
 
     facts: Mapping[str, Any] = MappingProxyType({})
+    valid: NDArray[np.bool_] | None = None
 
     def __init__(
         self, head: ClassesHead, shape: tuple[int, int], blend: Blend, **settings: Any

@@ -38,6 +38,11 @@ class Job:
     value: Any = None
     error: str = ""
 
+    @property
+    def is_frame(self) -> bool:
+        """True for a frame of a video."""
+        return self.path.suffix.lower() in VIDEO_SUFFIXES
+
     def then(self, step: Callable[[Job], Any]) -> Job:
         """Return the job after its next step; after an error, the step is skipped."""
         if self.error:

@@ -354,36 +354,3 @@ def test_settings_that_cannot_work(
     monkeypatch.chdir(room.parents[1])
     assert re.search(message, refused(**settings), re.DOTALL)
     assert not list(room.parents[1].glob("tan/*/*"))
-
-
-@pytest.mark.parametrize(
-    ("changes", "settings", "message"),
-    [
-        ({"face_003.png": None}, {}, r"found no face_003; expected one file for each"),
-        ({"face_003.npy": (32, 32, 3)}, {}, r"face_003\.npy and face_003\.png; .*cameras="),
-        (
-            {"face_003.png": (16, 16, 3)},
-            {},
-            r"003\.png: found uint8 .*; expected that of the first file: .*32",
-        ),
-        ({}, {"kind": "labels"}, "expected labels.*Choose kind=.*one channel"),
-        ({}, {"z_depth": True}, "z_depth: found true for color"),
-    ],
-)
-def test_results_that_cannot_be_used(
-    changes: dict[str, Any],
-    settings: dict[str, Any],
-    message: str,
-    rendered: Path,
-    tmp_path: Path,
-    monkeypatch: Patch,
-    refused: Refused,
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name, shape in changes.items():
-        if shape is None:
-            (rendered / name).unlink()
-        else:
-            write_pixels(rendered / name, np.zeros(shape, np.uint8))
-    assert re.search(message, refused(**{"back": rendered, "output": "back.png"} | settings))
-    assert not list(tmp_path.glob("back*"))

@@ -8,7 +8,6 @@ import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,28 +40,27 @@ def _started(*arguments: str) -> subprocess.Popen[bytes]:
     return subprocess.Popen(line, env=environment)
 
 
-def _images(shard: str) -> list[Any]:
-    content = json.loads(Path("out", "shards", shard).read_text())
-    return [entry["name"] for entry in content["images"]]
+def _finished(shard: str) -> list[str]:
+    file = Path("out", f"finished-{shard}.jsonl")
+    return [json.loads(line)["item"] for line in file.read_text().splitlines()]
 
 
-def test_one_of_them_is_killed_and_resumed(settings: list[str]) -> None:
+def test_one_of_them_is_killed_and_continued(settings: list[str]) -> None:
     settings = [*settings, "output=out"]
     killed, other = (_started(*settings, f"shard={n}/3") for n in (1, 2))
-    while not Path("out/shards/1-of-3.json").exists() or not _images("1-of-3.json"):
+    while not Path("out/finished-1-of-3.jsonl").exists():
         assert killed.poll() is None
         time.sleep(0.01)
     killed.send_signal(signal.SIGKILL)
     assert killed.wait() == -signal.SIGKILL
-    before = _images("1-of-3.json")
+    before = _finished("1-of-3")
     assert 0 < len(before) < COUNT // 3
     kept = Path("out", "labels", f"{before[0]}.png")
     time_ns = kept.stat().st_mtime_ns
-    again = [_started(*settings, f"shard={n}/3", "resume=true") for n in (1, 3)]
+    again = [_started(*settings, f"shard={n}/3") for n in (1, 3)]
     assert [process.wait(300) for process in (other, *again)] == [0, 0, 0]
     assert kept.stat().st_mtime_ns == time_ns
-    done = [_images(f"{n}-of-3.json") for n in (1, 2, 3)]
-    assert [sorted(names) for names in done] == [
+    assert [sorted(_finished(f"{n}-of-3")) for n in (1, 2, 3)] == [
         [f"{number:02}" for number in range(first, COUNT, 3)] for first in range(3)
     ]
     for path in Path("out").rglob(".partial*"):  # of the killed one
