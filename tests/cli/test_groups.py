@@ -22,7 +22,7 @@ def test_weathers_and_times_are_rows_of_the_results(run: Run, tmp_path: Path) ->
     found = results(tmp_path / "whole")["groups"]
     assert [group["group"] for group in found] == ["day", "fog", "night", "sun"]
     fog = ("data.weather=[fog]", "hydra.run.dir=fog")
-    run("evaluate", "checkpoint=whole/checkpoints/last.ckpt", *data, *fog)
+    run("evaluate", "checkpoint=whole/checkpoints/last.ckpt", "data=synpass", *data, *fog)
     alone = results(tmp_path / "fog")
     assert found[1]["images"] == alone["images"] == 2
     for name in ("miou", "macc", "miou_solid_angle", "macc_solid_angle"):

@@ -140,10 +140,13 @@ def test_photos_have_z_depth(tmp_path: Path, predict: Predict) -> None:
     np.testing.assert_allclose(points[:, 0].max(), 2 * half, rtol=0.01)
 
 
-def test_relative_depth_is_marked(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
-    tensors = {"weight": torch.zeros(1, 3, 3, 3), "bias": torch.ones(1)}
-    tensors["weight"][0, 0, 1, 1] = 0.1  # positive
-    write_depth_checkpoint(tmp_path / "relative.ckpt", "relative_depth", tensors)
+def test_relative_depth_is_marked(
+    tmp_path: Path, network: Path, predict: Predict, capsys: Capture
+) -> None:
+    relative = torch.load(network, weights_only=True)
+    relative["tangent_train"]["depth_kind"] = "relative_depth"
+    relative["state_dict"]["network.bias"] += 1  # positive
+    torch.save(relative, tmp_path / "relative.ckpt")
     write_pixels(tmp_path / "in" / "a.png", sphere(32))
     entry = predict(checkpoint=tmp_path / "relative.ckpt", align="none")["a"]["depth"]
     assert entry["unit"] == "relative"
