@@ -46,7 +46,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.label_map is not None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
-        loaded, notes = mapped.loaded, [f"Label map {label_map.name}: {mapped}."]
+        loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped}."]
     check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)

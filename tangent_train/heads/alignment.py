@@ -237,7 +237,9 @@ class Alignment:
         return values * added.exp() if is_disparity(self.kind) else values + added
 
 
-def align_views(parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = None) -> Alignment:
+def align_views(
+    parts: Sequence[ViewSamples], kind: DepthKind, mode: Align | None = None
+) -> Alignment:
     """Fit corrections of views to each other.
 
     Distances in the median view of each group of overlapping views keep their median, so that
