@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import copy
-import inspect
 from collections.abc import Mapping
-from itertools import product
 from typing import Any
 
 import torch
@@ -13,16 +11,14 @@ from torch import Tensor, nn
 
 from tangent_train.errors import SettingError
 
-_TRIALS = list(product(("meta", "cpu"), (256, 224)))
-"""Devices and sides of empty images to try: networks may depend on values, or have a fixed size."""
-
-_LISTED_DEPTH = 2
+_SIDE = 256
+"""Side of the empty image that is used to find the number of channels."""
 
 
 def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
     """Return the number of channels C' of the features ``(B, C', h', w')`` of a submodule.
 
-    A copy of the network is run on an empty image, on torch's meta device where possible.
+    A copy of the network is run on an empty image.
 
     Args:
         network: Network of images ``(B, C, h, w)``.
@@ -30,31 +26,19 @@ def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
         in_channels: Channels C of the images.
 
     Raises:
-        SettingError: There is no such stage, or it does not return one feature map.
+        SettingError: The submodule does not return one feature map.
     """
     found: list[object] = []
-    if stage in dict(network.named_modules()):
-        for device, side in _TRIALS:
-            found = []
-            probe = copy.deepcopy(network).eval().to(device)
-            probe.get_submodule(stage).register_forward_hook(
-                lambda _module, _inputs, result, found=found: found.append(result)
-            )
-            try:
-                with torch.no_grad():
-                    probe(torch.zeros(1, in_channels, side, side, device=device))
-                break
-            except Exception:
-                continue
+    probe = copy.deepcopy(network).eval()
+    probe.get_submodule(stage).register_forward_hook(lambda *given: found.append(given[2]))
+    with torch.no_grad():
+        probe(torch.zeros(1, in_channels, _SIDE, _SIDE))
     features = found[0] if len(found) == 1 else None
     if not isinstance(features, Tensor) or features.ndim != 4:
-        names = [name.removeprefix("network.") for name, _ in network.named_modules() if name]
-        shallow = [name for name in names if name.count(".") < _LISTED_DEPTH]
         raise SettingError(
             "network.stage",
             found=f"{stage!r} of {type(network).__name__}",
             expected="a submodule that is run once and returns one feature map (B, C, h, w)",
-            remedy=f"There are: {', '.join(dict.fromkeys(shallow))}.",
         )
     return features.shape[1]
 
@@ -73,19 +57,11 @@ class AuxiliaryHead(nn.Module):
         num_classes: Classes K.
 
     Raises:
-        SettingError: There is no such stage (the message lists the stages), or the network takes
-            more than images.
+        SettingError: The stage does not return one feature map.
     """
 
     def __init__(self, network: nn.Module, stage: str, in_channels: int, num_classes: int) -> None:
         super().__init__()
-        if "rays" in inspect.signature(network.forward).parameters:
-            raise SettingError(
-                "network.network",
-                found=type(network).__name__,
-                expected="a network that takes nothing but images",
-                remedy="Put the auxiliary head inside: a SphereContext of an AuxiliaryHead.",
-            )
         self.network = network
         self.auxiliary_head = nn.Conv2d(stage_channels(network, stage, in_channels), num_classes, 1)
         self._features: Tensor | None = None

@@ -102,8 +102,7 @@ class _TransformersNetwork(nn.Module):
         network: The network of transformers.
 
     Raises:
-        SettingError: transformers lacks the network or is missing, or `config` holds more than its
-            `architecture`.
+        SettingError: transformers lacks the network or is missing.
     """
 
     def __init__(
@@ -175,8 +174,7 @@ class HuggingFaceNetwork(_TransformersNetwork):
         is_universal: True if the network returns masks with classes.
 
     Raises:
-        SettingError: transformers lacks the network or is missing, or `config` holds more than its
-            `architecture`.
+        SettingError: transformers lacks the network or is missing.
     """
 
     def __init__(
@@ -239,8 +237,7 @@ class HuggingFaceDepthNetwork(_TransformersNetwork):
         network: The network of transformers.
 
     Raises:
-        SettingError: transformers lacks the network or is missing, or `config` holds more than its
-            `architecture`.
+        SettingError: transformers lacks the network or is missing.
     """
 
     def __init__(self, config: _Config, bgr: bool = False, padded: bool = False) -> None:

@@ -40,8 +40,7 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
         path: File, see `read_tensors`.
 
     Raises:
-        DataError: The file cannot be read, or several mappings or prefixes (``student.``,
-            ``teacher.``) with different tensors fit equally well.
+        DataError: The file cannot be read.
     """
     names = {_inner(name): name for name in network.state_dict()}
     given = {
@@ -54,30 +53,9 @@ def tensors_for(network: nn.Module, path: Path) -> dict[str, Tensor]:
         for outside, of_outside in _prefixes(tensors, names):
             fitting[place, outside, inside] = max(count, of_outside)
     best = [key for key, count in fitting.items() if count == max(fitting.values())]
-    best = [key for key in best if key[0] == "state_dict"] or best
-
-    def renamed(place: str, outside: str, inside: str) -> dict[str, Tensor]:
-        new = {n: inside + n.removeprefix(outside) for n in given[place] if n.startswith(outside)}
-        return {names.get(after, after): given[place][before] for before, after in new.items()}
-
-    place, prefix, _ = best[0]
-    first = renamed(*best[0])
-    for other in best[1:]:
-        second = renamed(*other)
-        is_part = other[0] == place and other[1].startswith(prefix)
-        if not is_part and not all(_equal(first.get(n), second.get(n)) for n in names.values()):
-            shown = dict.fromkeys(f"{place}.{prefix}".strip(".") for place, prefix, _ in best)
-            raise DataError(
-                path,
-                found=f"networks with different tensors: {', '.join(filter(None, shown))}",
-                expected="the tensors of one network, or of several one called state_dict",
-                remedy=f"Save one of them alone, for example {list(shown)[-1]}.",
-            )
-    return first
-
-
-def _equal(one: Tensor | None, other: Tensor | None) -> bool:
-    return one is other or (one is not None and other is not None and torch.equal(one, other))
+    place, outside, inside = next((key for key in best if key[0] == "state_dict"), best[0])
+    new = {n: inside + n.removeprefix(outside) for n in given[place] if n.startswith(outside)}
+    return {names.get(after, after): given[place][before] for before, after in new.items()}
 
 
 def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tangent_train.imports import import_own_packages
+from tangent_train.imports import check_own_packages
 
 if TYPE_CHECKING:
     from tangent_train.geometry import RingGrid, TangentGrid
@@ -30,7 +30,7 @@ __all__ = [
     "tangent_to_labels",
 ]
 
-import_own_packages()
+check_own_packages()
 
 _HOMES = {
     "RingGrid": "geometry",

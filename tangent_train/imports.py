@@ -4,38 +4,25 @@ from __future__ import annotations
 
 import io
 import logging
-import sys
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 
-def import_own_packages() -> None:
-    """Import ``models`` and ``datamodules`` of this package, not modules with these names.
+def check_own_packages() -> None:
+    """Refuse other modules named ``models`` or ``datamodules`` in place of those of this package.
 
     Raises:
-        ImportError: Another module with such a name has been imported.
+        ImportError: Such a module comes first on the path.
     """
-    root = str(Path(__file__).parents[1])
+    root = Path(__file__).parents[1]
     for name in ("datamodules", "models"):
-        other = None if name in sys.modules else find_spec(name)
-        sys.path.insert(0, root)
-        package = import_module(name)
-        sys.path.remove(root)
-        if package.__file__ != str(Path(root, name, "__init__.py")):
-            raise ImportError(
-                f"{package.__file__} is imported, but tangent-train has a package of this name. "
-                "Import tangent_train first, or rename the other one."
-            )
-        if other is not None and other.origin != package.__file__:
-            sys.stderr.write(
-                f"{other.origin} is not used: tangent-train has a package of this name. Rename it "
-                "to use its classes in a config.\n"
-            )
+        found = import_module(name).__file__
+        if found is None or Path(found).parents[1] != root:
+            raise ImportError(f"{found} has the name of a package of tangent-train: rename it")
 
 
 @contextmanager

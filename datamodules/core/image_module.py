@@ -96,6 +96,8 @@ class ImageDataModule(DataModule):
         if self.has_distances and (self.no_depth or self.no_distances):
             reason = f"{PIXEL_CLASSES}: {self.no_depth or self.no_distances}"
             raise SettingError("data.labels", found=DISTANCE, expected=reason)
+        if self.has_distances and self.classes is not None:
+            raise SettingError("data.classes", found=self.classes, expected="null, with distances")
         if with_depth and (self.no_depth or self.has_distances):
             expected = f"no depth: {self.no_depth or 'it is the target'}"
             raise SettingError("data.inputs", found=list(self.inputs), expected=expected)

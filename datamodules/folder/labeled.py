@@ -110,8 +110,9 @@ class LabeledFolder(ImageDataModule):
         paths = list(image_files.walk_files(folder))
         self.problems.note_absent(str(folder), {_name(folder, path) for path in paths} - names)
         folder = self.root / "images"
-        others = {_name(folder, path) for path in image_files.walk_files(folder)} - names
-        self.problems.note_absent(str(folder), others)
+        suffixes = {path.suffix.lower() for path in image_files.walk_files(folder)}
+        if others := sorted(suffixes - {*image_files.IMAGE_SUFFIXES}):
+            self.problems.warnings.append(f"{folder}: files {', '.join(others)} are not images")
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""

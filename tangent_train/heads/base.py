@@ -26,6 +26,7 @@ RGB = NDArray[np.uint8]
 Painter = Callable[[RGB, NDArray[Any]], RGB]
 """Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
 
+
 class Scores(NamedTuple):
     """Scores of a split, shares of 1 or in a unit; NaN if undefined.
 

@@ -55,6 +55,4 @@ class ImageClassHead(Head):
         """Return the accuracy over shapes, its mean over classes, and that of every class."""
         found = classification_scores(result)
         means = {"accuracy": found.accuracy, "class_accuracy": found.class_accuracy}
-        return Scores(
-            means, {"images": found.counts, "accuracy": found.of_class}, confusion=result
-        )
+        return Scores(means, {"images": found.counts, "accuracy": found.of_class}, confusion=result)

@@ -7,18 +7,19 @@ Their world frame is right-handed: x forward (to the middle column of the panora
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
+from pydantic import Field
 
 from tangent_train.errors import DataError
-from tangent_train.files import Text, check_fields, write_text
+from tangent_train.files import write_text
 from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
 
 CAMERAS_FILE = "cameras.json"
@@ -55,18 +56,55 @@ _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 """Matches lists of numbers, which are written on one line."""
 
 _EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
-_KINDS: dict[str, Any] = {"format": Literal["tangent images"], "source": dict, "images": list}
-_KINDS_OF_TANGENT: dict[str, Any] = {
-    "base_level": int,
-    "level": int,
-    "dim": int,
-    "icosahedron_rotation": list[list[float]] | None,
-}
-_KINDS_OF_VIEWS: dict[str, Any] = {
-    "views": list[list[list[float]]],
-    "overlapping": bool,
-    "camera": dict,
-}
+_Side = Annotated[int, Field(ge=2, le=_MOST_PIXELS)]
+_Matrix = Annotated[
+    list[Annotated[list[float], Field(min_length=3, max_length=3)]],
+    Field(min_length=3, max_length=3),
+]
+
+
+class _Source(pydantic.BaseModel):
+    file: str
+    height: _Side
+    width: _Side
+
+
+class _Camera(pydantic.BaseModel):
+    width: _Side
+    height: _Side
+    matrix: _Matrix
+
+
+class _Image(pydantic.BaseModel):
+    file: str
+    face: int
+
+
+class _CamerasJson(pydantic.BaseModel):
+    """Fields of a ``cameras.json`` that are read: of tangent images, or of other views."""
+
+    format: Literal["tangent images"]
+    source: _Source
+    camera: _Camera
+    images: list[_Image]
+    base_level: int | None = None
+    level: int = 0
+    dim: int | None = None
+    icosahedron_rotation: _Matrix | None = None
+    views: list[_Matrix] = []
+    overlapping: bool = False
+
+    def grid(self) -> PinholeGrid:
+        """Return the grid that the fields describe."""
+        if self.base_level is not None:
+            rotation = self.icosahedron_rotation
+            in_world = None if rotation is None else _in_world(np.array(rotation))
+            return TangentGrid(self.base_level, self.level, self.dim, in_world)
+        axes = np.array([FLIP_Y @ checked_rotation(np.array(view)) for view in self.views])
+        size, focal = (self.camera.height, self.camera.width), self.camera.matrix[0][0]
+        if not len(axes) or focal <= 0:
+            raise ValueError(f"{len(axes)} views with a focal length of {focal}")
+        return PinholeGrid(axes, size, 1 / focal, is_overlapping=self.overlapping)
 
 
 @dataclass(frozen=True)
@@ -152,45 +190,18 @@ def read_cameras(path: Path) -> CameraFile:
         DataError: The file is missing, or its content is not valid.
     """
     try:
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError) as error:
-        raise DataError(path, found=error, expected=_EXPECTED) from error
-    is_tangent = not (isinstance(content, Mapping) and "views" in content)
-    of_grid = _KINDS_OF_TANGENT if is_tangent else _KINDS_OF_VIEWS
-    fields = check_fields(path, content, _KINDS | of_grid, _EXPECTED)
-    kinds: dict[str, Any] = {"height": int, "width": int}
-    source = check_fields(path, fields["source"], kinds, _EXPECTED, "source")
-    kinds = {"file": Text, "face": int}
-    images = [check_fields(path, i, kinds, _EXPECTED, "images") for i in fields["images"]]
-    shape = source["height"], source["width"]
-    faces, files = (tuple(image[name] for image in images) for name in ("face", "file"))
-    if not 1 <= min(shape) <= max(shape) <= _MOST_PIXELS:
-        raise DataError(path, found=f"a source of {shape} pixels", expected=_EXPECTED)
-    if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
-        raise DataError(path, found="an image twice", expected=_EXPECTED)
-    try:
+        content = _CamerasJson.model_validate_json(path.read_bytes())
+        faces, files = zip(*((image.face, image.file) for image in content.images), strict=True)
+        if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
+            raise ValueError("an image twice")  # noqa: TRY301
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
-            grid = _grid_of(path, fields)
+            grid = content.grid()
         grid.face_indices(faces)
-    except (ValueError, OverflowError) as error:
-        raise DataError(path, found=error, expected=_EXPECTED) from error
-    return CameraFile(str(fields["source"].get("file")), shape, grid, faces, files)
-
-
-def _grid_of(path: Path, fields: Mapping[str, Any]) -> PinholeGrid:
-    """Return the grid that the fields of a file describe."""
-    if "views" not in fields:
-        rotation = fields["icosahedron_rotation"]
-        in_world = rotation and _in_world(np.array(rotation, np.float64).reshape(3, 3))
-        return TangentGrid(fields["base_level"], fields["level"], fields["dim"], in_world)
-    kinds: dict[str, Any] = {"width": int, "height": int, "matrix": list[list[float]]}
-    camera = check_fields(path, fields["camera"], kinds, _EXPECTED, "camera")
-    axes = np.array([FLIP_Y @ checked_rotation(view) for view in fields["views"]])
-    size = camera["height"], camera["width"]
-    focal = float(np.array(camera["matrix"], np.float64).reshape(3, 3)[0, 0])
-    if not (len(axes) and 2 <= min(size) <= max(size) <= _MOST_PIXELS and 0 < focal < math.inf):
-        raise ValueError(f"a camera of {size} pixels with a focal length of {focal}")
-    return PinholeGrid(axes, size, 1 / focal, is_overlapping=fields["overlapping"])
+    except (OSError, ValueError, OverflowError) as error:  # pydantic's are ValueErrors
+        found = error if isinstance(error, OSError) else str(error).replace("\n", " ")
+        raise DataError(path, found=found, expected=_EXPECTED) from error
+    source = content.source
+    return CameraFile(source.file, (source.height, source.width), grid, faces, files)
 
 
 @dataclass(frozen=True)

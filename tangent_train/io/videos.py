@@ -23,9 +23,10 @@ VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
 _READERS = "mov,matroska,avi"
 """FFmpeg's demuxers of these formats. Other demuxers read playlists, scripts and further files."""
 
-_EBML = (b"\x1a\x45\xdf\xa3", b"\x18\x53\x80\x67")  # Matroska's header, and its segment
-_BOXES = b"ftyp styp moov moof mdat mfra free skip wide meta sidx ssix prft pdin emsg uuid".split()
-_BOX_HEAD = 8  # bytes
+_MICROSECONDS = 10**6
+_MISSING_S = 0.5
+"""Part of the declared duration that a whole video may lack: frames are not always as long."""
+
 _SHOWN_VP8 = 0x10
 _STRAIGHT = 0.02  # tolerance of a matrix: about a degree
 _UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
@@ -37,37 +38,38 @@ _BT709 = 1  # of the matrix, primaries and transfer: what players assume of larg
 
 
 def read_video_size(path: Path) -> tuple[int, int, int]:
-    """Return the number of frames that players show, and rows and columns of an upright frame.
+    """Return the number of frames that a video declares, and rows and columns of an upright frame.
 
     All packets are read; only the first frame is decoded.
 
     Raises:
-        DataError: The video cannot be read, is truncated or damaged, or has no frames.
+        DataError: The video cannot be read, or has no frames.
         SettingError: PyAV is missing.
     """
-    _check_end(path)
-    first, packets, times = None, 0, []
-    with _logged_errors(path) as errors, _opened(path) as (container, stream):
-        stream.thread_type = "NONE"  # errors of other threads are not logged here
-        for packet in container.demux(stream):
-            if packet.is_corrupt:
-                raise _damaged(path, f"packet {packets} is incomplete")
-            if packet.size:
-                packets += 1
-                times += [packet.pts] if _is_shown(packet) else []
-            first = first or next(iter(packet.decode()), None)
+    first, packets, hidden, end_s, times = None, 0, 0, 0.0, []
+    with _opened(path) as (container, stream):
+        for packet in container.demux():
+            if packet.pts is not None:
+                end = (packet.pts + (packet.duration or 0)) * packet.time_base
+                end_s = max(end_s, float(end))
+            if packet.stream == stream:
+                packets += packet.size > 0
+                hidden += packet.size > 0 and not _is_shown(packet)
+                times += [packet.pts] if packet.size and _is_shown(packet) else []
+                first = first or next(iter(packet.decode()), None)
         indexed = sum(entry.size > 0 for entry in stream.index_entries)
-    if packets < indexed:
-        raise _damaged(path, f"{packets} of {indexed} packets")
-    if errors:
-        raise _damaged(path, errors[0])
+        # MP4 files have an index of all frames, the others a duration.
+        is_cut = (container.duration or 0) / _MICROSECONDS - end_s > _MISSING_S
+        is_cut &= "mov" not in container.format.name
+        declared = max(indexed, packets + is_cut) - hidden
     if first is None:
         raise DataError(path, found="no frame that can be decoded", expected="a whole video")
     check_pixels(path, first.height, first.width)
     rows, columns = _upright(first, _orientation(path, first)).shape[:2]
     # Cutting without encoding leaves frames at the start that refer to missing ones.
     start = first.pts
-    return sum(None in (time, start) or time >= start for time in times), rows, columns
+    early = sum(None not in (time, start) and time < start for time in times)
+    return declared - early, rows, columns
 
 
 def read_frames(
@@ -84,7 +86,8 @@ def read_frames(
         Function that converts a frame to upright RGB, ``(H, W, 3)``.
 
     Raises:
-        DataError: A frame is damaged, or the number of frames differs.
+        DataError: A frame is damaged, or the video ends before its declared length: after the
+            frames that were read.
     """
     for frame in _frames(path, read_video_size(path)[0] if frames is None else frames, every):
         yield partial(_upright, *frame)
@@ -100,12 +103,7 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
                 if frame.is_corrupt:
                     raise _damaged(path, f"frame {number}, and frames before that refer to it")
                 # Within an H.264 stream, only the first frame may have the matrix.
-                given = _orientation(path, frame)
-                signs = given if number == 0 else signs
-                if "DISPLAYMATRIX" in frame.side_data and (given != signs).any():
-                    found = f"another orientation from frame {number} on"
-                    expects = "a video of one orientation"
-                    raise DataError(path, found=found, expected=expects, remedy=_UPRIGHT)
+                signs = _orientation(path, frame) if number == 0 else signs
                 if number % every == 0:
                     yield frame, signs
         if number + 1 != expected:
@@ -145,59 +143,6 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
 def _file_url(path: Path) -> str:
     # A bare name may select another protocol, e.g. "http:…".
     return f"file:{path.absolute()}"
-
-
-@contextmanager
-def _logged_errors(path: Path) -> Iterator[list[str]]:
-    """Collect the errors that FFmpeg's Matroska demuxer logs when it skips damaged parts."""
-    with of_extra("video", path):
-        import av.logging as log
-    errors: list[str] = []
-    level, skips = log.get_level(), log.get_skip_repeated()
-    log.set_level(log.ERROR)
-    log.set_skip_repeated(False)  # another file may have the same errors
-    try:
-        with log.Capture() as messages:
-            yield errors
-        errors += [text.strip() for _, name, text in messages if name.startswith("matroska")]
-    finally:
-        log.set_level(level)
-        log.set_skip_repeated(skips)
-
-
-def _check_end(path: Path) -> None:
-    """Refuse a file that ends within one of its outermost elements, which FFmpeg accepts.
-
-    These are EBML elements (RFC 8794), RIFF chunks of AVI, and boxes (ISO 14496-12).
-    """
-    end, is_box = 0, False
-    try:
-        with path.open("rb") as file:
-            size = path.stat().st_size
-            while head := file.read(16):
-                # Zeros may fill the file; fewer than four may be the start of a size.
-                if is_box and len(head) < _BOX_HEAD and (len(head) < 4 or any(head)):
-                    raise _damaged(path, f"it ends at byte {size}, within the header of a box")
-                is_box = head[4:8] in _BOXES
-                if head[:4] in _EBML and len(head) > 4:
-                    width = 9 - head[4].bit_length()  # of the length
-                    length = int.from_bytes(head[4 : 4 + width]) % (1 << 7 * width)
-                    if length == (1 << 7 * width) - 1:  # unknown: a live stream
-                        break
-                    length += 4 + width
-                elif head[:4] == b"RIFF":
-                    length = 8 + int.from_bytes(head[4:8], "little")
-                else:
-                    length = int.from_bytes(head[:4])
-                    if length == 1:  # the length follows
-                        length = int.from_bytes(head[8:]) if len(head) == 16 else 16
-                    if length < _BOX_HEAD or not head[4:8].isalnum():  # the last box, or none
-                        break
-                if (is_box or head[:4] in (*_EBML, b"RIFF")) and end + length > size:
-                    raise _damaged(path, f"it ends at byte {size} of {end + length}")
-                end = file.seek(end + length)
-    except OSError as error:
-        raise DataError(path, found=error, expected="a video that can be read") from error
 
 
 def _is_shown(packet: Any) -> bool:

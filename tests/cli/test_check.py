@@ -90,7 +90,7 @@ def test_distances_are_counted_and_stored(tmp_path: Path, capsys: Capture) -> No
     stores = tmp_path / "stores"
     settings = ["data=folder", "level=4", f"data.root='{tmp_path}'", "data.val_fraction=0"]
     prepare(composed_settings("prepare", *settings, f"data.cache='{stores}'", "task=depth"))
-    stored = np.load(next(stores.glob("32x64_*/a.npy")))
+    stored = np.load(next(stores.rglob("a.*.npy")))
     assert stored.dtype.names == ("rgb", "labels")
     assert np.unique(stored["labels"]).tolist() == [0, 3 * 512]
 

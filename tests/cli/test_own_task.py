@@ -57,9 +57,8 @@ def test_a_head_of_ones_own_trains_evaluates_reports_and_resumes(
     (panel,) = (folder / "panels").iterdir()
     assert (decoded(panel.read_bytes()) == (255, 0, 0)).all(-1).any(), "its own picture"
 
-    views = "representation.base_level=0"
-    typed = (SETTINGS[0], "task=share", *SMALL_ROOMS, rooms, views, "hydra.run.dir=again")
-    run("evaluate", *typed, f"checkpoint={folder}/checkpoints/best.ckpt")
+    typed = (SETTINGS[0], "data=synthrooms", "task=share", *SMALL_ROOMS, rooms)
+    run("evaluate", *typed, f"checkpoint={folder}/checkpoints/best.ckpt", "hydra.run.dir=again")
     again = json.loads(Path("again/results.json").read_text())
     assert again["scores"]["mae"] == results["scores"]["mae"]
     capsys.readouterr()

@@ -143,9 +143,9 @@ def test_photos_have_z_depth(tmp_path: Path, predict: Predict) -> None:
 def test_relative_depth_is_marked(
     tmp_path: Path, network: Path, predict: Predict, capsys: Capture
 ) -> None:
-    relative = torch.load(network, weights_only=True) | {"depth_kind": "relative_depth"}
-    tensors = relative["state_dict"]
-    next(v for name, v in tensors.items() if name.endswith("bias")).add_(1)  # positive
+    relative = torch.load(network, weights_only=True)
+    relative["tangent_train"]["depth_kind"] = "relative_depth"
+    relative["state_dict"]["network.bias"] += 1  # positive
     torch.save(relative, tmp_path / "relative.ckpt")
     write_pixels(tmp_path / "in" / "a.png", sphere(32))
     entry = predict(checkpoint=tmp_path / "relative.ckpt", align="none")["a"]["depth"]

@@ -72,7 +72,13 @@ def test_weights_are_never_fetched(section: dict[str, Any], monkeypatch: Any) ->
         *("torchvision.models.get_model", "torchvision.models._api.inspect.os.system"),
         *("timm.models.load_checkpoint", "timm.models.helpers.torch.load", "timm.absent"),
         *("segmentation_models_pytorch.from_pretrained", "tangent_train.rendering.tables"),
-        *("tangent_train.files.write_text", "datamodules.synthrooms.datamodule.SynthRooms", "lightning.Trainer", 3, None),
+        *(
+            "tangent_train.files.write_text",
+            "datamodules.synthrooms.datamodule.SynthRooms",
+            "lightning.Trainer",
+            3,
+            None,
+        ),
     ],
 )
 def test_nothing_else_is_called(target: Any) -> None:

@@ -18,7 +18,7 @@ from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 import datamodules
 from datamodules.cityscapes import CLASSES as CITYSCAPES
 from datamodules.cityscapes import THIRTEEN
-from datamodules.core.label_map import LabelMap
+from datamodules.core.label_map import LabelMap, plain_name
 from datamodules.matterport360 import CLASSES as MATTERPORT
 from datamodules.stanford2d3ds.files import CLASSES as STANFORD
 from datamodules.stanford2d3ds.files import EIGHT
@@ -28,7 +28,7 @@ from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.checkpoints.scores import Groups
-from tangent_train.errors import SettingError
+from tangent_train.errors import DataError, SettingError
 from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
 from tests.inference.trained import TANGENT, trained_network
 
@@ -72,12 +72,13 @@ def test_a_map_names_published_classes(name: str) -> None:
     assert found.names == targets
     synonyms = {part.strip() for text in published for part in text.split(",")}
     synonyms |= {"dining table", "potted plant", "tv monitor"}  # VOC's, as others write them
-    assert not {str(key) for key, label in found.labels.items() if label} - synonyms
+    assert not found.labels.keys() - set(map(plain_name, synonyms))
     mapped = map_classes(_trained(published), found)
-    for label, target in enumerate(targets, start=1):
-        names = {key for key, to in found.labels.items() if to == label}
+    for target, label in zip(targets, range(1, 255), strict=False):
+        names = [key for key, of in found.labels.items() if of == label]
         assert bool(names) == bool(mapped.classes[target])
-        assert {text.split(",")[0].strip() for text in mapped.classes[target]} <= names
+        firsts = {text.split(",")[0].strip() for text in mapped.classes[target]}
+        assert set(map(plain_name, firsts)) <= set(names)
     assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
 
 
@@ -165,3 +166,22 @@ def test_a_map_can_follow_a_map() -> None:
     twice = map_classes(once, LabelMap.of({"all": ["outdoor"]})).loaded
     assert [list(group) for group in twice.groups] == [[1], [0, 3, 2]]
     assert twice.network(torch.randn(1, 4, 12, 20)).shape == (1, 2, 12, 20)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"source": 1, "classes": {"wall": ["wall"]}}, "found source=1"),
+        ({"classes": {"wall\n": ["wall"]}}, "found names="),
+        ({"classes": {"wall": ["a\u001b[2J"]}}, "found wall="),
+        ({"classes": {"wall": []}}, "found no source class; expected 1 to"),
+        ({"classes": {str(k): [f"c{k}"] for k in range(256)}}, "found 256 classes"),
+        ({"classes": {"wall": ["wall", "mirror"], "glass": ["Mirror"]}}, "found mirror more than"),
+    ],
+)
+def test_unusable_files_are_refused(content: Any, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "map.json"
+    path.write_text(json.dumps(content))
+    with pytest.raises(DataError, match=message) as caught:
+        load_label_map(str(path))
+    assert caught.value.subject == path

@@ -66,28 +66,17 @@ def test_pixels_are_at_the_positions_in_the_file(grid: PinholeGrid, tmp_path: Pa
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"format": "other"}, "found format='other'"),
+        ({"format": "other"}, "format"),
         ({"dim": 2}, "at least"),
-        ({"dim": "gone"}, "no dim"),
-        ({"source": {"file": "a.png", "height": 0, "width": 4}}, r"\(0, 4\) pixels"),
-        ({"source": {"file": "a.png", "height": 4, "width": 2**20 + 1}}, "pixels"),
+        ({"source": {"file": "a.png", "height": 0, "width": 4}}, "source.height"),
         ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
-        ({"views": []}, "a camera of"),
+        ({"views": []}, "0 views"),
         ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, -1]]]}, "rotation"),
-        ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]]}, "indices 0 to 0"),
-        (
-            {"camera": {"width": 21, "height": 1, "matrix": np.eye(3).tolist()}},
-            r"of \(1, 21\) pixels",
-        ),
-        (
-            {"camera": {"width": 21, "height": 30, "matrix": (-9 * np.eye(3)).tolist()}},
-            "length of -9",
-        ),
-        ({"camera": CAMERA | {"matrix": [[]]}}, "reshape"),
-        ({"images": [{"file": "a.png"}]}, "no face"),
+        ({"camera": CAMERA | {"matrix": (-9 * np.eye(3)).tolist()}}, "length of -9"),
+        ({"camera": CAMERA | {"matrix": [[]]}}, "camera.matrix"),
+        ({"images": [{"file": "a.png"}]}, "images.0.face"),
         ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),
         ({"images": [{"file": "a.png", "face": 1}, {"file": "a.jpg", "face": 2}]}, "twice"),
-        ({"images": [{"file": "a.png", "face": 1}, {"file": "b.png", "face": 1}]}, "twice"),
     ],
 )
 def test_inconsistent_files_are_refused(
@@ -96,7 +85,7 @@ def test_inconsistent_files_are_refused(
     path = tmp_path / "cameras.json"
     write_cameras(path, _cameras(GRIDS[2 if {"views", "camera"} & changes.keys() else 0]))
     content = json.loads(path.read_text()) | changes
-    path.write_text(json.dumps({key: value for key, value in content.items() if value != "gone"}))
+    path.write_text(json.dumps(content))
     with pytest.raises(DataError, match=rf"cameras\.json: .*{message}"):
         read_cameras(path)
 

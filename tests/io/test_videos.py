@@ -204,82 +204,34 @@ def test_other_angles_are_refused(tmp_path: Path) -> None:
         read_video_size(path)
 
 
-def _orientation_sei(quarter_turns: int) -> bytes:
-    """Quarter quarter_turns counterclockwise (H.264, D.1.27), with the length of the NAL unit."""
-    bits = f"000{quarter_turns % 4 << 14:016b}10100"
-    return b"\0\0\0\x07\x06\x2f\x03" + int(bits, 2).to_bytes(3) + b"\x80"
-
-
-@pytest.mark.parametrize("quarter_turns", ["1", "1 1", "3 3", "0 3", "1 3", "3 2", "0 1"])
-def test_the_orientation_in_an_h264_stream_is_that_of_all_frames(
-    tmp_path: Path, quarter_turns: str
-) -> None:
-    """In quarter quarter_turns of the first frame and of frame 6; the others have no matrix."""
-    whole, path = _write(tmp_path / "whole.mp4", "forward"), tmp_path / "a.mp4"
-    first, *later = map(int, quarter_turns.split())
-    places = {0: first} | dict.fromkeys([6] if later else [], *later)
-    with av.open(str(whole)) as source, av.open(str(path), "w") as output:
-        stream = output.add_stream_from_template(source.streams.video[0])
-        for number, packet in enumerate(p for p in source.demux(video=0) if p.size):
-            content = bytes(packet)
-            if number in places:
-                content = _orientation_sei(places[number]) + content
-            written = av.Packet(content)
-            written.pts, written.dts, written.time_base = packet.pts, packet.dts, packet.time_base
-            written.is_keyframe, written.stream = packet.is_keyframe, stream
-            output.mux(written)
-    if later and later != [first]:
-        with pytest.raises(DataError, match=r"a\.mp4: found another orientation from frame 6 on"):
-            _read(path)
-        return
-    shown = [np.rot90(rgb, first) for rgb in _decoded(whole)]
-    assert read_video_size(path) == (_COUNT, *shown[0].shape[:2])
-    np.testing.assert_array_equal(_read(path), shown)
-    np.testing.assert_array_equal([frame() for frame in read_frames(path, every=5)], shown[::5])
-
-
 @pytest.mark.parametrize(
     ("name", "settings"),
     [
         ("x264.mp4", {"movflags": "faststart"}),
-        ("x264.mov", {"movflags": "frag_keyframe+empty_moov"}),
-        ("x264.mkv", {"sound": 3}),
+        ("x264.mkv", {}),
         ("vp9.webm", {}),
         ("mpeg4.avi", {}),
     ],
 )
-def test_truncated_videos_are_refused(tmp_path: Path, name: str, settings: Any) -> None:
+def test_truncated_videos_are_an_error_after_their_frames(
+    tmp_path: Path, name: str, settings: Any
+) -> None:
     path = _write(tmp_path / name, name.partition(".")[0], **settings)
-    data = path.read_bytes()
-    tags = (b"mdat", b"moof", b"mfra", b"\x1f\x43\xb6\x75", b"00dc")
-    starts = {find(tag) for tag in tags if tag in data for find in (data.find, data.rfind)}
-    end, is_fragmented = len(data), b"moof" in data
-    cuts = {end * part // 19 for part in range(19)} | {start + 4 for start in starts} | {end - 1}
-    # Within the header of a box, which starts 4 bytes before its name.
-    cuts |= {start - cut for start in starts for cut in range(-3, 4) if is_fragmented}
-    for length in cuts:
-        path.write_bytes(data[:length])
-        with pytest.raises(DataError, match=rf"{name}: found"):
-            read_video_size(path)
+    whole, data = _decoded(path), path.read_bytes()
+    for part in (0.2, 0.4, 0.6):
+        path.write_bytes(data[: round(part * len(data))])
+        kept = []
+        with pytest.raises(DataError, match=rf"{name}: found"):  # noqa: PT012
+            for frame in read_frames(path):
+                kept.append(frame())  # noqa: PERF401 - those before the error
+        assert len(kept) < _COUNT
+        np.testing.assert_array_equal(kept[:-1], whole[: len(kept)][:-1])
 
 
 def _packets(path: Path) -> list[tuple[int, int]]:
     """Place and size of the packets in a file."""
     with av.open(str(path)) as container:
         return [(packet.pos, packet.size) for packet in container.demux(video=0) if packet.size]
-
-
-@pytest.mark.parametrize("name", ["x264.mkv", "vp8.webm", "vp9.webm", "mpeg4.avi"])
-def test_frames_lost_in_the_middle_are_an_error(tmp_path: Path, name: str) -> None:
-    """Headers of packets are overwritten; the second of two such files is refused as well."""
-    path = _write(tmp_path / name, name.partition(".")[0])
-    data = bytearray(path.read_bytes())
-    start, _ = _packets(path)[_COUNT // 2]
-    data[start - 8 : start + 8] = bytes(16)
-    for copy in (path, tmp_path / f"again-{name}"):
-        copy.write_bytes(data)
-        with pytest.raises(DataError, match="found a truncated or damaged video"):
-            read_video_size(copy)
 
 
 @pytest.mark.parametrize("name", ["forward.mp4", "forward.mkv", "forward.avi", "av1.webm"])
@@ -295,18 +247,6 @@ def test_a_damaged_frame_is_an_error_after_those_before(tmp_path: Path, name: st
             kept.append(frame())  # noqa: PERF401 - those before the error
     assert 0 < len(kept) < _COUNT
     np.testing.assert_array_equal(kept, whole[: len(kept)])
-
-
-def test_an_incomplete_last_packet_in_a_box_without_a_size(tmp_path: Path) -> None:
-    path = _write(tmp_path / "a.mp4", movflags="faststart")
-    data = bytearray(path.read_bytes())
-    place = data.index(b"mdat")
-    data[place - 4 : place] = bytes(4)  # to the end of the file
-    path.write_bytes(data)
-    assert read_video_size(path)[0] == _COUNT
-    path.write_bytes(data[:-5])
-    with pytest.raises(DataError, match=r"packet 11 is incomplete"):
-        read_video_size(path)
 
 
 def test_a_video_without_a_frame_and_another_number_of_frames(tmp_path: Path) -> None:

@@ -104,44 +104,6 @@ def _part(tensors: dict[str, Tensor], layers: str) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in tensors.items() if name[0] in layers}
 
 
-def test_two_state_dicts_of_equal_right_are_refused(tmp_path: Path) -> None:
-    network = _network()
-    tensors = network.state_dict()
-    torch.save({"model": tensors, "model_ema": _changed(tensors)}, tmp_path / "x.pt")
-    with pytest.raises(
-        DataError, match=r"networks with different tensors: model, model_ema; .*Save one of"
-    ):
-        initialize(network, tmp_path / "x.pt")
-    endless: dict[str, Any] = {"a": {"b": torch.ones(1)}}
-    endless["a"]["again"] = endless
-    torch.save(endless, tmp_path / "endless.pt")
-    with pytest.raises(DataError, match=r"endless\.pt: found no tensor that fits, but a\.b"):
-        initialize(network, tmp_path / "endless.pt")
-    torch.save({"epoch": 3}, tmp_path / "none.pt")
-    with pytest.raises(DataError, match=r"none\.pt: found no named tensors; expected a state dict"):
-        initialize(network, tmp_path / "none.pt")
-
-
-@pytest.mark.parametrize("prefixes", [("student.", "teacher."), ("ema_net.module.", "net.")])
-@pytest.mark.parametrize("wrap", [dict, lambda tensors: {"epoch": 1, "state_dict": tensors}])
-def test_two_networks_in_one_state_dict_are_refused(
-    wrap: Any, prefixes: tuple[str, str], tmp_path: Path
-) -> None:
-    """Unless their tensors are equal."""
-    tensors = _network().state_dict()
-    first, second = prefixes
-    for found in tensors, _changed(tensors):
-        content = _named(first, tensors) | _named(second, found)
-        torch.save(wrap(content), tmp_path / "x.pt")
-        if found is tensors:
-            initialize(_network(), tmp_path / "x.pt")
-            continue
-        with pytest.raises(DataError, match=r"x\.pt: found networks with different") as raised:
-            initialize(_network(), tmp_path / "x.pt")
-        assert first.strip(".") in str(raised.value)
-        assert second.strip(".") in str(raised.value)
-
-
 def test_depth_starts_at_zero_and_other_classes_untrained(tmp_path: Path) -> None:
     rgb, network = _network(3, 21), _network(4, 5)
     before = {name: tensor.clone() for name, tensor in network.state_dict().items()}

@@ -82,7 +82,7 @@ def test_channels_may_be_last(tmp_path: Path) -> None:
     torch.testing.assert_close(last(images), images)
     to_last = helper.make_node("Transpose", ["images"], ["scores"], perm=[0, 2, 3, 1])
     mixed = OnnxNetwork(write_onnx(tmp_path / "mixed.onnx", to_last, shape=("b", 3, 4, 5)))
-    assert mixed.image_size == (4, 5)
+    assert mixed.fixed_size == (4, 5)
     torch.testing.assert_close(mixed(images), images)
 
 

@@ -78,5 +78,4 @@ def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
         "tangent_train",
         "tangent_train.errors",
         "tangent_train.imports",
-        "tangent_train.config.build",
     }

@@ -12,7 +12,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from models.huggingface import HuggingFaceDepthNetwork, architecture
 from tangent_train.checkpoints.distances import depth_of_output
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import read_description
@@ -21,7 +20,6 @@ from tangent_train.photo_networks import huggingface, import_network
 from tangent_train.photo_networks.huggingface import declared_kind
 from tests.photo_networks import depth_networks as depth
 from tests.photo_networks.huggingface_networks import change_json, imported, saved
-from tests.security.attacks import undeclared_settings
 
 CONFIG = Path("config.json")
 METRIC = {"model_type": "depth_anything", "depth_estimation_type": "metric"}
@@ -115,13 +113,6 @@ def test_configs_that_do_not_fit_are_refused(changed: Any, expected: str, tmp_pa
     change_json(tmp_path / "config.json", **changed)
     with pytest.raises(DataError, match=expected):
         imported(tmp_path, depth="relative_disparity")
-
-
-def test_undeclared_settings_are_refused(tmp_path: Path) -> None:
-    config = architecture(depth.depth_anything()[0].config.to_dict())
-    for attack in undeclared_settings(tmp_path):
-        with pytest.raises(SettingError, match=r"network\.config"):
-            HuggingFaceDepthNetwork(config | attack)
 
 
 def test_depth_pro_takes_images_of_one_size(tmp_path: Path) -> None:

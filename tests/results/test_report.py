@@ -205,7 +205,11 @@ def test_a_transfer_compares_panoramas_with_photos_of_as_much_fine_tuning() -> N
 
 def test_reports_of_shapes_have_the_published_scores_of_the_same_rotation() -> None:
     classes = [{"class": name, "images": 3, "accuracy": 0.5} for name in MODELNET40]
-    settings = {"data._target_": "datamodules.modelnet40.shapes.ModelNet40", "level": 5, "name": "shapes"}
+    settings = {
+        "data._target_": "datamodules.modelnet40.shapes.ModelNet40",
+        "level": 5,
+        "name": "shapes",
+    }
     settings["representation.base_level"] = 0
     scores = {"accuracy": 0.8, "class_accuracy": 0.7}
     columns = ImageClassHead.columns

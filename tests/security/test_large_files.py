@@ -14,7 +14,7 @@ from PIL import Image, ImageFile
 from tangent_train.errors import DataError
 from tangent_train.io.gpano import read_area
 from tangent_train.io.pixel_files import read_depth_m, read_image_size, read_pixels, read_rgb
-from tests.slow.fuzz.mutation import sealed_png
+from tests.datamodules.data_files import png_chunk
 
 Read = Callable[[Path], Any]
 
@@ -31,7 +31,11 @@ def _png(path: Path, width: int, height: int) -> Path:
     """Write a file with 16 bits per pixel whose header has this size."""
     Image.new("I;16", (1, 1)).save(path, format="PNG")
     content = path.read_bytes()
-    path.write_bytes(sealed_png(content[:16] + struct.pack(">II", width, height) + content[24:]))
+    path.write_bytes(
+        content[:8]
+        + png_chunk(b"IHDR", struct.pack(">II", width, height) + content[24:29])
+        + content[33:]
+    )
     return path
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,15 +10,13 @@ import huggingface_hub
 import pytest
 import segmentation_models_pytorch  # type: ignore[import-untyped]
 import torch
-from transformers import quantizers
 
-from tangent_train.checkpoints.loaded import load_network
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import smp
 from tests.photo_networks import huggingface_networks as networks
-from tests.security.attacks import CANARY, undeclared_settings
+from tests.security.attacks import CANARY
 from tests.security.watch import watched
 
 _GPT2 = {"model_type": "timm_backbone", "backbone": "gpt2"}
@@ -42,33 +39,6 @@ def test_an_image_processor_runs_and_fetches_nothing(folder: Path, tmp_path: Pat
     with watched(tmp_path / "forbidden") as happened:
         networks.imported(folder)
     assert happened == []
-
-
-def test_undeclared_settings_are_left_out_or_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Undeclared settings are left out when a folder is imported, and refused in a checkpoint."""
-
-    def load_quantizer(*_: Any, **__: Any) -> None:
-        raise AssertionError("a quantizer")
-
-    monkeypatch.setattr(quantizers.auto.AutoHfQuantizer, "from_config", load_quantizer)
-    networks.saved(networks.mask2former, tmp_path / "net")
-    path = tmp_path / "net" / "config.json"
-    honest = json.loads(path.read_text())
-    networks.imported(tmp_path / "net")
-    content = torch.load(tmp_path / "net" / "imported.ckpt", weights_only=True)
-    hostile = tmp_path / "hostile.ckpt"
-    places: Any = ((), ("backbone_config",))
-    for attack in undeclared_settings(tmp_path / "forbidden"):
-        with watched(tmp_path / "forbidden") as happened:
-            path.write_text(json.dumps(_with(_with(honest, places[1], attack), (), attack)))
-            networks.imported(tmp_path / "net")
-            for place in places:
-                torch.save(_with(content, ("config", "network", "config", *place), attack), hostile)
-                with pytest.raises(DataError, match=r"hostile\.ckpt: found .*network\.config"):
-                    load_network(hostile)
-        assert happened == [], attack
 
 
 def _with(content: Any, place: tuple[str, ...], more: dict[str, Any]) -> Any:

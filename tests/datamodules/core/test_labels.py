@@ -20,7 +20,6 @@ from tests.conftest import fabricate
 STREETS = [0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 11, 12, 12, 12, -1, 12, 12]
 SYNPASS = [2, 4, -1, 11, 5, 0, 0, 1, 8, 12, 3, 7, 10, -1, -1, -1, -1, 6, -1, -1, -1, 9]
 PUBLISHED: list[tuple[type[ImageDataModule], str, list[int]]] = [
-    (Stanford2D3DS, "8", [-1, -1, -1, 0, 1, -1, -1, 2, 3, 4, 5, 6, 7]),
     (Cityscapes, "13", STREETS),
     (DensePASS, "13", STREETS),
     (SynPASS, "13", SYNPASS),
@@ -29,20 +28,19 @@ PUBLISHED: list[tuple[type[ImageDataModule], str, list[int]]] = [
 
 @pytest.mark.parametrize(("data", "name", "key"), PUBLISHED)
 def test_a_set_is_the_published_one(data: type[ImageDataModule], name: str, key: list[int]) -> None:
-    sets = data.class_sets
-    every = next(iter(sets.values()))
-    labels = np.arange(len(key) + 1, dtype=np.uint8)[None]
-    np.testing.assert_array_equal(every.relabel(labels), labels)
-    np.testing.assert_array_equal(sets[name].relabel(labels)[0], [0, *np.add(key, 1)])
-    assert len(sets[name].names) == max(key) + 1
-    assert (sets[name].relabel(labels + len(key) + 1) == 255).all(), "not of the data set"
+    maps = data.label_maps
+    every, some = next(iter(maps.values())), maps[name]
+    value_of = {label: value for value, label in every.labels.items() if label}
+    found = [some.labels[value_of[label]] for label in range(1, len(key) + 1)]
+    assert found == np.add(key, 1).tolist()
+    assert len(some.names) == max(key) + 1
 
 
 def test_panoramas_and_photos_are_read_in_a_set(tmp_path: Path, erp: Any) -> None:
     root = fabricate(tmp_path / "data", photos=1)
     store = tmp_path / "store"
     for kind, representation in ((Stanford2D3DS, erp), (Stanford2D3DSPerspective, None)):
-        given: Any = {"representation": representation, "inputs": ["rgb"], "store": store}
+        given: Any = {"representation": representation, "inputs": ["rgb"], "cache": store}
         every, eight = kind(root, **given, level=None), kind(root, **given, classes=8)
         for data in (every, eight):
             data.prepare_data()
@@ -53,7 +51,7 @@ def test_panoramas_and_photos_are_read_in_a_set(tmp_path: Path, erp: Any) -> Non
             expected = eight.class_names.index(class_name) if known else 0
             assert (after[before == label] == expected).all()
         assert len(np.unique(after)) > 4
-    assert len(list(store.iterdir())) == 4, "a store for each set"
+    assert len(list(store.iterdir())) == 4, "a cache for each set"
 
 
 def test_other_sets_are_refused(tmp_path: Path) -> None:

@@ -79,8 +79,9 @@ def test_the_best_epoch_has_the_smallest_error_and_is_reported(folder: Path, run
 def test_evaluation_takes_other_alignments_and_limits(
     run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    checkpoint = "checkpoint=whole/checkpoints/best.ckpt"
-    run("evaluate", checkpoint, "hydra.run.dir=again")
+    kept = [text for text in SETTINGS if text.startswith(("data", "experiment", "task"))]
+    checkpoint = ["checkpoint=whole/checkpoints/best.ckpt", *kept]
+    run("evaluate", *checkpoint, "hydra.run.dir=again")
     assert results(Path("again")) == results(Path("whole"))
     limits = (
         "task.head.alignment=affine",
@@ -88,7 +89,7 @@ def test_evaluation_takes_other_alignments_and_limits(
         "task.head.clip=true",
         "task.head.align=none",
     )
-    run("evaluate", checkpoint, *limits, "hydra.run.dir=aligned")
+    run("evaluate", *checkpoint, *limits, "hydra.run.dir=aligned")
     content = results(Path("aligned"))
     assert content["protocol"]["alignment"] == "affine in distance"
     assert content["protocol"]["range"] == "0 to 3 m, predictions clipped"

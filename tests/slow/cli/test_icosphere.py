@@ -36,7 +36,7 @@ def test_a_run_from_the_store_labels_panoramas_of_any_size(
     last, trust = "checkpoint=run/checkpoints/last.ckpt", "trust=torch.nn.Conv2d"
     assert list((tmp_path / "run/panels").glob("*.png"))
 
-    run("evaluate", last, trust, "hydra.run.dir=again")
+    run("evaluate", *data, last, trust, "hydra.run.dir=again")
     assert results(tmp_path / "again")["confusion"] == results(tmp_path / "run")["confusion"]
 
     write_pixels(tmp_path / "in" / "odd.png", sphere(75))

@@ -223,7 +223,6 @@ def _as_in_training(data: DataModule) -> DataModule:
     return data
 
 
-
 # --- the command --------------------------------------------------------------------------------
 
 
