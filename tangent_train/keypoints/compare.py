@@ -155,10 +155,9 @@ class Comparer:
                 valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
             image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level, valid)
-        has_truth = all(side.distance_m is not None and side.pose is not None for side in sides)
-        views: Any = (
-            [DepthView(side.distance_m, side.pose) for side in sides] if has_truth else None
-        )  # type: ignore[arg-type]
+        views: Any = None
+        if all(side.distance_m is not None and side.pose is not None for side in sides):
+            views = [DepthView(side.distance_m, side.pose) for side in sides]  # type: ignore[arg-type]
         common = {
             "pair": pair.name,
             "split": pair.split,

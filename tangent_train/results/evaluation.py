@@ -37,15 +37,14 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
         images: Number of images.
     """
     means, of_classes, bands, confusion = head.scores(result)
-    has_classes = confusion is not None
     return EvaluationResult(
         noun,
         images,
         head.columns,
         {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
-        classes=class_entries(of_classes, confusion, head.class_names) if has_classes else (),
+        classes=() if confusion is None else class_entries(of_classes, confusion, head.class_names),
         latitude_bands=latitude_entries(bands) if bands else (),
-        confusion=confusion.tolist() if has_classes else (),
+        confusion=() if confusion is None else confusion.tolist(),
         intervals=head.intervals(result),
     )
 

@@ -86,7 +86,9 @@ class Publication(NamedTuple):
         scores = []
         for line in self.lines:
             fold, mean = int(line["fold"]) if line["fold"] else None, line["score"]
-            parts = [(None, mean, line["mean"])] if mean in like.columns else []
+            parts: list[tuple[str | None, str, str | None]] = []
+            if mean in like.columns:
+                parts.append((None, mean, line["mean"]))
             if mean in of_class:
                 parts += [(name, of_class[mean], line.get(name)) for name in like.class_names]
             for part, name, text in parts:

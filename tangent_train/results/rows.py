@@ -189,7 +189,7 @@ def _scores(result: EvaluationResult) -> Iterator[Score]:
     """Yield the defined scores of an evaluation."""
     parts: list[tuple[Part, Mapping[str, Any]]] = [(None, result.scores)]
     parts += [(entry["class"], entry) for entry in result.classes]
-    parts += [(tuple(entry["latitude_deg"]), entry) for entry in result.latitude_bands]  # type: ignore[misc]
+    parts += [(tuple(entry["latitude_deg"]), entry) for entry in result.latitude_bands]
     for part, entry in parts:
         for name in dict.fromkeys((*result.columns, *result.class_means)):
             if (value := entry.get(name)) is not None:

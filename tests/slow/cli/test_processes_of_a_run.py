@@ -84,7 +84,9 @@ def test_two_processes_make_the_steps_and_figures_of_one(
     figures = [results(tmp_path / folder) for folder in ("again", "evaluated")]
     assert figures[0]["images"] == figures[1]["images"] == 5
     assert figures[0]["confusion"] == figures[1]["confusion"]
-    assert figures[0]["miou_solid_angle"] == pytest.approx(figures[1]["miou_solid_angle"])
+    assert figures[0]["scores"]["miou_solid_angle"] == pytest.approx(
+        figures[1]["scores"]["miou_solid_angle"]
+    )
 
 
 def test_depth_of_two_processes_is_that_of_one(
