@@ -229,8 +229,8 @@ class ImportSettings(Settings):
     unknown_wins: bool = True
     """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
     scores: ScoreKind | None = None
-    """output of the network: logits | probabilities | sigmoid_logits | sigmoid | labels; null =
-    detected"""
+    """output of the network: logits | probabilities | labels; null = by the sums of its values
+    (onnx)"""
     depth: DepthKind | None = None
     """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
     relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
