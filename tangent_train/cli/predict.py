@@ -123,7 +123,7 @@ class _Prediction:
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
-            print_text(f"Label map {label_map.name}: {mapped}.")
+            print_text(f"Label map {settings.label_map}: {mapped}.")
             loaded = mapped.loaded
         head: Any = head_of(loaded)
         kinds = head.file_kinds(settings.write)
