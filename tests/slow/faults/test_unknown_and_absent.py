@@ -14,7 +14,7 @@ import pytest
 import torch
 from lightning.pytorch.plugins import MixedPrecision
 
-from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.pictures import Pictures
 from tangent_train.results.evaluation import write_results
 from tests.slow.faults.small_runs import Faulty, run_trainer, small_data, small_task
 
@@ -62,7 +62,7 @@ def test_panoramas_without_a_labeled_pixel_do_not_count(
         _without_labels(path)
     data = small_data(root)
     task = small_task(Faulty(), absent_class=absent)
-    panels = PredictionPanels(tmp_path / "panels", count=2)
+    panels = Pictures(tmp_path / "panels", test=2)
     trainer = run_trainer(tmp_path / "run", callbacks=[panels])
     (logged,) = trainer.test(task, datamodule=data, verbose=False)
     record = task.evaluation_result(task.result, data.noun)
