@@ -126,8 +126,8 @@ class Cityscapes(PhotoDataModule):
         if not found:
             folder, expected = self.root / "leftImg8bit" / split, "the files of the release"
             raise DataError(folder, found="no photos", expected=expected, remedy=_GET_IT)
-        labels = self.root.glob(f"gtFine/{split}/*/[!.]*_labelIds.png")
-        self.problems.note_strays(labels, found)
+        every = self.root.glob(f"gtFine/{split}/*/[!.]*_labelIds.png")
+        self.problems.note_strays(every, found)
         return found
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:

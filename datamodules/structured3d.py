@@ -171,7 +171,7 @@ class Structured3DPerspective(Structured3DImages, PhotoDataModule):
 
     place = "perspective/{}/*"
 
-    configuration: Literal["full", "empty"] = "full"  # type: ignore[assignment]
+    configuration: Literal["full", "empty"] = "full"
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`; the center is in the middle of the photo."""

@@ -193,9 +193,11 @@ class _Shape:
             self.box((-depth / 2, 0, height + high / 2), (between(0.02, 0.08), width, high))
         if self._chance(row["arms"]):
             for side in (-1, 1):
-                y, rise = side * width / 2, between(0.14, 0.26)
-                self.box((0, y, height + rise), (depth * between(0.6, 1), 0.05, 0.03))
-                self._rod((depth * 0.3, y, height - thick), (depth * 0.3, y, height + rise), 0.02)
+                edge, rise = side * width / 2, between(0.14, 0.26)
+                self.box((0, edge, height + rise), (depth * between(0.6, 1), 0.05, 0.03))
+                self._rod(
+                    (depth * 0.3, edge, height - thick), (depth * 0.3, edge, height + rise), 0.02
+                )
 
     def _build_vessel(self, row: dict[str, str]) -> None:
         """Add a surface of revolution, with a wall or closed, perhaps with a handle."""

@@ -144,7 +144,9 @@ def read_label_table(path: Path) -> LabelMap:
     classes = [name.partition("_")[0] for name in read_json(path, expected, kind=list[str])]
     if strange := sorted(set(classes) - set(labels)):
         raise DataError(path, found=f"class {strange[0]!r}", expected=expected)
-    colors = {f"#{instance:06x}": labels[name] for instance, name in enumerate(classes)}
+    colors: dict[int | str, int] = {
+        f"#{instance:06x}": labels[name] for instance, name in enumerate(classes)
+    }
     return LabelMap(CLASSES, colors, refuses_others=False)
 
 

@@ -161,7 +161,7 @@ def _camera_file(folder: Path) -> Path:
     return folder / "CameraParams" / "intrinsics.txt"
 
 
-def read_first_channel(path: Path) -> NDArray[Any]:
+def read_first_channel(path: Any) -> NDArray[Any]:
     """Decode the red or only channel of an image unchanged, ``(H, W)``.
 
     Raises:

@@ -349,8 +349,8 @@ def build_room(rng: np.random.Generator, room_type: str) -> Room:
         rng: The room's source of randomness.
         room_type: From `draw_room_type`.
     """
-    limits = [map(float, _TYPES[room_type][side].split()) for side in ("long", "short")]
-    (long, short), notch = (rng.uniform(*pair) for pair in limits), None
+    limits = [_TYPES[room_type][side].split() for side in ("long", "short")]
+    (long, short), notch = (rng.uniform(float(a), float(b)) for a, b in limits), None
     size = (long, short, rng.uniform(*_HEIGHTS))
     if rng.random() < _L_SHAPED and short >= 3.2:
         notch = (long * rng.uniform(0.25, 0.5), short * rng.uniform(0.25, 0.45))

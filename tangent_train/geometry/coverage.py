@@ -58,7 +58,7 @@ def check_coverage(
 
 
 def overlaps(grid: PinholeGrid, valid: NDArray[np.bool_] | None = None) -> bool:
-    """Return True if the interior of some image contains each direction.
+    """Return True if the interior of some image contains each direction, except single points.
 
     Args:
         grid: Images that cover the valid pixels.
@@ -75,6 +75,8 @@ def _missed(
     if mask is None:
         angles = np.meshgrid(np.arange(-180, 180, _STEP_DEG), np.arange(-90, 91, _STEP_DEG))
         directions = lonlat_to_xyz(np.radians(np.stack(angles, axis=-1))).reshape(-1, 3)
+        if least > 0:  # views that meet at a pole overlap around it
+            directions = directions[np.abs(directions[:, 2]) < 1]
     else:
         directions = equirect_directions(mask[0])[np.frombuffer(mask[1], np.bool_).reshape(mask[0])]
     for tested in np.split(directions, range(_TOGETHER, len(directions), _TOGETHER)):
