@@ -28,7 +28,7 @@ _FUNCTIONS = (
     *("models.stem.widen_stem", "timm.models._factory.create_model"),
     *("models.tables.face_neighbors", "models.tables.gnomonic_points"),
     *("models.tables.hexagonal_rings", "models.tables.mapped_samples"),
-    "models.tables.mesh_operators",
+    *("models.tables.mesh_operators", "models.distortion_aware.make_distortion_aware"),
 )
 """Functions that a file may name, besides torchvision's functions that build networks."""
 

@@ -107,11 +107,11 @@ def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> No
     run_in(tmp_path, "train", *settings, "representation=erp")
     run_in(tmp_path, "train", "resume=run", "trainer.max_epochs=2")
     last = tmp_path / "run/checkpoints/last.ckpt"
-    evaluation = (*settings[:1], *settings[3:6], "hydra.run.dir=evaluated")
+    evaluation = (*settings[:1], *settings[3:7], "hydra.run.dir=evaluated")
     run_in(tmp_path, "evaluate", f"checkpoint={last}", *evaluation)
     assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
     with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
-        run_in(tmp_path, "train", *settings)
+        run_in(tmp_path, "train", *settings, "hydra.run.dir=refused")
 
 
 def test_the_reference_page_lists_every_network_with_its_number_of_parameters() -> None:
