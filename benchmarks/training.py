@@ -60,21 +60,21 @@ def built(overrides: Sequence[str], root: str, rows: int, rooms: int = 3) -> tup
 
 
 def loader(quick: bool) -> Iterator[Table]:
-    """Load samples of 4 of 80 RGB-D images from the prepared store and from PNGs, with 1 worker."""
+    """Load samples of 4 of 80 RGB-D images from the cache and from PNGs, with 1 worker."""
     level = 6 if quick else 10
     settings = [f"level={level}", "representation=tangent", "representation.base_level=1"]
     settings += ["representation.faces_per_panorama=4", "data.batch_size=1"]
     settings += ["data.num_workers=1", "data.in_memory=false"]
     with tempfile.TemporaryDirectory() as root, quiet():
         alternatives = []
-        stores = {"PNG files": "null", "prepared store": f"{root}/store"}
-        for name, store in stores.items():
-            overrides = ["experiment=rooms/standard", *settings, f"data.cache={store}"]
+        caches = {"PNG files": "null", "cache": f"{root}/cache"}
+        for name, cache in caches.items():
+            overrides = ["experiment=rooms/standard", *settings, f"data.cache={cache}"]
             data, _ = built(overrides, f"{root}/rooms", 2 ** (level + 1))
-            epochs = 1 if store == "null" or quick else 20
-            alternatives.append(_loading(name, data, epochs, is_ours=store != "null"))
+            epochs = 1 if cache == "null" or quick else 20
+            alternatives.append(_loading(name, data, epochs, is_ours=cache != "null"))
         table = Table("loader: time", measure(alternatives, 2 if quick else 5))
-    faster = 1 / table.ratio("prepared store")
+    faster = 1 / table.ratio("cache")
     table.goals = [Goal("as fast as from PNG files", faster, 20, True)]
     yield table
 

@@ -15,7 +15,7 @@ from typing import IO, Annotated, Any
 
 from pydantic import AfterValidator, TypeAdapter, ValidationError
 
-from tangent_train.errors import DataError, printable
+from tangent_train.errors import DataError, SettingError, printable
 
 
 @contextmanager

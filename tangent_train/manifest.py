@@ -1,7 +1,8 @@
 """Manifest of an output folder: the settings that decide its content, and what is finished.
 
 Every command that writes many files opens the manifest of its folder first. A folder with the same
-settings is continued with what is missing; a folder with others is refused, and nothing is written.
+settings is continued with what is missing; a folder with others is refused, and nothing is written,
+unless nothing in it is finished.
 Shards of one work (`items[i::n]`) share the folder and its settings.
 
 A folder holds ``manifest.json``, and for each shard a file ``finished*.jsonl`` with a line for each
@@ -88,44 +89,42 @@ class Manifest:
         """Create an output folder, or continue one that was written with the same settings.
 
         Args:
-            folder: Output folder: new, empty, or begun with the same settings.
+            folder: Output folder: new, empty, begun with the same settings, or nothing is finished.
             settings: Settings that decide the content, plain values; paths as text.
             shard: Part of the work that this process does; None for all of it.
 
         Raises:
-            SettingError: The folder holds other files, or was begun with other settings.
+            SettingError: The folder holds other files, or items finished with other settings.
         """
         path = folder / MANIFEST
         wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
-        if path.is_file():
-            cls._check_same(path, wanted)
-        elif folder.exists() and any(path.name[0] != "." for path in folder.iterdir()):
+        others = folder.iterdir() if folder.exists() and not path.is_file() else ()
+        if any(other.name[0] != "." for other in others):
             raise SettingError(
                 "output",
                 found=f"{folder}, which holds other files",
                 expected="a new or empty folder, or one that this command began",
                 remedy="Choose another folder.",
             )
-        else:
-            write_text(path, json.dumps(wanted, indent=1) + "\n")
         finished: dict[str, dict[str, Any]] = {}
         for file in sorted(folder.glob("finished*.jsonl")):
             finished |= _read_lines(file)
+        if finished:
+            cls._check_same(path, wanted)
+        else:
+            write_text(path, json.dumps(wanted, indent=1) + "\n")
         return cls(folder, finished, shard or Shard())
 
     @staticmethod
     def _check_same(path: Path, wanted: Mapping[str, Any]) -> None:
         """Refuse a folder that was begun with other settings."""
-        content: Any = None
-        with suppress(ValueError):
-            content = json.loads(path.read_bytes())
-        before = content if isinstance(content, dict) else {}
+        before = json.loads(path.read_bytes())
         for name in sorted(before.keys() | wanted.keys()):
             if before.get(name) != wanted.get(name):
                 raise SettingError(
                     name,
                     found=_shown(wanted.get(name)),
-                    expected=f"{_shown(before.get(name))}, with which {path.parent} was begun",
+                    expected=f"{_shown(before.get(name))}, with which {path.parent} was written",
                     remedy="Choose another output, or delete this one to write it again.",
                 )
 

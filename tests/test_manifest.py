@@ -42,6 +42,15 @@ def test_a_folder_with_other_settings_is_refused(
     assert Manifest.open(out, SETTINGS).finished == {"a.png": {}}
 
 
+def test_a_folder_without_finished_items_is_begun_anew(tmp_path: Path) -> None:
+    Manifest.open(tmp_path, SETTINGS)
+    other = SETTINGS | {"blend": "nearest"}
+    Manifest.open(tmp_path, other).finish("a.png")
+    assert Manifest.open(tmp_path, other).finished == {"a.png": {}}
+    with pytest.raises(SettingError, match="blend: found feather; expected nearest"):
+        Manifest.open(tmp_path, SETTINGS)
+
+
 def test_a_folder_of_somebody_else_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("…")
     with pytest.raises(SettingError, match="holds other files"):

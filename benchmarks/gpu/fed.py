@@ -1,4 +1,4 @@
-"""Measure if the loader keeps the GPU busy in a training from the prepared store."""
+"""Measure if the loader keeps the GPU busy in a training from the cache."""
 
 from __future__ import annotations
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import sys
 from collections.abc import Callable, Collection, Iterator
@@ -51,8 +52,12 @@ def predict(settings: PredictSettings) -> None:
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
     content = settings.model_dump(mode="json", exclude=_NOT_CONTENT)
-    content |= {"write": list(folder.kinds), "saved": settings.checkpoint.stat().st_mtime_ns}
-    manifest = Manifest.open(settings.output, content, shard)
+    content["write"] = list(folder.kinds)
+    # Not its path: a copy continues a folder, a checkpoint that was trained further does not.
+    with settings.checkpoint.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    same = {**content, "checkpoint": f"SHA-256 {digest}"}
+    manifest = Manifest.open(settings.output, same, shard)
     missing = manifest.missing(shard.part(names))
     done = len(shard.part(names)) - len(missing)
     print_text(f"{counted(len(missing) + done, 'images')}, {done} done already.")
@@ -71,7 +76,7 @@ def predict(settings: PredictSettings) -> None:
     except KeyboardInterrupt:
         print_text("The finished images are kept; the same command continues.")
         raise
-    manifest = Manifest.open(settings.output, content)  # with what other shards have finished
+    manifest = Manifest.open(settings.output, same)  # with what other shards have finished
     left = manifest.missing(names)
     if left and not errors.keys() >= set(left):
         print_text(f"Shard {shard} is done: {len(names) - len(left)} of {len(names)} images.")
@@ -118,12 +123,14 @@ class _Prediction:
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
-            print_text(f"Label map {label_map.name}: {mapped}.")
+            print_text(f"Label map {settings.label_map}: {mapped}.")
             loaded = mapped.loaded
-        of_head = type(head_of(loaded)).predict_settings
-        check_read(settings, _read(settings, loaded) | set(of_head))
-        head: Any = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
-        self.folder = PredictionFolder(settings.output, head, head.file_kinds(settings.write))
+        head: Any = head_of(loaded)
+        kinds = head.file_kinds(settings.write)
+        of_head = {name for name, kind in head.predict_settings.items() if kind in ("", *kinds)}
+        check_read(settings, _read(settings, loaded) | of_head)
+        head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
+        self.folder = PredictionFolder(settings.output, head, kinds)
         views = _views(settings, loaded)
         if isinstance(views, PanoramaViews):
             print_text(f"A panorama is predicted in {views.description(settings.area)}.")

@@ -1,4 +1,4 @@
-"""``tangent-prepare``: generate or check a data set, and write its prepared store."""
+"""``tangent-prepare``: generate or check a data set, and fill its cache."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from tangent_train.manifest import Shard
 
 
 def prepare(settings: PrepareSettings) -> None:
-    """Generate or check the data set of a run, and write its prepared store if it has one.
+    """Generate or check the data set of a run, and fill its cache if it has one.
 
     Args:
         settings: Settings of the command.
     """
-    shard = Shard.parse(settings.shard)
     data = open_data(settings)
-    if shard is not None:
+    if settings.shard is not None:
+        shard = Shard.parse(settings.shard)
         count = data.fill_cache(shard.part)
         print_text(f"Shard {shard}: {count} {data.noun} are in {data.cache}.")
     else:

@@ -163,7 +163,7 @@ def _views(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int,
     section |= {"blend": "nearest"} if "blend" in section else {}
     grid: PinholeGrid | None = getattr(build_from_config(section, "views"), "grid", None)
     if grid is None:
-        raise SettingError("views", found=settings.views, expected="tangent, ring or cubemap")
+        raise SettingError("views", found=settings.views, expected="tangent, horizontal or cubemap")
     if settings.rotation is not None:  # x forward, y to the right, z up
         yaw, pitch, roll = np.radians(settings.rotation)
         # A positive rotation about y looks down.

@@ -98,6 +98,7 @@ def transfer(_: object) -> None:
     manifest = Manifest.open(folder, content)
     settings = {stage.path: stage_settings(config, folder, stage) for stage in stages}
     _check_data([settings[s.path] for s in stages if str(s.path) not in manifest.finished])
+    manifest.finish("checks")  # an interrupted stage is resumed: other settings are refused
     for number, stage in enumerate(stages, start=1):
         heading = f"Stage {number} of {len(stages)}, {stage.name} in {folder / stage.path}"
         _run(stage, settings[stage.path], manifest, heading)

@@ -229,8 +229,8 @@ class ImportSettings(Settings):
     unknown_wins: bool = True
     """pixels where such a class wins: true: unknown (label 0) | false: the best other class"""
     scores: ScoreKind | None = None
-    """output of the network: logits | probabilities | sigmoid_logits | sigmoid | labels; null =
-    detected"""
+    """output of the network: logits | probabilities | labels; null = by the sums of its values
+    (onnx)"""
     depth: DepthKind | None = None
     """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
     relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
@@ -277,8 +277,8 @@ class KeypointSettings(Settings):
     margin: int = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
     ratio: float = 0.8
-    """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 = off
-    ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 = off"""
+    """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 =
+    off"""
     mutual: bool = True
     """true: mutual nearest neighbors only"""
     max_error_deg: float = 1
@@ -369,7 +369,7 @@ class PrepareSettings(RunSettings):
     """Settings of tangent-prepare."""
 
     shard: str | int | None = None
-    """part of the store to prepare, e.g. 3/16, for several machines; null = all"""
+    """part of the cache to fill, e.g. 3/16, for several machines; null = all"""
 
 
 class PhotoSettings(Settings):
@@ -548,4 +548,6 @@ def validate(command: str, config: Any) -> Any:
     of_setting = [e for e in errors if e["loc"][: name.count(".") + 1] == tuple(name.split("."))]
     expected = dict.fromkeys(str(e.get("ctx", {}).get("error") or e["msg"]) for e in of_setting)
     kinds = [text.removeprefix("Input should be ") for text in expected]
+    if first["type"] == "extra_forbidden":
+        kinds = ["a setting that something reads"]
     raise SettingError(name, found="null" if value is None else value, expected=" or ".join(kinds))

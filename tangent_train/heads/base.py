@@ -102,7 +102,8 @@ class Head(nn.Module, ABC):
         main_score: Score that selects the best epoch.
         takes: Input and output of a network for this head, for messages.
         num_outputs: Number of channels of the network's output.
-        predict_settings: Settings of ``tangent-predict`` that are arguments of the head.
+        predict_settings: Settings of ``tangent-predict`` that are arguments of the head, each with
+            the kind of output that reads it; "" for all.
         is_metric: False for distances that are known up to a scale.
         suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
             predicted pixels, from which pictures are made. All but the last are usual.
@@ -116,7 +117,7 @@ class Head(nn.Module, ABC):
     columns: ClassVar[Mapping[str, ScoreColumn]]
     main_score: ClassVar[str]
     takes: ClassVar[str]
-    predict_settings: ClassVar[Sequence[str]] = ()
+    predict_settings: ClassVar[Mapping[str, str]] = MappingProxyType({})
     summary: ClassVar[str] = ""
     unknown: ClassVar[float] = 0
     num_outputs: int

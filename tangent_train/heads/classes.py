@@ -84,7 +84,7 @@ class ClassesHead(Head):
     )
     main_score: ClassVar[str] = "miou"
     takes: ClassVar[str] = "images (n, C, h, w) to logits of every pixel (n, K, h, w)"
-    predict_settings: ClassVar[Sequence[str]] = ("min_confidence", "min_share")
+    predict_settings: ClassVar[Mapping[str, str]] = {"min_confidence": "", "min_share": ""}
     summary: ClassVar[str] = "classes"
     suffixes = MappingProxyType(
         dict.fromkeys(("labels", "color", "overlay"), ".png") | {"probabilities": ".npy"}

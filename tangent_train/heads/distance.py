@@ -126,7 +126,12 @@ class DistanceHead(Head):
     )
     main_score: ClassVar[str] = "absrel"
     takes: ClassVar[str] = "images (n, C, h, w) to one number for every pixel (n, 1, h, w)"
-    predict_settings: ClassVar[Sequence[str]] = ("align", "depth_format", "depth_scale", "points")
+    predict_settings: ClassVar[Mapping[str, str]] = {
+        "align": "",
+        "depth_format": "depth",
+        "depth_scale": "depth",
+        "points": "points",
+    }
     num_outputs = 1
     summary: ClassVar[str] = "depth"
     unknown: ClassVar[float] = math.nan

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +22,7 @@ from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
-from tests.inference.trained import PERSPECTIVE, sphere, write_checkpoint
+from tests.inference.trained import ERP, PERSPECTIVE, sphere, write_checkpoint
 from tests.rendering.drawn_room import draw_room
 from tests.running import Capture, Patch
 
@@ -90,12 +91,16 @@ def test_an_interruption_keeps_what_is_done(
     assert list(first.parent.iterdir()) == [first]
     assert "the same command continues" in capsys.readouterr().out
     monkeypatch.setattr(Predictor, "predict", whole)
+    checkpoint = shutil.copy(tmp_path / "model.ckpt", tmp_path / "copy.ckpt")
     written = first.stat().st_mtime_ns
     with pytest.raises(SystemExit, match="blend: found nearest; expected feather, with which"):
         predict(blend="nearest")
-    assert predict().keys() == {"a", "b", "c"}
+    assert predict(checkpoint=checkpoint).keys() == {"a", "b", "c"}
     assert "3 images, 1 done already" in capsys.readouterr().out
     assert first.stat().st_mtime_ns == written
+    write_checkpoint(Path(checkpoint), ERP)
+    with pytest.raises(SystemExit, match="checkpoint: found SHA-256"):
+        predict(checkpoint=checkpoint)
     # New images are added; results below the input are not taken for images.
     write_pixels(tmp_path / "in" / "d.png", sphere(16))
     assert predict().keys() == {"a", "b", "c", "d"}

@@ -185,7 +185,7 @@ def test_videos_that_cannot_be_used(
     printed = " ".join(capsys.readouterr().out.split())
     for name, message in (
         ("broken", "cannot be decoded"),
-        ("cut", "truncated or damaged"),
+        ("cut", "cannot be decoded"),
         ("gray", "cannot be decoded"),
         ("narrow", "expected a whole panorama"),
         ("sound", "no video stream"),

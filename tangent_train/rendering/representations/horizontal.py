@@ -75,7 +75,7 @@ class HorizontalRepresentation(PinholeRepresentation):
                 "representation.blend",
                 found="nearest, with rings of different fov",
                 expected="feather, or the same fov for all rings",
-                remedy="Views such as ring or tangent have the same.",
+                remedy="Views such as horizontal or tangent have the same.",
             )
         size = ring_size(level, _pair(fov), dim)
         covered = None
