@@ -15,10 +15,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from studies.output import COLORS, Row, save, save_table
+from studies.output import Row, save
 from tangent_train.checkpoints.distances import distance_of, from_distance
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.heads.alignment import align_views, sample_views, sphere_points
@@ -132,20 +131,6 @@ def fields_of_view(distances_m: Sequence[NDArray[np.floating]], seeds: Sequence[
     return rows
 
 
-def picture(rows: list[Row]) -> Figure:
-    """Plot the errors of aligned views over the smooth errors."""
-    figure = Figure((6, 4), layout="constrained")
-    axes = figure.subplots()
-    for kind, color in zip(_KINDS, COLORS, strict=False):
-        for column, style in (("error", "o"), ("error, grid", "x")):
-            of_kind = [row for row in rows if row["output"] == kind]
-            points = [[row["smooth error %"], row[column]] for row in of_kind]
-            axes.plot(*zip(*points, strict=True), style, color=color, label=f"{kind}: {column}")
-    axes.set(xlabel="smooth error of a view %", ylabel="median error after the alignment %")
-    axes.legend(frameon=False)
-    return figure
-
-
 def main() -> None:
     """Measure all files and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -157,9 +142,9 @@ def main() -> None:
         for kind in _KINDS
         for error in (0.0, 0.05, 0.1, 0.2)
     ]
-    save("depth_alignment", rows, picture(rows), digits=2)
+    save("depth_alignment", rows, digits=2)
     rows = fields_of_view([read_depth_m(path, 1000) for path in files], range(3))
-    save_table("depth_alignment_fov", rows, digits=2)
+    save("depth_alignment_fov", rows, digits=2)
 
 
 if __name__ == "__main__":

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor, nn
 
-from studies.output import Row, markdown
+from studies.output import Row, save
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.config.build import build_from_config
-from tangent_train.files import csv_text, write_text
 from tangent_train.geometry import (
     equirect_directions,
     equirect_solid_angles,
@@ -151,5 +150,4 @@ if __name__ == "__main__":
     parser.add_argument("methods", nargs="+", metavar="<method>=<checkpoint>")
     named = (text.partition("=") for text in parser.parse_args().methods)
     table = [rotation_error(name, checkpoint) for name, _, checkpoint in named]
-    write_text(Path("figures/rotation_error.csv"), csv_text(list(table[0]), table))
-    print(markdown(table))
+    save("rotation_error", table)

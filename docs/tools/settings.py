@@ -10,7 +10,6 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tangent_train.config.help import (
-    Setting,
     bases,
     command_settings,
     description,
@@ -26,74 +25,27 @@ COMMANDS = ("train", "evaluate", "predict", "import", "export", "render", "trans
             "prepare", "check")  # fmt: skip
 GROUPS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer",
           "logger", "callbacks", "recipe", "debug", "sweep", "launcher")  # fmt: skip
-_SETTINGS = """# Settings
-
-Every setting of every command, generated from their declarations and from the config files.
-`<command> --help` prints the same comments.
-
-Settings are given as `name=value`, e.g. `tangent-train level=6 trainer.max_epochs=3`. A *group*
-is a setting whose value is the name of an option, e.g. `data=folder`. The settings of the option
-then begin with the name of the group, e.g. `data.root=my_rooms`. `${name}` is the value of another
-setting.
-
-Stored combinations of options and values are on the page [Experiments](experiments.md).
-"""
-_REPORT = """### tangent-report
-
-`tangent-report <run>` has options instead of settings: see `tangent-report --help`.
-"""
-_EXPERIMENTS = """# Experiments
-
-An experiment is a file with options and values, chosen by `experiment=<name>`. Settings on the
-command line override it. This page is generated from the files in `configs/experiment/`. The
-meanings of the settings are on the page [Settings](settings.md).
-"""
-
-_PROTOCOLS = """# Protocols
-
-A protocol is the set of facts that decide which scores can be compared. Every run derives its facts
-from its data set, its settings and its task, prints them below the scores and stores them in
-[results.json](file_formats.md#resultsjson). `tangent-report` and `results.md` show a published
-score beside a result if all facts are the same, and name the facts in which the nearest other
-protocols differ. Different data sets are not compared.
-
-| fact | meaning |
-| --- | --- |
-| `data` | class of the data set |
-| `size` | width × height of the panorama whose pixels are scored; of photos, the crops |
-| `area` | part of the sphere: west, east, south and north in degrees; none is the whole sphere |
-| `unknown` | black pixels that are unknown too, see `data.unknown` |
-| `mask` | further ignored pixels, see `data.mask` |
-| `test_rotation` | rotation of the test images, see `data.test_rotation` |
-| `classes` | set of classes: their number, or a name, see `data.classes` |
-| `absent_class` | IoU of classes absent from the labels: not in the mean (`skip`) or 0 (`zero`) |
-| `alignment` | of depth: alignment with the true distances, in distance or disparity |
-| `range` | of depth: true distances that count, and whether predictions are clipped to them |
-| `views_aligned` | of depth of panoramas: alignment of the views with each other; not compared |
-| `images` | number of test images, if some are missing or were left out as broken: `2 of 100` |
-| `weighting` | `pixels`: the pixels of all images count equally; the mean is over classes |
-| | `pixels, then images`: the mean over the pixels of each image, then over the images |
-
-Further facts are settings of single data sets. Folds are compared separately. "Not stated" is a
-fact that the source does not state: such scores stand beside no result. Reasons are on the page
-[Comparison](../explanation/comparison.md#published-scores), commands on the page
-[Benchmarks of the field](../how-to/field_benchmarks.md).
-
-This page is generated from `protocols.yaml` and `published.csv` in `tangent_train/results`.
-"""
+_MARK = "<!-- generated -->\n"
 
 
 def pages() -> dict[Path, str]:
     """Return the generated pages by their paths."""
-    settings = [_SETTINGS, "## Commands\n", *map(_command, COMMANDS), _REPORT, "## Groups\n"]
+    settings = ["## Commands\n", *map(_command, COMMANDS), "## Groups\n"]
     for group in GROUPS:
         settings += [f"### {group}\n", *map(_option, sorted((CONFIGS / group).glob("*.yaml")))]
     experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))
-    return {
-        REFERENCE / "settings.md": "\n".join(settings),
-        REFERENCE / "experiments.md": "\n".join([_EXPERIMENTS, *experiments]),
-        REFERENCE / "protocols.md": "\n".join([_PROTOCOLS, *map(_protocol, protocols())]),
+    generated = {
+        "settings.md": settings,
+        "experiments.md": experiments,
+        "protocols.md": map(_protocol, protocols()),
     }
+    return {REFERENCE / name: _below_head(name, parts) for name, parts in generated.items()}
+
+
+def _below_head(name: str, parts: Iterable[str]) -> str:
+    """Return a page with new text below its mark; the text above is written by hand."""
+    head = (REFERENCE / name).read_text("utf-8").partition(_MARK)[0]
+    return head + _MARK + "\n" + "\n".join(parts)
 
 
 def _protocol(name: str) -> str:
@@ -126,8 +78,8 @@ def _command(name: str) -> str:
 
 def _option(file: Path) -> str:
     settings = [s for s in read_settings(file) if not s.name.endswith(("_target_", "_partial_"))]
-    names = [f"`{file.parent.name}={base}`" for base in _bases(file)]
-    note = _based_on("Based on", names, settings)
+    names = [f"`{file.parent.name}={name}`" for group, _, name in bases(file) if not group]
+    note = f"Based on {' and '.join(names)}{', with:' if settings else '.'}\n\n" if names else ""
     return f"#### {file.parent.name}={file.stem}\n\n{_prose(file)}\n\n{note}{_table(settings)}"
 
 
@@ -135,16 +87,6 @@ def _experiment(file: Path) -> str:
     name = file.relative_to(CONFIGS / "experiment").with_suffix("").as_posix()
     content = re.sub(r"\A(#.*\n)+", "", file.read_text("utf-8")).strip()
     return f"## {name}\n\n{_prose(file)}\n\n```yaml\n{content}\n```\n"
-
-
-def _bases(file: Path) -> list[str]:
-    return [name for group, _, name in bases(file) if not group]
-
-
-def _based_on(start: str, names: list[str], settings: list[Setting]) -> str:
-    if not names:
-        return ""
-    return f"{start} {' and '.join(names)}{', with:' if settings else '.'}\n\n"
 
 
 def _table(settings: Iterable[Setting]) -> str:

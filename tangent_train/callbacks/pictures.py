@@ -1,35 +1,43 @@
-"""Log pictures of validation predictions."""
+"""Draw validation images in the loggers, and test images in files and for the report."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 
-from tangent_train.errors import at_least
 from tangent_train.heads.pictures import evenly_spread
+from tangent_train.io.pixel_files import write_pixels
+from tangent_train.results.html import EncodedImage
 
 _MOST_ROWS = 256
-"""Larger images are reduced: a log contains the pictures of all validations."""
+"""Larger images are reduced in logs, which contain the pictures of all validations."""
 
 
-class ValidationPictures(Callback):
-    """Logs pictures of validation images after every validation, see `Task.picture`.
+class Pictures(Callback):
+    """Draws predictions of images that are spread over a split, see `PixelTask.picture`.
 
-    Their names are ``val_images/<name>``. The images are the same in every validation, spread over
-    the images of the first process.
+    Validation images are logged as ``val_images/<name>``, the same ones after every validation.
 
     Args:
-        count: Number of images.
+        folder: Output folder of the pictures of test images.
+        test: Number of test images.
+        validation: Number of validation images, of the first process.
 
-    Raises:
-        SettingError: `count` is negative.
+    Attributes:
+        images: Compressed test images for the report; after the test those of all processes, in the
+            order of the split.
     """
 
-    def __init__(self, count: int = 4) -> None:
-        self.count = at_least("validation_images", count, 0)
+    def __init__(self, folder: Path | str, test: int = 6, validation: int = 4) -> None:
+        self.folder = Path(folder)
+        self.test, self.validation = test, validation
+        self.images: list[EncodedImage] = []
+        self._encoded: dict[int, EncodedImage] = {}
 
     def on_validation_batch_end(  # noqa: D102 - a hook of Lightning
         self,
@@ -40,22 +48,48 @@ class ValidationPictures(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        chosen = evenly_spread(self.count, int(trainer.num_val_batches[dataloader_idx]))
+        chosen = evenly_spread(self.validation, int(trainer.num_val_batches[dataloader_idx]))
         is_logged = trainer.is_global_zero and not trainer.sanity_checking and trainer.loggers
         if not is_logged or batch_idx not in chosen:
             return
         task: Any = pl_module
-        data: Any = trainer.datamodule  # type: ignore[attr-defined]
-        source, index = data.dataset("val"), int(batch.index[0])
+        source, index = _dataset(trainer, "val"), int(batch.index[0])
         labels = task.true_labels(batch)[0], outputs[0]
         panel = task.picture(source.read(index), *labels, most_rows=_MOST_ROWS)
-        if panel is None:
-            return
-        tag = f"val_images/{source.name(index).replace('/', '_')}"
-        # The step at which Lightning logs the validation, one less than `global_step`.
-        step = trainer.fit_loop.epoch_loop._batches_that_stepped
-        for logger in trainer.loggers:
-            log_image(logger, tag, panel, step)
+        if panel is not None:
+            tag = f"val_images/{source.name(index).replace('/', '_')}"
+            # The step at which Lightning logs the validation, one less than `global_step`.
+            step = trainer.fit_loop.epoch_loop._batches_that_stepped
+            for logger in trainer.loggers:
+                log_image(logger, tag, panel, step)
+
+    def on_test_batch_end(  # noqa: D102 - a hook of Lightning
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
+    ) -> None:
+        task: Any = pl_module
+        source = _dataset(trainer, "test")
+        chosen = evenly_spread(self.test, len(source))
+        predictions = zip(batch.index.tolist(), task.true_labels(batch), outputs, strict=True)
+        for index, *labels in predictions:
+            if index in chosen:
+                name, image = source.name(index), source.read(index)
+                panel = task.picture(image, *labels)
+                if panel is not None:
+                    file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
+                    write_pixels(self.folder / file, panel)
+                    self._encoded[index] = task.report_image(name, image, *labels)
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Gather the images of all processes."""
+        parts = [self._encoded] * trainer.world_size
+        if trainer.world_size > 1:
+            torch.distributed.all_gather_object(parts, self._encoded)
+        gathered = {index: image for part in parts for index, image in part.items()}
+        self.images = [gathered[index] for index in sorted(gathered)]
+
+
+def _dataset(trainer: Trainer, split: str) -> Any:
+    return trainer.datamodule.dataset(split)  # type: ignore[attr-defined]
 
 
 def log_image(logger: Logger, name: str, image: Any, step: int) -> None:

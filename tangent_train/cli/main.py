@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import sys
-from contextlib import redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from io import StringIO
@@ -17,14 +17,28 @@ from typing import TYPE_CHECKING, Any
 from tangent_train.errors import DataError, SettingError, printable
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from omegaconf import DictConfig
+
+
+@contextmanager
+def _errors_as_messages(command: str) -> Iterator[None]:
+    """Exit with one line for an error of the user's settings or files."""
+    from hydra.errors import HydraException
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        yield
+    except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
+        sys.exit(printable(f"tangent-{command}: {error}"))
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 def _main(command: str) -> None:
     """Run a command with the settings that Hydra composes from the command line."""
     import hydra
-    from hydra.errors import HydraException
-    from omegaconf.errors import OmegaConfBaseException
 
     from tangent_train.cli.processes import in_sweep, run_job
     from tangent_train.config.help import annotate
@@ -32,14 +46,15 @@ def _main(command: str) -> None:
     from tangent_train.files import config_folder
 
     def job(config: DictConfig) -> Any:
-        settings = validate(command, config)
-        if in_sweep():
-            return run_job(command)
-        name = {"import": "import_network"}.get(command, command)  # import is a keyword
-        return getattr(import_module(f"tangent_train.cli.{name}"), name)(settings)
+        with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
+            settings = validate(command, config)
+            if in_sweep():
+                return run_job(command)
+            name = {"import": "import_network"}.get(command, command)  # import is a keyword
+            return getattr(import_module(f"tangent_train.cli.{name}"), name)(settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
-    try:
+    with _errors_as_messages(command):
         name = config_name(command, sys.argv[1:])
         run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)
         if {"--help", "-h"}.isdisjoint(sys.argv):
@@ -48,20 +63,14 @@ def _main(command: str) -> None:
         with suppress(SystemExit), redirect_stdout(StringIO()) as printed:
             run(job)()
         sys.stdout.write(annotate(printed.getvalue(), command))
-    except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
-        sys.exit(printable(f"tangent-{command}: {error}"))
-    except KeyboardInterrupt:
-        sys.exit(130)
 
 
 def report() -> None:
     """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
     from tangent_train.cli.report import report as write_report
 
-    try:
+    with _errors_as_messages("report"):
         write_report(sys.argv[1:])
-    except (DataError, SettingError, OSError) as error:
-        sys.exit(f"tangent-report: {error}")
 
 
 train = partial(_main, "train")

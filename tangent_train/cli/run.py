@@ -21,8 +21,7 @@ from datamodules.core.image_module import ImageDataModule
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
-from tangent_train.callbacks.panels import PredictionPanels
-from tangent_train.callbacks.pictures import ValidationPictures
+from tangent_train.callbacks.pictures import Pictures
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.checkpoints.loaded import (
     METADATA_KEY,
@@ -84,8 +83,9 @@ class Run:
                 *build_callbacks(self.settings, self.task),
                 CheckpointContents(self.contents()),
                 ProgressBar(),
-                PredictionPanels(self.folder / "panels", self.settings.panels),
-                ValidationPictures(self.settings.validation_images),
+                Pictures(
+                    self.folder / "panels", self.settings.panels, self.settings.validation_images
+                ),
                 *[LearningRateMonitor()] * bool(loggers),
             ],
             logger=loggers,
@@ -190,7 +190,7 @@ class Run:
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
             tables=[*tables, *([confusion_table(result)] if result.confusion else [])],
-            images=[i for c in callbacks if isinstance(c, PredictionPanels) for i in c.images],
+            images=[i for c in callbacks if isinstance(c, Pictures) for i in c.images],
             class_names=self.task.head.class_names,
             notes=[*summary, *notes],
         )

@@ -6,23 +6,18 @@ with their size as parameters.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
 from tangent_train.geometry import FLIP_Y, PanoramaPose
-from tangent_train.keypoints.two_view import colmap, rigid_matrix
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from tangent_train.io.camera_files import RigFile
-    from tangent_train.keypoints.spherical import SphericalKeypoints
-    from tangent_train.keypoints.two_view import TwoView
+from tangent_train.io.camera_files import RigFile
+from tangent_train.keypoints.spherical import SphericalKeypoints
+from tangent_train.keypoints.two_view import TwoView, colmap, rigid_matrix
 
 
 def add_pair(

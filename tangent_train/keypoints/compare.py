@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
+from datamodules.core.panorama_pairs import PanoramaPair
 from tangent_train.geometry import (
     CubeGrid,
     PanoramaPose,
@@ -36,12 +37,6 @@ from tangent_train.keypoints.covisibility import (
 )
 from tangent_train.keypoints.spherical import Floats
 from tangent_train.rendering import rotate_equirect
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from datamodules.core.panorama_pairs import PanoramaPair
-
 
 Row = dict[str, Any]
 """Figures of one pair, condition and representation, see `Comparer.compare`."""
@@ -95,7 +90,7 @@ class Comparer:
     Attributes:
         base_level: Base levels of the tangent images.
         margin: Number of pixels added around every tangent image.
-        level: Level s; None for the level nearest to the larger panorama.
+        level: Largest level s; None for the level nearest to the larger panorama.
         ratio: Largest ratio of descriptor distances, see `match`.
         mutual: True to keep mutual matches only, see `match`.
         max_error_deg: Largest error of an inlier, see `estimate_two_view`; at most 20.
@@ -133,12 +128,10 @@ class Comparer:
             and pose, they have the errors of the estimated motion, the area under the recall curve
             of the pair, and the number of ``correct`` matches among the ``verifiable`` ones.
             Undefined scores are None.
-
-        Raises:
-            SettingError: The panoramas are too small for the level or for a base level.
         """
-        level = self._level(pair)
         sides = (pair.left, pair.right)
+        nearest = nearest_level(max(side.rgb.shape[0] for side in sides))
+        level = nearest if self.level is None else min(self.level, nearest)
         images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
         # Keypoints of a panorama of the previous pair are used again.
         self._cache = {
@@ -170,23 +163,12 @@ class Comparer:
         comparison = Comparison([], {}, {})
         for condition, (rotation, image, right) in conditions.items():
             matched = {name: self._match(left[name], right[name]) for name in left}
-            comparison.images[condition], comparison.matched[condition] = (
-                (images[0], image),
-                matched,
-            )
+            comparison.images[condition] = (images[0], image)
+            comparison.matched[condition] = matched
             for name, one in matched.items():
                 row = {**common, "condition": condition, "representation": name}
                 comparison.rows.append(row | self._scores(one, rotation, views))
         return comparison
-
-    def _level(self, pair: PanoramaPair) -> int:
-        rows = max(side.rgb.shape[0] for side in (pair.left, pair.right))
-        nearest = nearest_level(rows)
-        level = nearest if self.level is None else self.level
-        if level > nearest:
-            expected = f"at most {nearest}, that of pair {pair.name} with {rows} rows"
-            raise SettingError("level", found=level, expected=expected)
-        return level
 
     def _detect(
         self, rgb: NDArray[np.uint8], level: int, valid: NDArray[np.bool_] | None

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 import math
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.geometry import (
+    CubeGrid,
+    PinholeGrid,
+    TangentGrid,
+    equirect_to_lonlat,
+    lonlat_to_xyz,
+)
 from tangent_train.keypoints.spherical import SphericalKeypoints, equirect_jacobian, local_to_sphere
 from tangent_train.rendering import equirect_to_tangent
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import CubeGrid, PinholeGrid, TangentGrid
-
 
 _cv2: Any = cv2  # its types lack the detectors
 

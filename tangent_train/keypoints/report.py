@@ -8,17 +8,14 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from datamodules.core.panorama_pairs import PublishedPair
 from tangent_train.files import csv_text, write_text
 from tangent_train.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparison, Row
 from tangent_train.results.tables import Table, percent
-
-if TYPE_CHECKING:
-    from datamodules.core.panorama_pairs import PublishedPair
-
 
 _CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
 _SCORES = {"PMR %": "pmr", "MS %": "ms", "P %": "p"}

@@ -6,22 +6,17 @@ Arguments of pycolmap are in COLMAP's camera axes: x right, y down, z to the pan
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tangent_train.errors import of_extra
+from tangent_train.geometry import PanoramaPose
 from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors, prefers_rotation
 from tangent_train.keypoints.spherical import Floats, angles_between
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from numpy.typing import NDArray
-
-    from tangent_train.geometry import PanoramaPose
-
 
 _CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 """From the axes of `tangent_train.geometry` to COLMAP's; a reflection."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ from matplotlib.text import Text
 from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.rows import RunRow, Statistic
 
-_COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
+COLORS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#999999")
 """Colors of Okabe and Ito, which people with color blindness can distinguish."""
 
 _LONGEST_LABEL = 60
@@ -46,23 +46,6 @@ def report_png(title: str, rows: Sequence[RunRow], like: EvaluationResult) -> by
         classes = [[row.score(score, name) for name in names] for row in rows]
         panels.append(_Panel(f"{column.class_text} of each class", names, classes, column.unit))
     return _png(rows, panels, like)
-
-
-def grid_png(title: str, grid: Mapping[str, Mapping[str, RunRow]], score: str, unit: str) -> bytes:
-    """Draw bars of one score of every view, grouped by condition.
-
-    Args:
-        title: Title of the chart.
-        grid: Rows by view and condition; every view has all conditions.
-        score: Name of the score over all images.
-        unit: Unit of the score.
-
-    Returns:
-        Content of a PNG file.
-    """
-    scores = [[row.score(score) for row in by_condition.values()] for by_condition in grid.values()]
-    conditions = list(next(iter(grid.values())))
-    return _png([RunRow(view, ()) for view in grid], [_Panel(title, conditions, scores, unit)])
 
 
 class _Panel(NamedTuple):
@@ -103,13 +86,13 @@ def _png(
 def _bars(axes: Axes, rows: Sequence[RunRow], panel: _Panel) -> None:
     width, ticks = 0.8 / len(rows), panel.ticks
     for k, (row, number, scores) in enumerate(zip(rows, _numbers(rows), panel.scores, strict=True)):
-        is_repeated = number >= len(_COLORS)  # its color
+        is_repeated = number >= len(COLORS)  # its color
         axes.bar(
             np.arange(len(ticks)) + (k - (len(rows) - 1) / 2) * width,
             _in_unit([score.mean for score in scores], panel.unit),
             0.92 * width,
             yerr=np.transpose([_in_unit(_error_bar(score), panel.unit) for score in scores]),
-            color=_COLORS[number % len(_COLORS)],
+            color=COLORS[number % len(COLORS)],
             hatch="//" if row.is_published else "xx" if is_repeated else "",
             label=_short(row.label),
             error_kw={"elinewidth": 1.2, "capsize": min(4.0, 14 * width), "ecolor": "#333333"},
@@ -123,8 +106,8 @@ def _band_lines(axes: Axes, rows: Sequence[RunRow], score: str, unit: str) -> No
         bands = sorted(row.bands)
         centers = [(south + north) / 2 for south, north in bands]
         shown = _in_unit([row.score(score, band).mean for band in bands], unit)
-        line = "--" if number >= len(_COLORS) else "-"
-        axes.plot(centers, shown, line, color=_COLORS[number % len(_COLORS)], marker=".")
+        line = "--" if number >= len(COLORS) else "-"
+        axes.plot(centers, shown, line, color=COLORS[number % len(COLORS)], marker=".")
     axes.set_xticks(range(-90, 91, 30), [f"{k}°" for k in range(-90, 91, 30)])
     _score_axis(axes, unit)
     axes.set_xlim(-90, 90)

@@ -18,12 +18,7 @@ from tangent_train.metrics.segmentation import BAND_EDGES_DEG
 from tangent_train.results.evaluation_result import RESULTS_FILE, EvaluationResult, plain_scores
 from tangent_train.results.tables import Table, score_text
 
-_OTHER_COLUMNS = {
-    "images": "images",
-    "share": "pixels %",
-    "taken_for": "most often taken for",
-    "taken_for_share": "%",
-}
+_OTHER_COLUMNS = {"images": "images", "share": "pixels %"}
 """Titles of the columns per class that are not scores."""
 
 
@@ -42,7 +37,7 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
         images,
         head.columns,
         {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
-        classes=() if confusion is None else class_entries(of_classes, confusion, head.class_names),
+        classes=class_entries(of_classes, head.class_names),
         latitude_bands=latitude_entries(bands) if bands else (),
         confusion=() if confusion is None else confusion.tolist(),
         intervals=head.intervals(result),
@@ -50,33 +45,18 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
 
 
 def class_entries(
-    scores: Mapping[str, NDArray[Any]], confusion: NDArray[np.int64], class_names: Sequence[str]
+    scores: Mapping[str, NDArray[Any]], class_names: Sequence[str]
 ) -> list[dict[str, Any]]:
-    """Return name, scores and most frequent confusion of each class, see `EvaluationResult`.
+    """Return name and scores of each class, see `EvaluationResult`.
 
     Args:
-        scores: Scores of the classes ``(K,)`` by name.
-        confusion: Counts ``(K, K)``, or ``(K + 1, K + 1)`` with the unknown class first; rows are
-            true, columns predicted classes.
-        class_names: Name of each row of the confusion matrix.
+        scores: Scores of the classes ``(K,)`` by name; empty without classes.
+        class_names: Names of the K classes, or of K + 1 labels with the unknown class first.
     """
-    first = len(class_names) - len(next(iter(scores.values())))
-    return [
-        {"class": class_names[k]}
-        | plain_scores({name: values[k - first].item() for name, values in scores.items()})
-        | _taken_for(confusion[k], k, class_names)
-        for k in range(first, len(class_names))
-    ]
-
-
-def _taken_for(row: NDArray[np.int64], label: int, class_names: Sequence[str]) -> dict[str, Any]:
-    """Return the class that a class is most often taken for, and its share; the first of equals."""
-    missed = row.copy()
-    missed[label] = 0
-    other = int(missed.argmax())
-    if not missed[other]:
-        return {"taken_for": None, "taken_for_share": None}
-    return {"taken_for": class_names[other], "taken_for_share": float(missed[other] / row.sum())}
+    of_classes = zip(*(values.tolist() for values in scores.values()), strict=True)
+    rows = [plain_scores(dict(zip(scores, values, strict=True))) for values in of_classes]
+    names = class_names[len(class_names) - len(rows) :]
+    return [{"class": name} | row for name, row in zip(names, rows, strict=True)]
 
 
 def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, Any]]:
@@ -169,14 +149,12 @@ def _per_class(result: EvaluationResult) -> Table:
         if count or entry[result.main_of_class] is not None
     ]
     means = (_mean(result, mean_of[name]) if name in mean_of else "" for name in columns)
-    texts = [0, *(1 + k for k, name in enumerate(columns) if name == "taken_for")]
     note = f"Means without classes that do not occur in the labels: {', '.join(result.absent)}."
     return Table(
         "Per class",
         ["class", *(titles[name] for name in columns)],
         [*rows, ["mean", *means]],
         note if result.absent else "",
-        text_columns=texts,
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.score_columns import SOLID_ANGLE
-from tangent_train.results.chart import grid_png, report_png
+from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.published import published_rows
 from tangent_train.results.rows import Part, RunRow, check_alike, group_results
@@ -45,8 +45,8 @@ class Report:
         rows: Evaluations, and published scores.
         notes: Sentences about the rows.
         compared: Explanation of the column "change"; empty without this column.
-        cells: Cell of a row in the first table and the chart, by the row's label. They are drawn
-            only if there are several conditions.
+        cells: Cell of a row in a table of views and conditions, by the row's label. The table is
+            written only if there are several conditions.
     """
 
     title: str
@@ -61,35 +61,13 @@ class Report:
         return next(result for row in self.rows for result in row.results)
 
     @property
-    def grid(self) -> dict[str, dict[str, RunRow]]:
-        """Rows by view and condition, all conditions in each view; empty with one condition."""
-        grid: dict[str, dict[str, RunRow]] = defaultdict(dict)
-        for row in self.rows:
-            if row.label in self.cells:
-                view, condition = self.cells[row.label]
-                grid[view][condition] = row
-        conditions = dict.fromkeys(c for rows in grid.values() for c in rows)
-        if len(conditions) < 2:
-            return {}
-        empty = RunRow("", ())
-        return {view: {c: rows.get(c, empty) for c in conditions} for view, rows in grid.items()}
-
-    @property
-    def cell_score(self) -> str:
-        """Name of the score in the cells: the main score, by solid angle if that exists."""
-        by_angle = self.first.main + SOLID_ANGLE
-        return by_angle if by_angle in self.first.columns else self.first.main
-
-    @property
     def _legend(self) -> str:
         in_percent = all(column.unit == "%" for column in self.first.columns.values())
         return "Percent. " * in_percent + _LEGEND
 
     def tables(self) -> list[Table]:
         """Return the tables of views in conditions, of means, of classes and of latitude bands."""
-        first, tables = self.first, [self.means()]
-        if self.grid:
-            tables.insert(0, self._views())
+        first, tables = self.first, [self._views(), self.means()]
         for name, mean in first.class_means.items():
             if not name.endswith(SOLID_ANGLE):
                 title = first.columns[mean].class_title
@@ -102,13 +80,16 @@ class Report:
         return [table for table in tables if table.rows]
 
     def _views(self) -> Table:
-        rows = [
-            (view, *(self._cell(row, self.cell_score) for row in by_condition.values()))
-            for view, by_condition in self.grid.items()
-        ]
-        title = f"{self.title}: {self.first.columns[self.cell_score].title}"
-        header = ("", *next(iter(self.grid.values())))
-        return Table(title, header, rows, f"{self._legend} {_LEGEND_OF_INTERVALS}")
+        """Return the main score of the views in conditions; no rows with a single condition."""
+        main, by_angle = self.first.main, self.first.main + SOLID_ANGLE
+        name = by_angle if by_angle in self.first.columns else main
+        rows = {row.label: row for row in self.rows}
+        scores = {cell: self._cell(rows[label], name) for label, cell in self.cells.items()}
+        views, conditions = (dict.fromkeys(cell[k] for cell in scores) for k in (0, 1))
+        cells = [(view, *(scores.get((view, c), "–") for c in conditions)) for view in views]
+        title = f"{self.title}: {self.first.columns[name].title}"
+        note = f"{self._legend} {_LEGEND_OF_INTERVALS}"
+        return Table(title, ("", *conditions), cells if len(conditions) > 1 else [], note)
 
     def _parts(self, title: str, name: str, parts: Mapping[str, Part]) -> Table:
         """Return the table of a score of classes or latitude bands, given by title."""
@@ -160,13 +141,7 @@ class Report:
         lines = list(self.csv_lines())
         titles = list(dict.fromkeys(title for line in lines for title in line))
         write_text(folder / f"{name}.csv", csv_text(titles, lines))
-        if self.grid:
-            column = self.first.columns[self.cell_score]
-            title = f"{self.title}: {column.text}"
-            png = grid_png(title, self.grid, self.cell_score, column.unit)
-        else:
-            png = report_png(self.title, self.rows, self.first)
-        write_bytes(folder / f"{name}.png", png)
+        write_bytes(folder / f"{name}.png", report_png(self.title, self.rows, self.first))
 
     def csv_lines(self) -> Iterator[dict[str, Any]]:
         """Yield a line for each row, fold ("mean" over all folds), class or band, and score."""
@@ -240,7 +215,7 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
     merged = sorted(
         [*published, *rows], key=lambda row: (row.facts["data"], row.facts["s"].zfill(2))
     )
-    return Report("Report", merged, [*_missing_folds(rows), *_repeated(rows), *notes, *sources])
+    return Report("Report", merged, [*_missing_folds(rows), *notes, *sources])
 
 
 def transfer_report(
@@ -316,15 +291,6 @@ def _missing_folds(rows: Sequence[RunRow]) -> list[str]:
             text = f"fold {' and '.join(missing)} missing; not a mean of {len(folds)} folds."
             notes[text].append(row.label)
     return [f"{', '.join(labels)}: {text}" for text, labels in notes.items()]
-
-
-def _repeated(rows: Sequence[RunRow]) -> list[str]:
-    """Return notes on rows with several runs of the same fold and seed."""
-    return [
-        f"{row.label}: {len(row.results) - count} runs have the fold and seed of another one."
-        for row in rows
-        if (count := len({(r.fold, r.seed) for r in row.results})) < len(row.results)
-    ]
 
 
 def _facts(results: Sequence[EvaluationResult], shown: Sequence[str] = ()) -> dict[str, str]:

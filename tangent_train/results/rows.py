@@ -33,8 +33,6 @@ _IGNORED = (
 )
 """Settings, or sections, in which the runs of a row may differ: fold, seed, paths, speed."""
 
-_SHOWN_SETTINGS = 3
-
 
 class Score(NamedTuple):
     """A score of one run, a share of 1 or in the unit of its column."""
@@ -234,10 +232,7 @@ def group_results(results: Sequence[EvaluationResult]) -> dict[str, list[Evaluat
     for identity, members in groups:
         identity.setdefault("name", members[0].folder.name)
     identities = [identity for identity, _ in groups]
-    labels = [_label(one, identities, _SHOWN_SETTINGS) for one in identities]
-    if len(set(labels)) < len(labels):
-        labels = [_label(one, identities, None) for one in identities]
-    return {label: members for label, (_, members) in zip(labels, groups, strict=True)}
+    return {_label(identity, identities): members for identity, members in groups}
 
 
 def _identity(result: EvaluationResult) -> dict[str, Any]:
@@ -253,15 +248,12 @@ def _identity(result: EvaluationResult) -> dict[str, Any]:
     }
 
 
-def _label(
-    identity: Mapping[str, Any], identities: Sequence[Mapping[str, Any]], shown: int | None
-) -> str:
-    """Return the name of runs with the settings that differ: the first few, or all with None."""
+def _label(identity: Mapping[str, Any], identities: Sequence[Mapping[str, Any]]) -> str:
+    """Return the name of runs with the settings that differ."""
     others = [other for other in identities if other["name"] == identity["name"]]
     names = sorted({name for other in others for name in other})
     names = [n for n in names if any(_is_different(n, identity, other) for other in others)]
-    texts = [_setting_text(name, identity.get(name)) for name in names]
-    text = ", ".join(texts[:shown]) + ", …" * (shown is not None and len(texts) > shown)
+    text = ", ".join(_setting_text(name, identity.get(name)) for name in names)
     return str(identity["name"]) + f" ({text})" * bool(text)
 
 

@@ -63,7 +63,6 @@ def test_the_tables_show_means_spreads_and_missing_folds() -> None:
     assert [_cells(report, k)["mine"] for k in (1, 2)] == [classes] * 2
     assert report.notes == [
         "mine: fold 2 missing; not a mean of 3 folds.",
-        "mine: 1 runs have the fold and seed of another one.",
         "a note",
     ]
 

@@ -69,18 +69,3 @@ def test_the_commands_answer_from_another_folder(
         assert done.returncode == 0, done.stderr
         assert command in done.stdout
     assert not list(tmp_path.iterdir())
-
-
-def test_packages_of_the_same_names_on_the_path_hide_nothing(
-    scripts: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("models", "datamodules"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "__init__.py").write_text("raise RuntimeError")
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    done = _run(tmp_path, scripts / "tangent-check", "data=folder", "data.root=nowhere")
-    assert done.returncode == 1
-    *notes, refusal = done.stderr.splitlines()
-    for name, note in zip(("datamodules", "models"), notes, strict=True):
-        assert note.startswith(f"{tmp_path / name / '__init__.py'} is not used")
-    assert refusal.startswith("tangent-check: nowhere: found no such folder")

@@ -1,4 +1,4 @@
-"""Predicted depth is read where true depth is: by data sets, keypoints, renderings, networks."""
+"""Predicted depth is read where true depth is: by data sets, renderings, networks."""
 
 from __future__ import annotations
 
@@ -10,11 +10,9 @@ import pytest
 
 from datamodules.core.splits import SPLITS
 from datamodules.folder.labeled import FolderPanoramas
-from datamodules.stanford2d3ds.pairs import StanfordPairs
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
-from tests.cli.tiny_runs import Run, predicted, results, run_command
+from tests.cli.tiny_runs import Run, predicted, run_command
 from tests.datamodules.data_files import read_png
-from tests.datamodules.stanford_pairs_format import write_panorama
 from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 
 ROWS = 64
@@ -65,27 +63,3 @@ def test_tangent_images_and_projects_of_depth(run: Run, tmp_path: Path) -> None:
     face = read_png(next((tmp_path / "project" / "images").rglob("hall.png")))
     assert face.dtype == np.uint16
     assert set(np.unique(face)) <= {0, *np.unique(depth).tolist()}
-
-
-def test_keypoints_are_compared_with_predicted_depth(run: Run, tmp_path: Path) -> None:
-    pytest.importorskip("pycolmap")
-    root, rng = tmp_path / "data", np.random.default_rng(0)
-    texture = rng.integers(0, 256, (ROWS, 2 * ROWS, 3), np.uint8)
-    for camera, shift in (("a", 0), ("b", 3)):
-        image = write_panorama(root, 32 * camera, "office_1", 20, ROWS)
-        write_pixels(image, np.roll(texture, shift, axis=1))
-    pano = root / "area_1" / "pano"
-    predict = ("checkpoint=depth.ckpt", f"input={pano}/rgb", "depth_scale=512", "align=none")
-    run("predict", *predict, "output=out", "write=[depth]")
-    true = read_png(next((pano / "depth").iterdir()))
-    for path in (tmp_path / "out" / "depth").iterdir():
-        shutil.copy(path, pano / "depth" / path.name.replace("_rgb", "_depth"))
-    assert (read_png(next((pano / "depth").iterdir())) != true).any()
-    data = ("data=stanford2d3ds_pairs", f"data.root={root}", "data.selection=rooms")
-    run("keypoints", *data, "base_level=0", "controls=false", "pictures=0", "output=keypoints")
-    assert {row["visible_by"] for row in results(tmp_path / "keypoints")["rows"]} == {"depth"}
-    pair = StanfordPairs(root, pairs="rooms").read(0)
-    for side, camera in ((pair.left, "a"), (pair.right, "b")):
-        (path,) = (tmp_path / "out" / "depth").glob(f"camera_{camera}*")
-        assert side.distance_m is not None
-        np.testing.assert_allclose(side.distance_m, read_depth_m(path, 512), atol=1e-6)

@@ -11,6 +11,7 @@ import lightning
 import torch
 from torch import Tensor, nn
 
+from datamodules.stanford2d3ds.files import CLASSES
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.rendering import TangentRepresentation
@@ -52,7 +53,7 @@ def small_task(network: nn.Module, **settings: Any) -> PixelTask:
     return segmentation_task(
         network,
         TangentRepresentation(base_level=0, level=4),
-        Stanford2D3DS.class_names,
+        ("unknown", *CLASSES),
         partial(torch.optim.SGD, lr=0.01),
         class_weights="none",
         **settings,

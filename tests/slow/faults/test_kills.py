@@ -19,7 +19,6 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
-import cv2
 import pytest
 import torch
 
@@ -109,20 +108,12 @@ def _loaded(path: Path) -> dict[str, Any]:
 
 
 def _assert_whole(run: Path) -> None:
-    """Every file of a run can be read but for temporary ones and what Hydra writes for itself."""
-    for path in run.rglob("*"):
-        if not path.is_file() or path.name.startswith(".partial-") or ".hydra" in path.parts:
-            continue
+    """Every checkpoint and every JSON file of a run can be read but for temporary ones."""
+    for path in run.rglob("[!.]*.*"):
         if path.suffix == ".ckpt":
             _loaded(path)
         elif path.suffix == ".json":
             json.loads(path.read_text(encoding="utf-8"))
-        elif path.suffix == ".png":
-            assert cv2.imread(str(path)) is not None, path
-        elif path.suffix == ".html":
-            assert path.read_text(encoding="utf-8").rstrip().endswith("</html>"), path
-        elif path.suffix in (".csv", ".md", ".yaml"):
-            assert path.read_text().endswith("\n"), path
 
 
 def _assert_same(run: Path, undisturbed: Path) -> None:

@@ -16,7 +16,6 @@ from playwright.sync_api import Browser
 from tangent_train.geometry import (
     camera_matrix_from_fov,
     equirect_directions,
-    lonlat_to_xyz,
     perspective_directions,
 )
 from tangent_train.heads.pictures import colorize_distance, distance_limits
@@ -28,33 +27,6 @@ SIZE, PHOTO, FOV_DEG = (500, 1000), (300, 400), 80.0
 CENTER = np.zeros(3)
 HALF_ANGLE = math.radians(25)  # from the middle of the picture to the end of its longer side
 OUTSIDE, WRONG, UNLABELED = (22, 24, 28), (214, 39, 40), (110, 110, 110)
-FLAT_MESSAGE = "This browser offers no WebGL 2: images are shown flat, without points."
-NO_WEBGL = """
-  const open = HTMLCanvasElement.prototype.getContext;
-  HTMLCanvasElement.prototype.getContext = function (kind, ...rest) {
-    return kind === "webgl2" ? null : open.call(this, kind, ...rest);
-  };
-"""
-
-# The picture of the points' numbers, which the viewer draws in one pixel, as a whole.
-WITH_NUMBERS = """
-  const { prototype } = WebGL2RenderingContext;
-  const { readPixels, scissor } = prototype;
-  prototype.scissor = function () {
-    scissor.call(this, 0, 0, this.canvas.width, this.canvas.height);
-  };
-  prototype.readPixels = function (...all) {
-    readPixels.apply(this, all);
-    if (this.getParameter(this.FRAMEBUFFER_BINDING)) return; // a value of a map
-    const { width, height } = this.canvas;
-    const bytes = new Uint8Array(4 * width * height);
-    readPixels.call(this, 0, 0, width, height, ...all.slice(4, 6), bytes);
-    window.numbers = [];
-    for (let k = 0; k < bytes.length; k += 4) {
-      numbers.push(bytes[k] + 256 * bytes[k + 1] + 65536 * bytes[k + 2] - 1);
-    }
-  };
-"""
 
 
 def room(directions: NDArray[np.float64], **kwargs: Any) -> EncodedImage:
@@ -155,26 +127,6 @@ def test_walls_are_straight_from_three_sides_and_from_inside(
     inside = seen(report, middle)
     assert np.isfinite(inside).mean() > 0.97, "the eye is in the room"
     close(report.pixels(), colors_at(np.nan_to_num(inside)), but=0.04)
-
-
-def test_points_are_as_dense_at_the_pole_as_elsewhere(browser: Browser, tmp_path: Path) -> None:
-    """A sphere of 1 m, from outside: its far side, from the lower pole to latitude 30°."""
-    rows, columns = 64, 128
-    directions = equirect_directions((rows, columns))
-    rgb = np.full((rows, columns, 3), 90, np.uint8)
-    path = tmp_path / "report.html"
-    image = encode_image("sphere", rgb, prediction=np.ones((rows, columns)))
-    write_report(path, "Sphere", images=[image])
-    with opened(browser, path, before=WITH_NUMBERS) as report:
-        report.press("p")
-        axis = axes_of(report)[1][0]
-        numbers = np.unique(report.page.evaluate("window.numbers"))
-    drawn = directions.reshape(-1, 3)[numbers[numbers >= 0]]
-    per_steradian = (rows / np.pi) ** 2
-    for center in (axis, [0, 0, -1], lonlat_to_xyz(np.radians([30, 5]))):
-        is_near = drawn @ center > np.cos(np.radians(25))
-        expected = 2 * np.pi * (1 - np.cos(np.radians(25))) * per_steradian
-        assert is_near.sum() == pytest.approx(expected, rel=0.12)  # neighbors hide some
 
 
 def test_the_readout_names_the_point_under_the_pointer(report: OpenReport, path: Path) -> None:

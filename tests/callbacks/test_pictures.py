@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from tangent_train.callbacks.panels import PredictionPanels
+from tangent_train.callbacks.pictures import Pictures
 from tests.decoded import decoded
 from tests.tasks.builders import segmentation_task
 
@@ -29,13 +29,15 @@ class _Source:
         return f"area/room {index}"
 
     def read(self, index: int) -> Any:
-        return SimpleNamespace(rgb=np.full((*SHAPE, 3), 20 * index, np.uint8), area=None)
+        return SimpleNamespace(rgb=np.full((*SHAPE, 3), 20 * index, np.uint8), valid=None)
 
 
 def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> None:
     """After all ten, two a batch; the first labeled pixel is wrong."""
-    panels = PredictionPanels(tmp_path, 4)
-    trainer: Any = SimpleNamespace(datamodule=SimpleNamespace(source=lambda split: _Source()))
+    panels = Pictures(tmp_path, 4)
+    trainer: Any = SimpleNamespace(
+        datamodule=SimpleNamespace(dataset=lambda split: _Source()), world_size=1
+    )
     representation: Any = None
     task = segmentation_task(nn.Identity(), representation, NAMES, partial(torch.optim.SGD, lr=1))
     for first in range(0, 10, 2):
