@@ -25,7 +25,9 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
+
+from pydantic import Field
 
 from datamodules.cityscapes import THIRTEEN
 from datamodules.core.data_module import data_set
@@ -79,7 +81,7 @@ class SynPASS(PanoramaDataModule):
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
-    weather: Literal["all"] | Weather | Sequence[Weather] = "all"
+    weather: Literal["all"] | Weather | Annotated[Sequence[Weather], Field(min_length=1)] = "all"
     time: Literal["all", "day", "night"] = "all"
     test_split: Literal["val", "test"] = "test"
 

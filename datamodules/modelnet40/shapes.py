@@ -26,6 +26,7 @@ from typing import Any, ClassVar, Literal, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
@@ -195,7 +196,7 @@ class ModelNet40(DataModule):
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
-    batch_size: int = 16
+    batch_size: PositiveInt = 16
     test_rotation: Literal["yaw", "so3"] | None = None
 
     def __post_init__(self) -> None:

@@ -297,7 +297,7 @@ def read_description(path: Path) -> NetworkDescription | None:
         path: File.
 
     Returns:
-        The description; None if the file has none, such as the state dict of another program.
+        Description of the network; None for files of other programs, such as a state dict.
 
     Raises:
         DataError: The file is missing, or its description cannot be used.

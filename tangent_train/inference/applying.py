@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from itertools import chain
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,13 +19,11 @@ from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator
+    from collections.abc import Callable
 
     from numpy.typing import NDArray
 
     from tangent_train.geometry import PinholeGrid
-
-    _Part = tuple[NDArray[np.int64], NDArray[Any]]
 
 _PIXELS_PER_CALL = 2**20
 
@@ -85,86 +82,51 @@ def apply(
     check_panorama(panorama, "bilinear")
     step = images_per_call or max(1, _PIXELS_PER_CALL // math.prod(grid.size))
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
-    parts: Iterator[_Part] = _results(function, panorama, grid, step)
+    shape, views = (rows, columns), PinholeViews(grid)
+    kept: list[NDArray[Any]] = []
+    mosaic: Any = None
     if align is not None:
-        return _like(
-            panorama, _distance(parts, grid, (rows, columns), blend, kind or "metric_z", align)
-        )
-    start = next(parts)
-    first: NDArray[Any] = start[1]
-    parts = chain([start], parts)
-    if first.dtype.kind == "f":
-        array = _mean(parts, grid, (rows, columns), blend, first.shape[3:])
-    elif blend == "nearest":
-        images = np.empty((grid.num_images, *first.shape[1:]), first.dtype)
-        for faces, results in parts:
-            images[faces] = results
-        array = tangent_to_equirect(images, grid, (rows, columns), interpolation="nearest")
-    else:
-        raise SettingError(
-            "blend",
-            found=f"{blend!r} for results of {first.dtype}",
-            expected="'nearest': labels and masks cannot be averaged",
-            remedy="To average numbers, return them as floats.",
-        )
-    return _like(panorama, array)
-
-
-def _results(
-    function: Callable[[Pixels], Pixels], panorama: Pixels, grid: PinholeGrid, step: int
-) -> Iterator[_Part]:
-    """Yield the faces and the results of each call."""
+        mosaic = AlignedMosaic(shape, kind or "metric_z", blend, align)
     for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
         images = equirect_to_tangent(panorama, grid, faces)
-        yield faces, _as_array(function(images), images)
+        results = _as_array(function(images), images)
+        _check_result(results, blend, align)
+        if results.dtype.kind != "f":
+            kept.append(results)
+            continue
+        flat = results.reshape(*results.shape[:3], -1).astype(np.float32)
+        if mosaic is None:
+            mosaic = MeanMosaic(shape, blend, flat.shape[-1], skips_unknown=False)
+        part = views[faces[0] : faces[-1] + 1]
+        mosaic.add(torch.from_numpy(np.moveaxis(flat, -1, 1)), part)
+    if align is not None:
+        array = mosaic.distances().numpy()
+    elif mosaic is not None:
+        array = mosaic.values().movedim(0, -1).reshape(*shape, *results.shape[3:]).numpy()
+    else:
+        array = tangent_to_equirect(np.concatenate(kept), grid, shape, interpolation="nearest")
+    if not isinstance(panorama, Tensor):
+        return array
+    result = torch.from_numpy(array)
+    return (result if array.ndim == 2 else result.movedim(-1, 0)).to(panorama.device)
 
 
-def _mean(
-    parts: Iterable[_Part],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend,
-    channels: tuple[int, ...],
-) -> NDArray[np.float32]:
-    """Return the blended results ``(H, W, *channels)``."""
-    mosaic, views = (
-        MeanMosaic(shape, blend, math.prod(channels), skips_unknown=False),
-        PinholeViews(grid),
-    )
-    for faces, results in parts:
-        flat = results.reshape(*results.shape[:3], -1)
-        images = np.moveaxis(flat, -1, 1).astype(np.float32)
-        mosaic.add(torch.from_numpy(images), views[faces[0] : faces[-1] + 1])
-    return mosaic.values().movedim(0, -1).reshape(*shape, *channels).numpy()
-
-
-def _distance(
-    parts: Iterable[_Part],
-    grid: PinholeGrid,
-    shape: tuple[int, int],
-    blend: Blend,
-    kind: DepthKind,
-    align: Align,
-) -> NDArray[np.float32]:
-    """Return the distances ``(H, W)`` of aligned and blended depth."""
-    views, mosaic = PinholeViews(grid), AlignedMosaic(shape, kind, blend, align)
-    for faces, results in parts:
+def _check_result(results: NDArray[Any], blend: Blend, align: Align | None) -> None:
+    """Refuse numbers that cannot be aligned or blended."""
+    if align is not None:
         if (channels := math.prod(results.shape[3:])) != 1 or results.dtype.kind != "f":
             raise SettingError(
                 "result of the function",
                 found=f"K = {channels} of {results.dtype}",
                 expected="one float per pixel, which is depth, with align=",
             )
-        depth = torch.from_numpy(results.astype(np.float32)).reshape(-1, 1, *grid.size)
-        mosaic.add(depth, views[faces[0] : faces[-1] + 1])
-    distance = mosaic.distances()
-    if not distance.isfinite().any():
+    elif results.dtype.kind != "f" and blend != "nearest":
         raise SettingError(
-            "result of the function",
-            found=f"no depth that {kind} with align={align} can use",
-            expected="finite depth, larger than 0",
+            "blend",
+            found=f"{blend!r} for results of {results.dtype}",
+            expected="'nearest': labels and masks cannot be averaged",
+            remedy="To average numbers, return them as floats.",
         )
-    return distance.numpy()
 
 
 def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
@@ -181,18 +143,8 @@ def _as_array(returned: Any, images: Tensor | NDArray[Any]) -> NDArray[Any]:
         fits = array.ndim in (3, 4) and array.shape[:3] == (count, rows, columns)
         if fits and array.dtype.kind in "buif":
             return array
-    layout = "({}[, K], {}, {})" if kind is Tensor else "({}, {}, {}[, K])"
     raise SettingError(
         "result of the function",
         found=found,
-        expected=f"a {kind.__name__} of numbers {layout.format(count, rows, columns)} "
-        f"for {count} images of {columns}×{rows} pixels",
+        expected=f"a {kind.__name__} of numbers for {count} images of {columns}×{rows} pixels",
     )
-
-
-def _like(panorama: Any, array: NDArray[Any]) -> Any:
-    """Return the result ``(H, W[, K])`` as an array, or as a tensor if the panorama is a tensor."""
-    if not isinstance(panorama, Tensor):
-        return array
-    result = torch.from_numpy(array)
-    return (result if array.ndim == 2 else result.movedim(-1, 0)).to(panorama.device)

@@ -137,10 +137,14 @@ def read_panorama(
 
     Raises:
         DataError: A file cannot be used, or the image is not a whole panorama.
-        SettingError: The angles do not fit the image, or the value is not an image.
+        SettingError: The angles do not fit the image, the value is not an image, or an image in
+            memory has no pose.
     """
     rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
     size = rgb.shape[0], rgb.shape[1]
+    if upright == "pose" and path is None:
+        expected = "the path of a file: images in memory and videos have no GPano tags"
+        raise SettingError("upright", found="pose", expected=expected)
     if path is not None or angles is not None:
         area = panorama_area(path or _IN_MEMORY, size, angles)
     else:

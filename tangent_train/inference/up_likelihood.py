@@ -43,9 +43,9 @@ class UpLikelihood:
     A network that was trained on upright images is most confident on upright images. For each
     direction it gets four horizontal views of 135° that are upright for that direction. A network
     with cross-image attention gets all views of its representation, with which it was more often
-    right, and a network of whole spheres gets its view. The uncertainty of a view is the mean of 1 −
-    confidence over its pixels. The likelihood of a direction is the product of uncertainty⁻³ over up to
-    20 views.
+    right, and a network of whole spheres gets its view. The uncertainty of a view is the mean of 1
+    − confidence over its pixels. The likelihood of a direction is the product of uncertainty⁻³ over
+    up to 20 views.
 
     Attributes:
         loaded: The network.

@@ -299,12 +299,8 @@ def _check_single(levels: Sequence[int], base_level: int | None) -> None:
     if base_level is not None:
         raise SettingError("base_level", found=base_level, expected="tangent images")
     if len(levels) > 1:
-        raise SettingError(
-            "levels",
-            found=list(levels),
-            expected="one level, for a network that does not take tangent images",
-            remedy="Use views=tangent for tangent images.",
-        )
+        expected = "one level, or tangent images (views=tangent)"
+        raise SettingError("levels", found=list(levels), expected=expected)
 
 
 def panorama_settings(
@@ -398,27 +394,18 @@ def check_size(loaded: LoadedNetwork, size: tuple[int, int]) -> None:
     Raises:
         SettingError: The network does not support the size.
     """
-    if _fits(loaded, size):
-        return
-    expected = f"multiples of {loaded.size_multiple}, the network's stride"
-    remedy = "Choose other levels, or leave both as trained."
-    if loaded.fixed_size is not None:
-        size_in_file = width_height(loaded.fixed_size)
-        expected = f"at least {size_in_file}, the input size of the network's file"
     if loaded.is_spherical:
-        expected = f"{width_height(loaded.image_size)}, the panorama or signal of the training"
-        remedy = "It labels whole panoramas: leave projection, views and base_level as trained too."
-    found = f"images of {width_height(size)}"
-    raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
-
-
-def _fits(loaded: LoadedNetwork, size: tuple[int, int]) -> bool:
-    """Return True if a network supports images of rows and columns."""
-    if loaded.is_spherical:
-        return size == loaded.image_size
-    if loaded.fixed_size is not None:
-        return all(n >= least for n, least in zip(size, loaded.fixed_size, strict=True))
-    return not any(side % loaded.size_multiple for side in size)
+        fits = size == loaded.image_size
+        expected = f"{width_height(loaded.image_size)}, as in training: it labels whole panoramas"
+    elif loaded.fixed_size is not None:
+        fits = all(n >= least for n, least in zip(size, loaded.fixed_size, strict=True))
+        expected = f"at least {width_height(loaded.fixed_size)}, the size in the network's file"
+    else:
+        fits = not any(side % loaded.size_multiple for side in size)
+        expected = f"multiples of {loaded.size_multiple}, the network's stride"
+    if not fits:
+        found, remedy = f"images of {width_height(size)}", "Leave both and views as trained."
+        raise SettingError("levels and base_level", found=found, expected=expected, remedy=remedy)
 
 
 def _covered(image: InputImage, wanted: PerspectiveRepresentation, overlap: float) -> SourceViews:

@@ -22,7 +22,7 @@ from tangent_train.heads.pictures import shown_arrays
 from tangent_train.results.evaluation import evaluation_result
 from tangent_train.results.evaluation_result import EvaluationResult
 from tangent_train.results.html.page import EncodedImage, encode_image
-from tangent_train.tasks.divergence import refuse_loss
+from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
 
@@ -242,7 +242,8 @@ class Task(lightning.LightningModule, ABC):
         return self
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Store `fresh`."""
+        """Store `fresh`; keep the file of earlier weights if these are not finite."""
+        check_weights(self)
         if self.fresh is not None:
             checkpoint["fresh"] = sorted(self.fresh)
 

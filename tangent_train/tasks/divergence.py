@@ -1,4 +1,4 @@
-"""Stop a diverged training before its weights are changed."""
+"""Stop a diverged training before its weights or its checkpoints are changed."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 
 _NAMED = 5
+_REMEDY = "a smaller optimizer.lr or trainer.gradient_clip_val=1."
 
 
 def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoReturn:
@@ -36,9 +37,23 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
         f"loss of step {trainer.global_step} (epoch {trainer.current_epoch}, {_some(names)})",
         found=f"{loss}, {reason}",
         expected="a finite number",
-        remedy=f"Try, in a new run, {precision}a smaller optimizer.lr or "
-        "trainer.gradient_clip_val=1.",
+        remedy=f"Try, in a new run, {precision}{_REMEDY}",
     )
+
+
+def check_weights(task: lightning.LightningModule) -> None:
+    """Refuse to save weights that are not finite: a finite loss may have an infinite gradient.
+
+    Raises:
+        SettingError: A weight is NaN or infinite.
+    """
+    if broken := _not_finite(task):
+        raise SettingError(
+            f"weights after step {task.trainer.global_step} (epoch {task.trainer.current_epoch})",
+            found=f"NaN or infinite values in {_some(broken)}",
+            expected="finite numbers; the last checkpoint has them",
+            remedy=f"Try, in a new run, {_REMEDY}",
+        )
 
 
 def _not_finite(task: lightning.LightningModule) -> list[str]:

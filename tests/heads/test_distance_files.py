@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
 from tangent_train.heads import DistanceHead, PredictedImage
 from tangent_train.heads.distance import points_of, spread_pixels
-from tangent_train.heads.pictures import colorize_distance, distance_picture
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import area_of_angles, whole_area
 from tangent_train.io.palette import distance_colors
@@ -71,21 +70,6 @@ def test_depth_files_are_read_back(tmp_path: Path) -> None:
         write_depth_m(tmp_path / f"a{suffix}", meters, 1000)
         found = read_depth_m(tmp_path / f"a{suffix}", 1000)
         np.testing.assert_array_equal(found, np.nan_to_num(meters))
-
-
-def test_pictures_have_a_bar_of_their_colors() -> None:
-    distance = np.tile(np.geomspace(1, 10, 500, dtype=np.float32), (40, 1))
-    picture = distance_picture(distance, "m")
-    assert picture.shape == (62, 500, 3)
-    np.testing.assert_array_equal(picture[:40], colorize_distance(distance))
-    bar = picture[40 + 10]
-    ramp = np.flatnonzero((bar == distance_colors()[0]).all(axis=-1))[0]
-    assert (bar[ramp:][:100].astype(int).sum(axis=-1)[::10] > bar[-80].min()).all()
-    assert picture[40:, : ramp - 2].min() < 100, "text"
-    named = distance_picture(distance, "relative")
-    assert not np.ptp(named[40:, -110:], axis=-1).any(), "gray text on white"
-    assert named[40:, -75:].min() < 100
-    assert distance_picture(np.full((8, 20), np.nan), "m").shape == (30, 20, 3)
 
 
 def test_a_video_has_one_range_of_colors() -> None:

@@ -1,4 +1,4 @@
-"""A third kind of output, a head and its metric, is trained, evaluated and predicted."""
+"""A third kind of output, a head and its metric, is evaluated and predicted."""
 
 from __future__ import annotations
 
@@ -25,14 +25,9 @@ def test_a_head_and_its_metric_are_enough() -> None:
     torch.manual_seed(0)
     head, representation = ShareHead(NAMES, "b"), TangentRepresentation(base_level=0, level=4)
     task = PixelTask(nn.Conv2d(2, 1, 1), representation, head, partial(torch.optim.SGD, lr=5))
-    trainer, data = quiet_trainer(max_epochs=60, limit_val_batches=0), Data()
-    (before,) = trainer.test(task, datamodule=data, verbose=False)
-    trainer.fit(task, datamodule=data)
-    (after,) = trainer.test(task, datamodule=data, verbose=False)
-    assert after["test/mae"] < 0.85 * before["test/mae"]
-    assert head.mode_of(task.monitor) == "min"
+    (scores,) = quiet_trainer().test(task, datamodule=Data(), verbose=False)
     result = task.evaluation_result("panoramas")
-    assert (result.main, result.scores["mae"]) == ("mae", after["test/mae"])
+    assert (result.main, result.scores["mae"]) == ("mae", scores["test/mae"])
 
     loaded = trained_network(TANGENT)
     loaded.__dict__["network"] = nn.Conv2d(3, 1, 1)

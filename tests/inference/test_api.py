@@ -155,7 +155,9 @@ def test_files_get_the_labels_and_scores_of_tangent_predict(
     for given in ("room.png", tmp_path / "room.png"):
         np.testing.assert_array_equal(network.labels(given, **settings), expected)
     without = {name: value for name, value in settings.items() if name != "mask"}
-    np.testing.assert_allclose(network.probabilities("room.png", **without), probabilities, atol=1e-3)
+    np.testing.assert_allclose(
+        network.probabilities("room.png", **without), probabilities, atol=1e-3
+    )
     assert (expected == 0).any() == ("mask" in settings)
     if not tags and not Path(str(settings.get("mask"))).is_dir():
         np.testing.assert_array_equal(network.labels(rgb, **settings), expected)
@@ -166,29 +168,12 @@ def test_files_get_the_labels_and_scores_of_tangent_predict(
             np.testing.assert_array_equal(network.labels(rgb, mask=array), expected)
 
 
-def test_a_network_has_a_description(network: Network) -> None:
-    assert repr(network) == (
-        "<Network of 3 classes (dark, green, bright), inputs rgb, trained at level 4 on 16×16 "
-        "images of TangentRepresentation, on cpu>"
-    )
-
-
 @pytest.mark.gpu
 def test_a_gpu_gives_what_the_cpu_gives(tmp_path: Path, network: Network) -> None:
     panorama = torch.from_numpy(sphere(33)).permute(2, 0, 1)
     on_gpu = tt.load(tmp_path / "net.ckpt", device="cuda").labels(panorama.cuda())
     assert on_gpu.is_cuda
     assert (on_gpu.cpu() == network.labels(panorama)).double().mean() > 0.99
-
-
-def test_images_per_forward_limits_memory(tmp_path: Path) -> None:
-    network = tt.load(write_checkpoint(tmp_path / "net.ckpt"), view_batch_size=7)
-    counts: list[int] = []
-    network.loaded.network.register_forward_pre_hook(
-        lambda _, images: counts.append(len(images[0]))
-    )
-    network.labels(sphere(32))
-    assert counts == [7, 7, 6]
 
 
 def test_depth_is_in_meters(tmp_path: Path, predicted: Predicted) -> None:
@@ -253,6 +238,7 @@ def test_other_images_are_refused(image: Any, message: str, network: Network) ->
         ({"fov": 60, "area": [0, 90, 0, 45]}, "area and upright: found one; expected None"),
         ({"area": [0, 90, 0, 90]}, "area: found .*square"),
         ({"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
+        ({"upright": "pose"}, "upright: found pose; expected the path of a file"),
         ({"mask": 30}, "mask: found 30; expected a latitude"),
         ({"depth": np.zeros((16, 32))}, "for a network that takes depth"),
         ({"mask": "none.png"}, "none.png: found no such file"),

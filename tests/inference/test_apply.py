@@ -100,7 +100,7 @@ _ARRAY = np.zeros((8, 16, 3), np.float32)
 @pytest.mark.parametrize(
     ("function", "message"),
     [
-        (lambda images: images[1:], r"expected a ndarray of numbers \(10, 16, 16\[, K\]\)"),
+        (lambda images: images[1:], "expected a ndarray of numbers for 10 images"),
         (lambda images: images.astype(complex), "complex128; expected a ndarray of numbers"),
         (torch.from_numpy, "found a Tensor"),
         (lambda _: None, "found a NoneType"),

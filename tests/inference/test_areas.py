@@ -15,8 +15,6 @@ from datamodules.core.class_weights import class_weights
 from datamodules.core.samples import valid_mask
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.config.build import build_from_config
-from tangent_train.geometry.coverage import is_valid
-from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
@@ -158,32 +156,6 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     cut = data.canvas.cut
     assert len(np.unique(cut(labels.numpy()))) > 1
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
-
-
-def test_views_inside_the_area_are_those_of_the_whole_panorama(tmp_path: Path) -> None:
-    """Pixel for pixel: colors and labels of all views that see nothing else."""
-    small = TangentRepresentation(1, 5)
-    rendered = []
-    for root in write_both(tmp_path):
-        task = _task("tangent")
-        task.representation = small
-        data = _data(root, task)
-        image = data.dataset("test").read(0)
-        (views,) = image.sampler(small).view_sets(image.valid)
-        rendered.append(
-            [views.render(image.rgb, "bilinear"), views.render(image.labels, "nearest")]
-        )
-        kept = views.grid
-    assert len(rendered[1][0]) < 80
-    west, east, south, north = AREA
-    inner = area_mask((west + 5, east - 5, south + 5, north - 5), (512, 1024))
-    inside = is_valid(inner, kept.directions().reshape(-1, 3)).reshape(len(rendered[1][0]), -1)
-    inside = inside.all(axis=1)
-    assert 5 < inside.sum() < inside.size
-    whole = TangentRepresentation(1, 5).grid
-    faces = (whole.centers_xyz @ kept.centers_xyz.T).argmax(axis=0)
-    for of_whole, of_part in zip(*rendered, strict=True):
-        np.testing.assert_array_equal(of_whole[faces[inside]], of_part[inside])
 
 
 @pytest.mark.parametrize("rotation", ["none", "so3"])

@@ -14,7 +14,6 @@ from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.inference.views import PanoramaViews, PhotoViews
 from tests.fake_gpu import fake_gpu
 from tests.inference.trained import (
@@ -78,13 +77,6 @@ def test_only_the_image_goes_to_the_device_and_only_labels_come_back(
     assert labels.device.type == "cuda"
     assert tuple(labels.shape) == image.shape
     assert set(transfers) == {"from {'cpu'} to {'cuda'}"}
-
-
-def test_up_is_estimated_on_the_device() -> None:
-    trained, image, _ = _case("cube")
-    with fake_gpu(trained.network) as transfers, pytest.raises(RuntimeError, match="numpy"):
-        UpLikelihood(trained, "cuda")(image, np.eye(3))  # the doubts of the first come back
-    assert transfers.count("from {'cuda'} to {'cpu'}") == 1
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -6,7 +6,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +14,6 @@ from torch import nn
 from torchvision.datasets import Cityscapes
 from torchvision.models.segmentation import DeepLabV3_ResNet50_Weights
 
-import datamodules
 from datamodules.cityscapes import CLASSES as CITYSCAPES
 from datamodules.cityscapes import THIRTEEN
 from datamodules.core.label_map import LabelMap, plain_name
@@ -80,24 +78,6 @@ def test_a_map_names_published_classes(name: str) -> None:
         firsts = {text.split(",")[0].strip() for text in mapped.classes[target]}
         assert set(map(plain_name, firsts)) <= set(names)
     assert len(mapped.unmapped) + sum(map(len, mapped.classes.values())) == count
-
-
-@pytest.mark.parametrize(
-    ("name", "labels"),
-    [
-        ("cityscapes_to_densepass13", datamodules.cityscapes.Cityscapes.label_maps),
-        ("synpass_to_densepass13", datamodules.synpass.SynPASS.label_maps),
-        ("structured3d_to_span8", datamodules.structured3d.Structured3D.label_maps),
-    ],
-)
-def test_a_map_maps_a_network_as_label_maps_the_files(name: str, labels: Any) -> None:
-    of_all, *_ = every = list(labels.values())
-    mapped = map_classes(_trained(of_all.names), load_label_map(name))
-    values = {label: value for value, label in of_all.labels.items()}
-    key = [every[1].labels[values[label]] for label in range(1, 1 + len(of_all.names))]
-    order = (*range(1, 1 + len(every[1].names)), 0)
-    groups = [[k for k, to in enumerate(key) if to == label] for label in order]
-    assert [list(group) for group in mapped.loaded.groups] == groups
 
 
 def test_names_are_compared_without_case_hyphens_and_further_synonyms() -> None:

@@ -291,7 +291,7 @@ def test_a_network_of_whole_spheres_takes_only_those_of_its_training(
     representation: dict[str, Any], size: tuple[int, int]
 ) -> None:
     trained = trained_network(representation, fixed_size=size)
-    expected = f"expected {size[1]} × {size[0]} .* labels whole panoramas: leave"
+    expected = f"expected {size[1]} × {size[0]} .* labels whole panoramas"
     changes: dict[str, Any]
     for changes in ({"levels": 5}, {"views": "horizontal"}, {"base_level": 1}):
         with pytest.raises(SettingError, match=expected):

@@ -38,14 +38,6 @@ class Sky(nn.Module):
         return torch.stack([30.0 * fits, 0.0 * fits], dim=1)
 
 
-class WholeSky(Sky):
-    """The same, with all images of a sphere and their viewing rays."""
-
-    def forward(self, images: Tensor, rays: Tensor, **_: Any) -> Tensor:  # type: ignore[override]
-        assert rays.shape == (1, len(images), 3, 3)
-        return super().forward(images)
-
-
 class SkyOfVertices(Sky):
     """The same, for a signal on the vertices of level 4: bright above the horizon."""
 

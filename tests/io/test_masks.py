@@ -123,17 +123,17 @@ def stored_labels(root: Path, name: str) -> Any:
     return np.vectorize(CLASS_OF_STORED.get)(stored)
 
 
-@pytest.mark.parametrize("settings", [{}, {"in_memory": True}, {"store": "store"}], ids=str)
+@pytest.mark.parametrize("settings", [{}, {"in_memory": True}, {"cache": "cache"}], ids=str)
 def test_labels_are_unknown_there_and_pixels_stay(
     root: Path, settings: dict[str, Any], tmp_path: Path
 ) -> None:
-    settings = {n: tmp_path if n == "store" else v for n, v in settings.items()}
+    settings = {n: tmp_path if n == "cache" else v for n, v in settings.items()}
     plain = FolderPanoramas(root, ERP, **settings)
     masked = FolderPanoramas(root, ERP, mask=-30, **settings)
     masked.prepare_data()
     prepared = sorted(tmp_path.rglob("*.npy"))
     plain.prepare_data()
-    assert sorted(tmp_path.rglob("*.npy")) == prepared, "one store for both"
+    assert sorted(tmp_path.rglob("*.npy")) == prepared, "one cache for both"
     for split in ("train", "val", "test"):
         for index, name in enumerate(names_of(masked, split)):
             expected = stored_labels(root, name)

@@ -13,6 +13,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from models.huggingface import architecture
 from tangent_train.errors import DataError, SettingError
 from tangent_train.photo_networks import huggingface, import_network
 from tests.photo_networks import huggingface_networks as networks
@@ -247,3 +248,8 @@ def test_models_of_the_hub_are_fetched_without_code(
     assert tuple(network.score_names) == networks.NAMES
     (patterns,) = requested.values()
     assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
+
+
+def test_settings_that_transformers_does_not_declare_are_dropped() -> None:
+    config = {"model_type": "segformer", "depths": [1, 1, 1, 1], "auto_map": {"x": "y"}, "own": 3}
+    assert architecture(config) == {"model_type": "segformer", "depths": [1, 1, 1, 1]}

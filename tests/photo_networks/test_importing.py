@@ -16,6 +16,7 @@ from torch import Tensor
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
+from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.label_maps import LabelMap, map_classes
@@ -120,7 +121,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
     merged = LabelMap.of({f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network in (loaded, map_classes(loaded, merged).loaded):
-        predictor = Predictor(network, PanoramaViews(network), min_confidence=0.5)
+        predictor = Predictor(network, head_of(network, min_confidence=0.5), PanoramaViews(network))
         mosaic = predictor.predict(InputImage(rgb))
         assert set(np.unique(network.labels(mosaic.labels()))) == {18}
 
@@ -143,6 +144,8 @@ def test_settings_that_do_not_fit_are_refused(
 
 def test_outputs_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
     path = write_linear(tmp_path / "net.onnx", WEIGHT * np.nan, BIAS)
-    with pytest.raises(SettingError, match="output of the network: found .*, 0 numbers are finite"):
+    with pytest.raises(
+        SettingError, match=r"output of the network: found .*, 0 numbers are finite"
+    ):
         _imported(path)
     assert OnnxNetwork(path).fixed_size is None

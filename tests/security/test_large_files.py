@@ -66,7 +66,7 @@ def test_chunks_that_claim_gigabytes_are_not_decoded(tmp_path: Path) -> None:
     path = _png(tmp_path / "a.png", 16, 8)
     whole = path.read_bytes()
     path.write_bytes(whole[:33] + struct.pack(">I", 3_000_000_000) + whole[37:])
-    with pytest.raises(DataError, match=r"a\.png: found .* truncated"):
+    with pytest.raises(DataError, match=r"a\.png: found no image"):
         _pixels(path)
 
 

@@ -20,6 +20,7 @@ from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tangent_train.heads import ClassesHead
 from tangent_train.io.image_files import short_names
+from tangent_train.io.inputs import Job
 from tangent_train.io.pixel_files import read_array, write_pixels
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
@@ -95,7 +96,7 @@ def test_predictions_stay_in_their_folder(names: list[list[str]]) -> None:
     head = ClassesHead(("unknown", "wall"))
     folder = PredictionFolder(Path("/output"), head, ("labels", "probabilities"))
     for name in short_names(paths):
-        for file in folder.files(name).values():
+        for file in folder.files(Job(name, Path())).values():
             assert file.is_relative_to("/output")
             assert ".." not in file.parts
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from types import SimpleNamespace
 from typing import Any, get_args
 
 import numpy as np
@@ -12,7 +11,6 @@ import torch
 from torch import Tensor, nn
 
 from datamodules.core.samples import EvaluationSample, TrainingSample
-from models import AuxiliaryHead
 from tangent_train.checkpoints.distances import from_distance, is_metric
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
@@ -164,14 +162,6 @@ def test_views_are_aligned_with_each_other_as_set() -> None:
     assert errors[None] == errors["scale"] < 0.1 < 0.2 < errors["none"]
 
 
-def test_the_report_has_no_score_of_an_image_without_true_distances() -> None:
-    image = SimpleNamespace(rgb=np.zeros((8, 16, 3), np.uint8), valid=None)
-    steps = torch.zeros(8, 16, dtype=torch.int32)
-    for target, note in ((steps, ""), (steps + 1024, "AbsRel 0.5")):
-        found = _task(nn.Identity()).report_image("a", image, target, torch.ones(8, 16))
-        assert found.note == note
-
-
 def _network() -> nn.Module:
     torch.manual_seed(0)
     last = nn.Conv2d(8, 1, 3, padding=1)
@@ -204,21 +194,11 @@ def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
         assert float((found - whole).norm() / whole.norm()) < 1e-4
 
 
-def test_the_auxiliary_head_adds_its_loss() -> None:
-    images, truth = torch.randn(6, 2, 16, 16), torch.randn(6, 16, 16)
-    network = AuxiliaryHead(nn.Sequential(nn.Conv2d(2, 1, 1)), "0", 2, 1)
-    task = _task(network, auxiliary_weight=0.4)
-    main, auxiliary = ((out[:, 0] - truth).abs().sum() for out in network(images).values())
-    torch.testing.assert_close(task.loss_sum((images,), truth), main + 0.4 * auxiliary)
-
-
 @pytest.mark.parametrize(
     ("network", "settings", "named"),
     [
         (Right("relative_depth"), {"alignment": "none"}, "task.head.alignment.*relative_depth"),
         (nn.Identity(), {"depth_kind": "depth"}, "task.head.depth_kind"),
-        (nn.Identity(), {"loss": "l2"}, "task.head.loss"),
-        (nn.Identity(), {"align": "median"}, "align"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(

@@ -149,16 +149,16 @@ def small_settings(words: list[str], world: Path) -> list[str]:
         return ["--help"] if arguments[0] == "-m" else []
     if "--help" in arguments or any(word.startswith("resume=") for word in arguments):
         return []
-    config = CONFIGS.get(
-        program, "train" if any(w.startswith("data=") for w in arguments) else None
-    )
+    has_data = any(word.startswith(("data=", "experiment=")) for word in arguments)
+    config = CONFIGS.get(program, "train" if has_data else None)
     if config is None or any(word.startswith(("left=", "input=")) for word in arguments):
         return []
     overrides = [
         w for w in arguments if "=" in w and not w.startswith(("sweep=", "launcher=", "hydra."))
     ]
     if program == "tangent-evaluate":
-        overrides = [word for word in overrides if word.startswith(("data=", "representation="))]
+        groups = ("data=", "experiment=", "representation=")
+        overrides = [word for word in overrides if word.startswith(groups)]
     folders = (
         [world / arguments[arguments.index("--config-dir") + 1]]
         if "--config-dir" in arguments
@@ -173,7 +173,8 @@ def small_settings(words: list[str], world: Path) -> list[str]:
             n: v for n, v in settings.items() if not n.startswith(("fine_tuning", "network"))
         }
     if program == "tangent-evaluate":
-        settings = {
-            n: v for n, v in settings.items() if n.startswith(("data.rooms", "representation."))
-        }
+        sections = ["data.rooms", "data.shapes"]
+        if any(word.startswith("representation=") for word in arguments):  # else that of the file
+            sections.append("representation.")
+        settings = {n: v for n, v in settings.items() if n.startswith(tuple(sections))}
     return [f"{name}={value}" for name, value in settings.items()]

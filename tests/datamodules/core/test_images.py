@@ -1,0 +1,49 @@
+"""Sizes and unknown pixels of images, against slow references."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from datamodules.core.images import Unknown, mask_black, resize_depth
+from tangent_train.rendering.resampling import resize
+from tests.datamodules.data_files import nearest_valid
+
+
+def test_a_ramp_keeps_its_place_at_an_uneven_ratio() -> None:
+    # The center of target column j lies at (j + ½) · 3/2 source columns; the ramp shows it.
+    ramp = np.tile(np.arange(96, dtype=np.uint8) * 2, (48, 1))
+    expected = 2 * ((np.arange(64) + 0.5) * 1.5 - 0.5)
+    area = resize(np.repeat(ramp[..., None], 3, axis=2), (32, 64), "bilinear")[0, :, 0]
+    np.testing.assert_allclose(area, expected, atol=1)
+    np.testing.assert_allclose(resize(ramp, (32, 64), "nearest")[0], expected, atol=1)
+    depth = resize_depth(ramp.astype(np.uint16) + 1, (32, 64))[0].astype(int) - 1
+    np.testing.assert_allclose(depth, expected, atol=1)
+
+
+def test_colors_are_means_of_areas() -> None:
+    rgb = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
+    means = rgb.reshape(8, 4, 16, 4, 3).mean(axis=(1, 3))
+    np.testing.assert_allclose(resize(rgb, (8, 16), "bilinear"), means, atol=0.501)
+
+
+@pytest.mark.parametrize("shape", [(12, 24), (4, 8), (3, 6), (5, 10)])
+def test_depth_is_that_of_the_nearest_valid_pixel(shape: tuple[int, int]) -> None:
+    rng = np.random.default_rng(3)
+    depth = rng.integers(1, 2000, (12, 24), np.uint16)
+    depth[rng.random(depth.shape) < 0.7] = 0
+    small = resize_depth(depth, shape)
+    assert small.dtype == np.uint16
+    np.testing.assert_array_equal(small, nearest_valid(depth, shape))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+@pytest.mark.parametrize(
+    ("unknown", "expected"),
+    [("labels", [5, 5, 5]), ("any_black", [0, 0, 5]), ("all_black", [0, 5, 5])],
+)
+def test_black_pixels_are_unknown(unknown: Unknown, expected: list[int], dtype: type) -> None:
+    rgb = np.array([[[0, 0, 0], [9, 0, 9], [1, 2, 3]]], np.uint8)
+    masked = mask_black(np.full((1, 3), 5, dtype), rgb, unknown)
+    assert masked.dtype == dtype
+    assert masked.tolist() == [expected]
