@@ -165,16 +165,21 @@ def _write_colmap_model(project: Path) -> None:
     (model / "points3D.txt").write_text("")
 
 
+def words_in_world(words: list[str], world: Path) -> list[str]:
+    """Return a command with files of the world in place of placeholders and missing runs."""
+    for named in re.findall(r"(?<!dir=)runs/([\w/-]+?)(?=/…|/<|/\d{4}-|\s|$)", " ".join(words)):
+        if not (world / "runs" / named).exists():
+            kind = "shapes/default" if "shapes" in named else "demo"
+            shutil.copytree(world / "runs" / kind / TIME, world / "runs" / named / TIME)
+    return fill_in(words, world)
+
+
 def run(words: list[str], variables: dict[str, str], world: Path) -> None:
     """Run a documented command on small data; it must succeed and write a file.
 
     The process is forked from a server that has already imported the slow modules.
     """
-    for named in re.findall(r"(?<!dir=)runs/([\w/-]+?)(?=/…|/<|/\d{4}-|\s|$)", " ".join(words)):
-        if not (world / "runs" / named).exists():
-            kind = "shapes/default" if "shapes" in named else "demo"
-            shutil.copytree(world / "runs" / kind / TIME, world / "runs" / named / TIME)
-    words = fill_in(words, world)
+    words = words_in_world(words, world)
     for name, _, value in (word.partition("=") for word in words):
         place = world / value
         if name in ("output", "figure") and place != world:
