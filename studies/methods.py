@@ -55,7 +55,8 @@ def picture() -> Figure:
         axis.set_major_formatter("{x:g}")
         axis.set_minor_formatter("")
     cost.xaxis.set_major_locator(MultipleLocator(1))
-    figure.legend(*cost.get_legend_handles_labels(), loc="outside right", frameon=False)
+    handles, names = cost.get_legend_handles_labels()
+    figure.legend(handles, names, loc="outside right center", frameon=False)
     return figure
 
 

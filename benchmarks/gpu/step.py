@@ -84,7 +84,7 @@ def _step(
         compile=compiled if on_gpu or compiled is None else {"backend": "eager"},
     )
     task = task.to(DEVICE).train()
-    optimizer = task.optimization(lambda: {"epoch": 1, "step": 1})
+    optimizer = task.make_optimizer(task.network.parameters())
     images = torch.randn(size, device=DEVICE)
     labels = torch.randint(0, NUM_CLASSES + 1, (size[0], *size[2:]), device=DEVICE).byte()
 

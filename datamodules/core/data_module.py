@@ -268,8 +268,8 @@ class DataModule(LightningDataModule, ABC):
             All problems, and the number of images or shapes, broken ones included.
         """
         found = self._find_files()
-        counts = partial(np.zeros, len(self.label_names), np.int64)
-        self.label_counts = {split: counts() for split in SPLITS}
+        size = len(self.label_names)
+        self.label_counts = {split: np.zeros(size, np.int64) for split in SPLITS}
         usable = {split: self.problems.without(found[split]) for split in SPLITS}
         self._read_all(usable, "Checking", self._counted)
         names = {files.name for files in chain.from_iterable(found.values())}

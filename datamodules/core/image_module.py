@@ -83,7 +83,7 @@ class ImageDataModule(DataModule):
     no_distances: ClassVar[str] = ""
     fact_settings: ClassVar[tuple[str, ...]] = ("unknown",)
 
-    labels: Literal["pixel_classes", "distance"] = PIXEL_CLASSES  # type: ignore[misc]
+    labels: Literal["pixel_classes", "distance"] = "pixel_classes"  # type: ignore[misc]
     inputs: Sequence[Input] = ("rgb", "depth")
     color_jitter: Annotated[float, Field(ge=0, le=1)] = 0.0
     classes: str | int | None = None

@@ -212,7 +212,7 @@ def read_label_map(path: Path) -> LabelMap:
         raise DataError(path, found=found, expected=expected)
     if not isinstance(content, list):
         return LabelMap(names, labels, refuses_others=False)
-    unknown = [*(v for v, name in enumerate(content) if name is None), *_UNKNOWN_VALUES]
+    unknown: list[Key] = [*(v for v, name in enumerate(content) if name is None), *_UNKNOWN_VALUES]
     return LabelMap(names, dict.fromkeys(unknown, 0) | labels)
 
 

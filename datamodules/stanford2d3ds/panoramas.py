@@ -58,6 +58,7 @@ from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.pixel_files import read_pixels
+from tangent_train.io.png import check_png
 
 GET_IT = (
     "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
@@ -270,8 +271,9 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
-        DataError: The file is broken.
+        DataError: The file is broken, or not 16-bit gray.
     """
+    check_png(path, 16, ["gray"])
     steps: NDArray[np.uint16] = read_pixels(path, indices=True)
     steps[steps == MISSING_DEPTH] = 0
     return steps

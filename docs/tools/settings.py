@@ -10,6 +10,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from tangent_train.config.help import (
+    Setting,
     bases,
     command_settings,
     description,

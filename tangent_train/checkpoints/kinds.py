@@ -29,7 +29,8 @@ DepthKind = Literal[
 ]
 """Output of a depth network, a channel of values at the pixels of its images.
 
-* `log_distance`: natural logarithm of the distance along the ray in meters; trained with `DistanceHead`.
+* `log_distance`: natural logarithm of the distance along the ray in meters; trained with
+  `DistanceHead`.
 * `metric_distance`: distance along the ray in meters.
 * `metric_z`: z-depth in meters, the distance times the cosine of the angle to the optical axis.
 * `canonical_inverse`: 1 / z-depth, in meters if the focal length were the width of the image, as of

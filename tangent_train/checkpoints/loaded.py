@@ -99,7 +99,7 @@ class NetworkDescription:
     def plain(self) -> dict[str, Any]:
         """Return the description as plain values, with the version of this package."""
         fields: Any = pydantic.TypeAdapter(NetworkDescription).dump_python(self, mode="json")
-        names = NetworkDescription.__dataclass_fields__  # type: ignore[attr-defined]
+        names = NetworkDescription.__dataclass_fields__
         described = {name: fields[name] for name in names}
         return described | {"tangent_train_version": version("tangent-train")}
 

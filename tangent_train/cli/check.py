@@ -57,8 +57,9 @@ def check(settings: RunSettings) -> None:
         rows, columns = data.representation.image_size
         angles = equirect_solid_angles(data.canvas.full_shape)
         share = 1.0 if valid is None else np.average(valid.mean(axis=1), weights=angles)
+        area = ", ".join(f"{angle:g}" for angle in data.area)
         print_text(
-            f"Area [{', '.join(f'{angle:g}' for angle in data.area)}]: {percent(share)} % of the sphere; "
+            f"Area [{area}]: {percent(share)} % of the sphere; "
             f"{views[0]} of {views[1]} views, {columns} × {rows} pixels each.",
             error=not terminal,
         )

@@ -40,7 +40,8 @@ def evaluate(settings: EvaluateSettings) -> None:
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
-    loaded.check_predicts(get_class(settings.task["head"]["_target_"]).kind, remedy)
+    head: Any = get_class(settings.task["head"]["_target_"])
+    loaded.check_predicts(head.kind, remedy)
     settings = settings.model_copy(update=_of_network(settings, loaded))
     data, notes = build_data(settings), []
     if settings.label_map is not None:

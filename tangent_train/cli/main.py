@@ -46,10 +46,10 @@ def _main(command: str) -> None:
     from tangent_train.files import config_folder
 
     def job(config: DictConfig) -> Any:
+        if in_sweep():  # outside the block: the other jobs go on
+            return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
             settings = validate(command, config)
-            if in_sweep():
-                return run_job(command)
             name = {"import": "import_network"}.get(command, command)  # import is a keyword
             return getattr(import_module(f"tangent_train.cli.{name}"), name)(settings)
 

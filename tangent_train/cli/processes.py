@@ -12,7 +12,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError
 
 OBJECTIVE_FILE = "validation.json"
 """File in a run's folder with the validation score of its best epoch."""
@@ -34,6 +34,7 @@ def run_job(command: str) -> float | None:
 
     Raises:
         DataError: The run failed.
+        SettingError: The sweeper searches in the other direction.
     """
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
@@ -46,7 +47,15 @@ def run_job(command: str) -> float | None:
         found = f"a run that ended with status {status}"
         raise DataError(folder, found=found, expected="a finished run")
     file = folder / OBJECTIVE_FILE
-    return float(json.loads(file.read_bytes())["best"]) if file.is_file() else None
+    if not file.is_file():
+        return None
+    content = json.loads(file.read_bytes())
+    expected = f"{content['mode']}imize"
+    direction = hydra.sweeper.get("direction") or expected
+    if direction != expected:  # the sweeper would search for the worst score
+        expected = f"{expected}, for {content['figure']}"
+        raise SettingError("hydra.sweeper.direction", found=direction, expected=expected)
+    return float(content["best"])
 
 
 def command_line(command: str, arguments: Sequence[str], folder: Path) -> list[str]:

@@ -120,6 +120,6 @@ def _best_validation_score(
         return None
     score = float(best.best_model_score)
     if trainer.is_global_zero:
-        content = {"figure": best.monitor, "best": score}
+        content = {"figure": best.monitor, "best": score, "mode": best.mode}
         write_text(folder / OBJECTIVE_FILE, json.dumps(content) + "\n")
     return score

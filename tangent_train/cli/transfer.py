@@ -206,7 +206,8 @@ def _fine_tuning(config: Any, epochs: int) -> dict[str, Any]:
 def _named(entries: Sequence[Any]) -> Iterator[tuple[str, dict[str, Any]]]:
     """Yield the entries of a list, names or named settings, as settings by name."""
     for entry in entries:
-        settings = {"name": entry} if isinstance(entry, str) else OmegaConf.to_container(entry)
+        named = isinstance(entry, str)
+        settings: Any = {"name": entry} if named else OmegaConf.to_container(entry)
         yield settings.pop("name"), settings
 
 

@@ -478,7 +478,7 @@ def config_name(command: str, arguments: Sequence[str]) -> str:
     if not file.is_file():
         expected = "the folder of a run, which tangent-train printed"
         raise DataError(file.parent, found="no config.yaml", expected=expected)
-    config = OmegaConf.to_container(OmegaConf.load(file))
+    config: Any = OmegaConf.to_container(OmegaConf.load(file))
     defaults = ["_self_", {"override hydra/job_logging": "none"}]
     store("resumed", {**config, "defaults": defaults, "hydra": {"run": {"dir": str(run)}}})
     return "resumed"

@@ -124,8 +124,7 @@ def import_network(
         else:
             _write_checkpoint(loaded, temporary)
         # The classes are from the user.
-        loaded = load_network(temporary, classes_to_trust(network.settings))
-    return loaded
+        return load_network(temporary, classes_to_trust(network.settings))
 
 
 @torch.no_grad()

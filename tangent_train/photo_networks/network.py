@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -35,7 +35,7 @@ class PhotoNetwork:
     """
 
     module: nn.Module
-    settings: Mapping[str, Any] | None
+    settings: dict[str, Any] | None
     score_names: Sequence[str]
     normalization: Normalization
     image_size: tuple[int, int] = USUAL_SIZE

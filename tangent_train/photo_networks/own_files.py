@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +48,7 @@ def load_onnx(
 
 
 def load_config(
-    settings: Mapping[str, Any],
+    settings: dict[str, Any],
     *,
     weights: str | Path | None,
     classes: Path | None,

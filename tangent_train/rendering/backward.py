@@ -94,7 +94,7 @@ def tangent_to_labels(
     shape = check_shape(shape)
     check_images("scores", scores, grid)
     is_summed = blend == "feather" and scores.device.type != "cpu"
-    labels = []
+    labels: list[Tensor] = []
     for stack in scores.reshape(-1, *scores.shape[-4:]):
         mosaic = Mosaic(
             shape,

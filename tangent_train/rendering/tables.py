@@ -260,8 +260,8 @@ def _write_nearest_pixels(
             w = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z
             u = np.float32((m[0, 0] * x + m[0, 1] * y + m[0, 2] * z) / w)
             v = np.float32((m[1, 0] * x + m[1, 1] * y + m[1, 2] * z) / w)
-            row = min(max(np.int64(np.rint(v)), 0), size[0] - 1)
-            column = min(max(np.int64(np.rint(u)), 0), size[1] - 1)
+            row: Any = min(max(np.int64(np.rint(v)), 0), size[0] - 1)
+            column: Any = min(max(np.int64(np.rint(u)), 0), size[1] - 1)
             index[i, j] = (np.int64(owner[i, j]) * size[0] + row) * size[1] + column
 
 

@@ -152,9 +152,9 @@ def test_all_loggers_hold_the_same_scalars_and_pictures(
     assert shown.keys() == pictures.keys()
     for name, images in pictures.items():
         np.testing.assert_array_equal(shown[name], images, err_msg=name)
-    logger: Any = create_autospec(WandbLogger, instance=True)
-    log_image(logger, "val_images/a", images[0], 3)
-    logger.log_image.assert_called_once_with("val_images/a", [images[0]], 3)
+    wandb: Any = create_autospec(WandbLogger, instance=True)
+    log_image(wandb, "val_images/a", images[0], 3)
+    wandb.log_image.assert_called_once_with("val_images/a", [images[0]], 3)
 
 
 def test_hyperparameters_name_and_group_are_logged_once(
@@ -210,6 +210,7 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
 ) -> None:
     folder, task, data = trained
     total, norm, source = 0.0, 0.0, data.dataset("val")
+    head: Any = task.head
     normalization: Any = data.normalization
     for index in range(len(source)):
         panorama, (views,) = source.read(index), TANGENT.view_sets()
@@ -217,7 +218,7 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
         with torch.no_grad():
             scores = task.network(normalize(inputs, normalization, data.inputs)).double()
         labels = views.render(panorama.labels, "nearest").astype(np.int64)
-        weights = np.insert(task.head.class_weights.double().numpy(), 0, 0)[labels]
+        weights = np.insert(head.class_weights.double().numpy(), 0, 0)[labels]
         chosen = scores.log_softmax(1).gather(1, torch.tensor(labels).clamp(min=1)[:, None] - 1)
         total -= float((chosen[:, 0].numpy() * weights).sum())
         norm += float(weights.sum())

@@ -123,5 +123,12 @@ def test_fine_tuning_leaves_a_run_of_its_own(
         assert not frozen or torch.equal(tensor, content["state_dict"][name])
     assert load_network(checkpoint).normalization == Normalization.of("imagenet", 3)
     data = [text for text in SETTINGS if text.startswith(("data.", "trainer."))]
-    run("evaluate", f"checkpoint={checkpoint}", "data=synthrooms", *data, rooms, "hydra.run.dir=again")
+    run(
+        "evaluate",
+        f"checkpoint={checkpoint}",
+        "data=synthrooms",
+        *data,
+        rooms,
+        "hydra.run.dir=again",
+    )
     assert results(tmp_path / "again") == results(tmp_path / "tuned")

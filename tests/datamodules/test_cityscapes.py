@@ -50,7 +50,8 @@ def test_every_id_has_its_published_class(shared: Path) -> None:
 def test_cameras_count_from_pixel_centers(shared: Path) -> None:
     photo = photos(shared).dataset("test").read(0)
     fx, fy, x, y = (value / 16 for value in streets.CAMERA.values())
-    np.testing.assert_allclose(photo.camera_matrix, [[fx, 0, x], [0, fy, y], [0, 0, 1]])
+    matrix: Any = [[fx, 0, x], [0, fy, y], [0, 0, 1]]
+    np.testing.assert_allclose(photo.camera_matrix, matrix)
     assert photo.rgb.shape == (64, 128, 3)
 
 

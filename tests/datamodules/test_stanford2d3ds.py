@@ -14,6 +14,7 @@ from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
+    read_depth,
     read_label_table,
 )
 from tangent_train.errors import DataError
@@ -43,7 +44,7 @@ def test_pixels_of_instances_past_the_end_of_the_table_are_unknown(tmp_path: Pat
 
 
 @pytest.mark.parametrize("fold", [1, 3])  # in fold 3, rooms of 5a and 5b are the same rooms
-def test_folds_are_disjoint_and_rooms_stay_whole(stanford_root: Path, erp: Any, fold: int) -> None:
+def test_folds_are_disjoint_and_rooms_stay_whole(stanford_root: Path, erp: Any, fold: Any) -> None:
     module = Stanford2D3DS(stanford_root, erp, fold=fold, seed=1, val_fraction=0.3)
     module.setup("fit")
     splits = {split: names_of(module, split) for split in ("train", "val", "test")}
@@ -138,6 +139,13 @@ def test_a_photo_is_what_the_files_hold(photo_root: Path) -> None:
     np.testing.assert_allclose(
         photo.camera_matrix, camera_matrix_from_fov(62, (32, 32)), err_msg="counted from centers"
     )
+
+
+def test_depth_of_8_bits_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "depth.png"
+    write_png(path, np.full((4, 8), 200, np.uint8))
+    with pytest.raises(DataError, match="found 8-bit gray; expected 16-bit gray"):
+        read_depth(path)
 
 
 def test_distances_saturate_and_holes_stay_holes() -> None:

@@ -32,7 +32,7 @@ from tangent_train.errors import SettingError
 
 def test_impossible_settings_are_named() -> None:
     with pytest.raises(SettingError, match=r"data\.rooms: found .*expected numbers of rooms"):
-        SynthRooms("rooms", rooms={"rooms": {"7": 1}})
+        SynthRooms("rooms", rooms={"rooms": {"7": 1}})  # type: ignore[arg-type]
 
 
 SEEDS = range(60)

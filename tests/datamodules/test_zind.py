@@ -120,7 +120,7 @@ def test_a_broken_home_is_named_with_its_place(root: Path, name: str) -> None:
 
 
 def test_a_room_without_the_camera_is_left_out(root: Path) -> None:
-    around = {"openings": [], "doors": [], "windows": []}
+    around: dict[str, Any] = {"openings": [], "doors": [], "windows": []}
     corners = [[1, 1], [2, 1], [2, 2], [1, 2]]
     _change(root, {"layout_visible": {"vertices": corners, **around}})
     with pytest.raises(DataError, match=rf"expected a room around {ROOM}/pano_1"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ def test_a_head_and_its_metric_are_enough() -> None:
     result = task.evaluation_result("panoramas")
     assert (result.main, result.scores["mae"]) == ("mae", scores["test/mae"])
 
-    loaded = trained_network(TANGENT)
+    loaded: Any = trained_network(TANGENT)
     loaded.__dict__["network"] = nn.Conv2d(3, 1, 1)
     mosaic = Predictor(loaded, head, PanoramaViews(loaded)).predict(InputImage(sphere(32)))
     with torch.no_grad():

@@ -101,7 +101,8 @@ def test_true_depth_of_views_is_that_of_the_panorama(name: str, kind: DepthKind)
     single = sum(len(views) for views, _ in outputs) == 1
     for blend in ("nearest", "feather"):
         found = _combined(scaled, SHAPE, kind, blend, "scale")
-        assert (found.dtype, found.shape) == (np.float32, SHAPE)
+        assert found.dtype == np.float32
+        assert found.shape == SHAPE
         ratio = found / _truth()
         np.testing.assert_allclose(ratio / np.median(ratio), 1, atol=0.02 if single else 0.01)
     plain = _combined(scaled, SHAPE, kind, "feather", "none") / _truth()

@@ -136,7 +136,11 @@ def test_networks_that_are_hard_to_export_are_exported(
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
 def test_depth_networks_are_exported_and_read_back(suffix: str, tmp_path: Path) -> None:
-    changes = {"class_names": (), "predicts": DISTANCE, "depth_kind": "relative_disparity"}
+    changes: dict[str, Any] = {
+        "class_names": (),
+        "predicts": DISTANCE,
+        "depth_kind": "relative_disparity",
+    }
     trained = replace(small_trained(UNET | {"num_classes": 1}), **changes)
     path = tmp_path / f"net{suffix}"
     assert export_network(trained, path).difference < 1e-5

@@ -94,7 +94,7 @@ def write_depth_checkpoint(
     module = build_from_config(settings, "network")
     usual = {name: tensor[:1] for name, tensor in color_network().state_dict().items()}
     module.load_state_dict(usual if tensors is None else tensors)
-    of_depth = {"class_names": (), "depth_kind": depth_kind}
+    of_depth: dict[str, Any] = {"class_names": (), "depth_kind": depth_kind}
     path.parent.mkdir(parents=True, exist_ok=True)
     save_network(path, trained_network(TANGENT, module=module, settings=settings, **of_depth))
     return path

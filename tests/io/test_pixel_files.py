@@ -398,9 +398,10 @@ def test_files_without_depth_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("missing", [slice(-60, None), slice(1000, 3000)])
-def test_truncated_files_are_named(tmp_path: Path, missing: slice) -> None:
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_truncated_files_are_named(tmp_path: Path, missing: slice, dtype: Any) -> None:
     path = tmp_path / "image.png"
-    write_png(path, _noise((64, 128, 3)))
+    write_png(path, _noise((64, 128, 3), dtype))
     content = bytearray(path.read_bytes())
     del content[missing]
     path.write_bytes(content)

@@ -13,13 +13,14 @@ from numpy.typing import NDArray
 from onnx import helper
 from torch import Tensor
 
+from datamodules.core.label_map import LabelMap
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.label_maps import LabelMap, map_classes
+from tangent_train.inference.label_maps import map_classes
 from tangent_train.inference.views import PanoramaViews
 from tangent_train.photo_networks import import_network
 from tangent_train.photo_networks.own_files import load_onnx

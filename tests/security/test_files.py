@@ -76,7 +76,7 @@ def test_nothing_runs_and_nothing_is_contacted(
         "train": ("init_from=hostile.ckpt", *data, "data.inputs=[rgb]"),
     }
     with watched(tmp_path / "forbidden") as happened:
-        with pytest.raises(DataError, match="hostile.ckpt"):
+        with pytest.raises(DataError, match=r"hostile\.ckpt"):
             tt.load("hostile.ckpt")
         for command, arguments in commands.items():
             if (command, attack) != ("train", "representation"):  # of the config, not of the file

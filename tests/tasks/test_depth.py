@@ -18,7 +18,6 @@ from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.results.evaluation import result_tables
-from tangent_train.tasks import PixelTask
 from tests.tasks.builders import depth_task
 from tests.tasks.shapes import Spheres, gradients_of, quiet_trainer
 from tests.tasks.test_segmentation import WHOLE
@@ -80,7 +79,7 @@ class Right(nn.Module):
         return scale * depth + shift
 
 
-def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> PixelTask:
+def _task(network: nn.Module, representation: Any = TANGENT, **settings: Any) -> Any:
     kind: Any = settings.setdefault("depth_kind", getattr(network, "kind", "log_distance"))
     settings = {"alignment": "none" if is_metric(kind) else "affine"} | settings
     optimizer = settings.pop("optimizer", partial(torch.optim.SGD, lr=0.1))

@@ -16,7 +16,6 @@ from datamodules.core.samples import EvaluationSample, TrainingSample
 from models import AuxiliaryHead
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
-from tangent_train.tasks import PixelTask
 from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import Spheres, quiet_trainer
 
@@ -68,7 +67,7 @@ class SignNetwork(nn.Module):
         return {"out": torch.cat([-signal, signal], dim=1)}
 
 
-def _task(network: nn.Module, **settings: Any) -> PixelTask:
+def _task(network: nn.Module, **settings: Any) -> Any:
     optimizer = partial(torch.optim.SGD, lr=0.1)
     return segmentation_task(network, TANGENT, NAMES, optimizer, **settings)
 

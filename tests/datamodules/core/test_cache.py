@@ -114,9 +114,12 @@ def test_shards_fill_a_cache_and_only_missing_files_are_decoded(
     sorted(cache.rglob("*.npy"))[0].unlink()
     decoded: list[str] = []
     read = Stanford2D3DS.read
-    monkeypatch.setattr(
-        Stanford2D3DS, "read", lambda data, files: decoded.append(files.name) or read(data, files)
-    )
+
+    def noted(data: Any, files: Any) -> Any:
+        decoded.append(files.name)
+        return read(data, files)
+
+    monkeypatch.setattr(Stanford2D3DS, "read", noted)
     Stanford2D3DS(root, erp, cache=cache).prepare_data()
     assert len(decoded) == 1
 

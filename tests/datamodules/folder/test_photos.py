@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.images import Image
 from datamodules.folder.labeled import FolderPhotos
 from tangent_train.errors import DataError
 from tangent_train.rendering import PerspectiveRepresentation
@@ -22,7 +21,7 @@ def _photos(root: Path, **settings: Any) -> FolderPhotos:
     return FolderPhotos(root, CROPS, val_fraction=0, **settings)
 
 
-def _only(root: Path, name: str, **settings: Any) -> Image:
+def _only(root: Path, name: str, **settings: Any) -> Any:
     """A photo, of a data set with another one for training."""
     (root / "test.txt").write_text(name)
     return _photos(root, **settings).dataset("test").read(0)

@@ -79,7 +79,7 @@ def test_the_best_epoch_has_the_smallest_error_and_is_reported(folder: Path, run
 def test_evaluation_takes_other_alignments_and_limits(
     run: Run, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kept = [text for text in SETTINGS if text.startswith(("data", "experiment", "task"))]
+    kept = [text for text in SETTINGS if text.startswith(("data", "experiment", "task", "level"))]
     checkpoint = ["checkpoint=whole/checkpoints/best.ckpt", *kept]
     run("evaluate", *checkpoint, "hydra.run.dir=again")
     assert results(Path("again")) == results(Path("whole"))
@@ -93,7 +93,7 @@ def test_evaluation_takes_other_alignments_and_limits(
     content = results(Path("aligned"))
     assert content["protocol"]["alignment"] == "affine in distance"
     assert content["protocol"]["range"] == "0 to 3 m, predictions clipped"
-    assert content["rmse"] < results(Path("whole"))["rmse"]
+    assert content["scores"]["rmse"] < results(Path("whole"))["scores"]["rmse"]
     facts = (
         "alignment: affine in distance; range: 0 to 3 m, predictions clipped; views aligned: none"
     )
@@ -113,7 +113,7 @@ def test_a_resumed_run_is_the_same(run: Run) -> None:
     ]
     for name, tensor in tensors[0].items():
         assert tensor.equal(tensors[1][name]), name
-    assert results(Path("one"))["absrel"] == results(Path("two"))["absrel"]
+    assert results(Path("one"))["scores"] == results(Path("two"))["scores"]
 
 
 def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network(
@@ -121,7 +121,7 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
 ) -> None:
     once = (*SETTINGS[:-2], "panels=0", "logger=none", "trainer.max_epochs=1")
     run("train", *once, "init_from=whole/checkpoints/best.ckpt", "hydra.run.dir=tuned")
-    assert read_checkpoint(Path("tuned/checkpoints/last.ckpt"))["depth_kind"] == "log_distance"
+    assert load_network(Path("tuned/checkpoints/last.ckpt")).depth_kind == "log_distance"
 
     write_depth_checkpoint(Path("photos.ckpt"), depth_kind="relative_disparity")
     tuned = [s for s in once if "widths" not in s] + ["init_from=photos.ckpt"]
