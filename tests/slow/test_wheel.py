@@ -52,7 +52,7 @@ def test_the_wheel_holds_the_packages_and_the_configs(wheel: Path) -> None:
         "tangent_train/results/protocols.yaml",
         "tangent_train/results/published.csv",
         "tangent_train/inference/label_maps/ade20k_to_stanford2d3ds.json",
-        "datamodules/stanford2d3ds/pairs.csv",
+        "datamodules/tables/stanford2d3ds_pairs.csv",
         "models/unet.py",
     )
     assert set(wanted) <= set(names)
