@@ -41,8 +41,8 @@ test: install
 # The security tests run apart, without coverage: they add an audit hook, and below Python 3.12 coverage cannot start
 # tracing in one thread while such a hook runs in another.
 test-all: install
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered --ignore=tests/security --ignore=tests/slow/security
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal tests/security tests/slow/security
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal --cov --cov-report=term:skip-covered --ignore=tests/security
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal tests/security
 
 lint: install
 	$(BIN)/ruff check .
