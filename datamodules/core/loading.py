@@ -1,8 +1,7 @@
-"""Loaders of samples: order and random numbers, and explanations of their workers' errors."""
+"""Loaders of samples: order and random numbers."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Sized
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset, Sampler, SequentialSampler, Subset
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 
 Seed = int | tuple[int, int]
 """A seed, 0 or more, or two of them; (seed, 0) is the same as the seed alone."""
@@ -154,14 +153,6 @@ def _check_length(length: int, world_size: int) -> None:
         )
 
 
-_FEWER = (
-    "Memory may be too small for that many: use fewer (0 works in the process itself), a lower "
-    "level, or a cache (data.cache=…, data.in_memory=false); or enlarge /dev/shm (docker run "
-    "--shm-size=8g)."
-)
-_CAUGHT = re.compile(r"\ACaught \w+ in DataLoader worker.*\.(?:Data|Setting)Error: ", re.DOTALL)
-
-
 def make_loader(
     dataset: Dataset[Any],
     batch_size: int,
@@ -189,34 +180,6 @@ def make_loader(
         pin_memory=torch.cuda.is_available(),
         worker_init_fn=_opencv_without_threads,
     )
-
-
-def explained(error: Exception, num_workers: int) -> Exception:
-    """Explain an error that a loader, or one of its workers, raised.
-
-    Args:
-        error: The error.
-        num_workers: Number of worker processes of the loader.
-
-    Returns:
-        The error as the worker raised it; an error with a remedy if a worker was killed;
-        otherwise the same error.
-    """
-    text = str(error)
-    died = isinstance(error, RuntimeError) and text.startswith("DataLoader worker (pid")
-    if isinstance(error, ConnectionError | EOFError):  # a batch was fetched as its worker ended
-        died, text = True, "DataLoader worker that ended"
-    if died:
-        return SettingError(
-            "data.num_workers",
-            found=f"{num_workers}, and a {text.partition('. ')[0]}",
-            expected="workers that keep running",
-            remedy=_FEWER,
-        )
-    if not isinstance(error, DataError | SettingError):
-        return error
-    message, caught = _CAUGHT.subn("", text)
-    return type(error)(message.rstrip()) if caught else error
 
 
 def this_process() -> tuple[int, int]:
