@@ -15,14 +15,6 @@ from torch import Tensor
 
 from datamodules.core.images import STEPS_PER_M
 from datamodules.core.labels import DISTANCE
-from tangent_train.checkpoints.distances import (
-    along_rays,
-    depth_of_output,
-    distance_of,
-    from_distance,
-    is_disparity,
-    is_metric,
-)
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
@@ -36,6 +28,14 @@ from tangent_train.heads.base import (
     Scores,
     SummaryTable,
     solid_angles,
+)
+from tangent_train.heads.distances import (
+    along_rays,
+    depth_of_output,
+    distance_of,
+    from_distance,
+    is_disparity,
+    is_metric,
 )
 from tangent_train.heads.losses import DepthLoss, log_error_sum
 from tangent_train.heads.pictures import (

@@ -14,7 +14,7 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 from torchmetrics import SumMetric
 
-from tangent_train.checkpoints.scores import network_for_views
+from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import at_least
 from tangent_train.heads import Head
 from tangent_train.heads.base import RGB

@@ -64,7 +64,7 @@ class PixelTask(Task):
                 expected="tangent images or a cube map for a network with cross-image context",
                 remedy="Use the network without context.",
             )
-        head.num_outputs = getattr(network, "num_scores", head.num_outputs)
+        head.num_outputs = getattr(network, "num_outputs", head.num_outputs)
         self.auxiliary_weight = auxiliary_weight
         self.eval_view_batch_size = at_least("task.eval_view_batch_size", eval_view_batch_size, 1)
 
