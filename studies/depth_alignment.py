@@ -18,9 +18,9 @@ import torch
 from numpy.typing import NDArray
 
 from studies.output import Row, save
-from tangent_train.checkpoints.distances import distance_of, from_distance
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.heads.alignment import align_views, sample_views, sphere_points
+from tangent_train.heads.distances import distance_of, from_distance
 from tangent_train.io.pixel_files import read_depth_m
 from tangent_train.rendering import HorizontalRepresentation
 

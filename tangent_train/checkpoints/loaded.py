@@ -21,9 +21,8 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.distances import DistanceNetwork
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.checkpoints.scores import ClassScoreNetwork
+from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import load_plain
@@ -165,11 +164,11 @@ class LoadedNetwork(NetworkDescription):
         """
         tile = None if self.is_spherical else self.fixed_size
         if self.predicts == DISTANCE and self.depth_kind is not None:
-            return DistanceNetwork(self.module, self.depth_kind, tile).eval()
+            return OutputNetwork(self.module, 1, tile=tile, kind=None).eval()
         if self.predicts != PIXEL_CLASSES:
             return self.module
         count = len(self.class_names) - 1
-        return ClassScoreNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
+        return OutputNetwork(self.module, count, self.groups, tile, self.score_kind).eval()
 
     def labels(self, best: Tensor) -> NDArray[np.unsignedinteger]:
         """Convert indices of the best scores to labels.

@@ -30,7 +30,7 @@ def export(settings: ExportSettings) -> None:
     fixed, multiple = written.loaded.fixed_size, loaded.size_multiple
     sides = width_height(fixed) if fixed else "any size"
     sides += f", multiples of {multiple}" if multiple > 1 and not fixed else ""
-    scores, of_what = f"scores: {loaded.network.num_scores} classes", "scores"
+    scores, of_what = f"scores: {loaded.network.num_outputs} classes", "scores"
     if loaded.depth_kind is not None:
         scores, of_what = f"depth: {loaded.depth_kind}", "depth"
     print_text(

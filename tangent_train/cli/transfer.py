@@ -32,7 +32,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.checkpoints.scores import network_for_views
+from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.cli.processes import command_line, quoted, run_process
 from tangent_train.cli.run import build_data
 from tangent_train.config.settings import SETTINGS, validate

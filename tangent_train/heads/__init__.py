@@ -37,5 +37,5 @@ def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:
     if loaded.depth_kind is not None:
         return DistanceHead(depth_kind=loaded.depth_kind, **settings)
     head = ClassesHead(loaded.class_names, **settings)
-    head.num_outputs = loaded.network.num_scores  # with that of no class
+    head.num_outputs = loaded.network.num_outputs  # with that of no class
     return head

@@ -11,7 +11,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from tangent_train.checkpoints.distances import depth_of_output, distance_of, is_metric
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.geometry import ray_lengths
 from tangent_train.heads.alignment import (
@@ -21,6 +20,7 @@ from tangent_train.heads.alignment import (
     sample_views,
     sphere_points,
 )
+from tangent_train.heads.distances import depth_of_output, distance_of, is_metric
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views

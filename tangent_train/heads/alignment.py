@@ -33,10 +33,10 @@ from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
 
-from tangent_train.checkpoints.distances import RAY_POWERS, along_rays, is_disparity, is_metric
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
+from tangent_train.heads.distances import RAY_POWERS, along_rays, is_disparity, is_metric
 from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.views import Views
 

@@ -19,8 +19,7 @@ import torch
 from datamodules.core.images import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
 from datamodules.core.samples import render_inputs
-from tangent_train.checkpoints.distances import DistanceNetwork
-from tangent_train.checkpoints.scores import ClassScoreNetwork, network_for_views, plain_scores
+from tangent_train.checkpoints.outputs import OutputNetwork, network_for_views, plain_output
 from tangent_train.errors import SettingError, at_least
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import sphere_rays
@@ -50,8 +49,7 @@ _PIXELS_PER_FORWARD = 2**20
 
 def sees_rays(network: nn.Module) -> bool:
     """Return True if a network takes viewing rays, such as one with cross-image attention."""
-    wrappers = ClassScoreNetwork, DistanceNetwork
-    inner = network.network if isinstance(network, wrappers) else network
+    inner = network.network if isinstance(network, OutputNetwork) else network
     return "rays" in inspect.signature(inner.forward).parameters
 
 
@@ -86,7 +84,7 @@ def view_scores(
     for start in range(0, count, step):
         part = slice(start, min(start + step, count))
         returned = network(images(part), *(() if rays is None else (rays[None],)))
-        yield part, plain_scores(returned).float()
+        yield part, plain_output(returned).float()
 
 
 def scored_views(

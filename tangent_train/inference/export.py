@@ -147,7 +147,7 @@ def _write_onnx(
     program.save(path, external_data=False)
     written = replace(loaded, fixed_size=fixed, settings=None)
     if not returns_labels:  # the graph computes the logits and adds them up
-        count = getattr(loaded.network, "num_scores", 1)
+        count = getattr(loaded.network, "num_outputs", 1)
         groups = tuple((k,) for k in range(count)) if loaded.groups else None
         written = replace(written, groups=groups, score_kind="logits")
     write_onnx_description(path, path, written)

@@ -20,7 +20,7 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
-from tangent_train.checkpoints.scores import Groups, network_for_views, plain_scores
+from tangent_train.checkpoints.outputs import Groups, network_for_views, plain_output
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import classes_to_trust
 from tangent_train.errors import SettingError, first_line, width_height
@@ -136,7 +136,7 @@ def _output(network: PhotoNetwork, size: tuple[int, int]) -> Tensor:
         for values in (network.normalization.mean, network.normalization.std)
     )
     try:
-        output = plain_scores(network.module.eval()((image - mean) / std)).float()
+        output = plain_output(network.module.eval()((image - mean) / std)).float()
     except Exception as error:  # networks raise many kinds about images that they do not take
         raise SettingError(
             "network",

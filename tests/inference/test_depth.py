@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 import tangent_train as tt
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.distances import from_distance, is_metric
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
@@ -29,6 +28,7 @@ from tangent_train.geometry import (
 from tangent_train.geometry.equirect import area_mask
 from tangent_train.heads import head_of
 from tangent_train.heads.aligned_mosaic import AlignedMosaic
+from tangent_train.heads.distances import from_distance, is_metric
 from tangent_train.inference.api import Network
 from tangent_train.inference.applying import apply
 from tangent_train.inference.engine import Predictor

@@ -25,7 +25,7 @@ from datamodules.synpass import CLASSES as SYNPASS
 from datamodules.synthia.reader import CLASSES as SYNTHIA
 from datamodules.zind.layout import CLASSES as ZIND
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.checkpoints.scores import Groups
+from tangent_train.checkpoints.outputs import Groups
 from tangent_train.errors import SettingError
 from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
 from tests.inference.trained import TANGENT, trained_network

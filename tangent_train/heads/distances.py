@@ -6,77 +6,11 @@ import math
 from typing import Any
 
 import torch
-from torch import Tensor, nn
-from torch.nn import functional
+from torch import Tensor
 
 from tangent_train.checkpoints.kinds import DepthKind
-from tangent_train.checkpoints.scores import plain_scores
-from tangent_train.errors import SettingError
 
 _FARTHEST_M = 1e4
-
-_MAP = 3
-"""Number of dimensions of depth without an axis of channels."""
-
-
-class DistanceNetwork(nn.Module):
-    """A depth network whose output is checked, for images of any size.
-
-    Args:
-        network: Network that maps images ``(B, C, h, w)`` to depth ``(B, 1, h, w)`` or
-            ``(B, h, w)``, or to a dict with it under ``"out"``.
-        kind: Kind of the network's output.
-        tile: Rows and columns of the only image size that the network takes; other images are
-            resized to it, and their depth back. They are not divided as for classes: the parts of
-            an image would have different scales. None if the network takes other sizes.
-
-    Attributes:
-        kind: See above.
-        tile: See above.
-        num_scores: 1, the number of output channels.
-    """
-
-    num_scores = 1
-
-    def __init__(
-        self, network: nn.Module, kind: DepthKind, tile: tuple[int, int] | None = None
-    ) -> None:
-        super().__init__()
-        self.network = network
-        self.kind: DepthKind = kind
-        self.tile = tile
-
-    def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        """Return depth ``(B, 1, h, w)`` of the kind.
-
-        Args:
-            images: Normalized images ``(B, C, h, w)``.
-            *arguments: Further arguments of the network.
-            **settings: Further arguments of the network, by name.
-
-        Raises:
-            SettingError: The network returns other shapes.
-        """
-        size = (images.shape[-2], images.shape[-1])
-        is_resized = self.tile not in (None, size)
-        if is_resized:
-            images = _resized(images, self.tile)
-        depth = plain_scores(self.network(images, *arguments, **settings))
-        if depth.ndim == _MAP:
-            depth = depth[:, None]
-        is_traced = torch.compiler.is_compiling()  # comparing would fix the sizes of the graph
-        if not is_traced and depth.shape != (len(images), 1, *images.shape[-2:]):
-            raise SettingError(
-                "depth network",
-                found=f"output {tuple(depth.shape)}, for images {tuple(images.shape)}",
-                expected="one value for each pixel, (B, 1, h, w)",
-            )
-        return _resized(depth, size) if is_resized else depth
-
-
-def _resized(images: Tensor, size: Any) -> Tensor:
-    return functional.interpolate(images, size, mode="bilinear", antialias=True)
-
 
 RAY_POWERS: dict[str, int] = {
     "metric_distance": 0,

@@ -7,19 +7,16 @@ from typing import Any, get_args
 
 import pytest
 import torch
-from torch import Tensor, nn
 
-from tangent_train.checkpoints.distances import (
-    DistanceNetwork,
+from tangent_train.checkpoints.kinds import DepthKind
+from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
+from tangent_train.heads.distances import (
     along_rays,
     depth_of_output,
     distance_of,
     from_distance,
     is_disparity,
 )
-from tangent_train.checkpoints.kinds import DepthKind
-from tangent_train.errors import SettingError
-from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
 
 
 @pytest.mark.parametrize("kind", get_args(DepthKind))
@@ -70,41 +67,3 @@ def test_values_without_a_distance_are_unknown() -> None:
         depth, depth_kind = depth_of_output(odd, kind, one)
         found = distance_of(along_rays(depth, depth_kind, one), depth_kind)
         assert found.isfinite().tolist() == known.get(kind, [0] * 5)
-
-
-class _MeanColor(nn.Module):
-    """Depth is the mean of the channels; only one size is taken if it is given."""
-
-    def __init__(self, size: tuple[int, int] | None = None, output: str = "map") -> None:
-        super().__init__()
-        self.size, self.output = size, output
-
-    def forward(self, images: Tensor) -> Any:
-        if self.size not in (None, tuple(images.shape[-2:])):
-            raise ValueError(self.size)
-        depth = images.mean(dim=1)
-        channel = depth[:, None]
-        return {"map": depth, "channel": channel, "dict": {"out": channel}}.get(self.output, images)
-
-
-@pytest.mark.parametrize("output", ["map", "channel", "dict", "colors"])
-def test_outputs_of_several_forms_have_one_channel(output: str) -> None:
-    images, network = (
-        torch.randn(2, 3, 4, 6),
-        DistanceNetwork(_MeanColor(output=output), "metric_z"),
-    )
-    if output == "colors":
-        with pytest.raises(SettingError, match=r"depth network: found output \(2, 3, .*one value"):
-            network(images)
-        return
-    torch.testing.assert_close(network(images), images.mean(dim=1, keepdim=True))
-
-
-def test_images_are_resized_for_networks_of_one_size() -> None:
-    """A plane keeps its depth: no part of the image is predicted separately."""
-    network = DistanceNetwork(_MeanColor((4, 6)), "relative_disparity", tile=(4, 6))
-    x, y = torch.meshgrid(torch.linspace(-1, 1, 12), torch.linspace(-1, 1, 8), indexing="xy")
-    images = (2 + 0.5 * x + y).expand(1, 3, 8, 12)
-    found = network(images)
-    assert found.shape == (1, 1, 8, 12)
-    torch.testing.assert_close(found[..., 1:-1, 1:-1], images[:, :1, 1:-1, 1:-1], atol=0.1, rtol=0)

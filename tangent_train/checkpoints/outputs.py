@@ -1,8 +1,9 @@
-"""Convert the output of networks to scores of classes at every pixel."""
+"""Convert the output of networks to what heads take: logits of classes, or depth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -13,8 +14,8 @@ from models.distortion_aware import make_distortion_aware
 from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.errors import SettingError, width_height
 
-_LABEL_MAP = 3
-"""Number of dimensions of label maps without an axis of scores."""
+_MAP = 3
+"""Number of dimensions of labels or depth without an axis of channels."""
 
 _CERTAIN = 20.0
 """Score of a pixel's class if the network returns labels."""
@@ -23,68 +24,63 @@ Groups = Sequence[Sequence[int]]
 """Indices of the scores of each class, whose probabilities are added up."""
 
 
-class ClassScoreNetwork(nn.Module):
-    """A network whose output is converted to the scores of classes.
+class OutputNetwork(nn.Module):
+    """A network whose output is converted, for images of any size.
 
     Args:
-        network: Network that maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to a dict
-            with these under ``"out"`` (as in torchvision), or to label maps.
-        num_classes: Number K of classes.
+        network: Network that maps images ``(B, C, h, w)`` to scores ``(B, K, h, w)``, to label maps
+            or depth, with or without an axis of channels, or to a dict with one of these under
+            ``"out"`` (as in torchvision).
+        num_outputs: Number of channels of its output: K classes, or 1 for depth.
         groups: Indices of the network's scores for each class, including index K of kinds that
             have it. Scores in no group, and classes without scores, never win. None if each score
             is a class.
-        tile: Rows and columns of the only image size that the network takes; larger images are
-            divided. None if it takes other sizes.
-        kind: Kind of the network's output.
+        tile: Rows and columns of the only image size that the network takes; None if it takes other
+            sizes. Larger images are divided for classes. For depth, images are resized: the parts
+            of an image would have different scales.
+        kind: Kind of the scores; None for depth.
 
     Attributes:
-        num_scores: Number of scores of a pixel: K, or the number of groups.
+        num_outputs: Number of channels of the converted output, with `groups` their number.
         tile: See above.
     """
 
     def __init__(
         self,
         network: nn.Module,
-        num_classes: int,
+        num_outputs: int,
         groups: Groups | None = None,
         tile: tuple[int, int] | None = None,
-        kind: ScoreKind = "logits",
+        kind: ScoreKind | None = "logits",
     ) -> None:
         super().__init__()
         self.network = network
-        self.num_scores = num_classes if groups is None else len(groups)
-        self._groups = groups
+        self.num_outputs = num_outputs if groups is None else len(groups)
         self.tile = tile
-        self._kind = kind
+        self._groups, self._kind = groups, kind
 
     def forward(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        """Return the scores ``(B, num_scores, h, w)``.
+        """Return the converted output ``(B, num_outputs, h, w)``.
 
         Args:
             images: Normalized images ``(B, C, h, w)``.
             *arguments: Further arguments of the network.
             **settings: Further arguments of the network, by name.
-
-        Raises:
-            SettingError: The network returns another number of scores.
         """
         size = (images.shape[-2], images.shape[-1])
         if self.tile in (None, size):
-            return self._class_scores(images, *arguments, **settings)
-        return _tiled_scores(self._class_scores, images, self.tile)
+            return self._outputs(images, *arguments, **settings)
+        if self._kind is None:
+            return _resized(self._outputs(_resized(images, self.tile)), size)
+        return _mean_of_tiles(self._outputs, images, self.tile)
 
-    def _class_scores(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
-        returned = self.network(images, *arguments, **settings)
+    def _outputs(self, images: Tensor, *arguments: Any, **settings: Any) -> Tensor:
+        outputs = plain_output(self.network(images, *arguments, **settings))
+        if self._kind is None:
+            return outputs[:, None] if outputs.ndim == _MAP else outputs
         groups = self._groups
-        needed = self.num_scores if groups is None else 1 + max(k for g in groups for k in g)
-        scores = as_logits(plain_scores(returned), self._kind, needed - 1)
-        count = scores.shape[1]
-        if count < needed or (groups is None and count > needed):
-            raise SettingError(
-                "class names of the network",
-                found=f"{self.num_scores}, for {count} scores",
-                expected="one name for each score",
-            )
+        last = self.num_outputs - 1 if groups is None else max(k for group in groups for k in group)
+        scores = as_logits(outputs, self._kind, last)
         if groups is None:
             return scores
         return torch.cat([_sum(scores, group) for group in groups], dim=1)
@@ -113,10 +109,10 @@ def network_for_views(network: nn.Module, distortion_aware: bool | None) -> nn.M
     return make_distortion_aware(network)
 
 
-def plain_scores(returned: Any) -> Tensor:
-    """Return scores or label maps from a network's output, which is a dict in torchvision."""
-    scores: Tensor = returned["out"] if isinstance(returned, dict) else returned
-    return scores
+def plain_output(returned: Any) -> Tensor:
+    """Return the main output of a network, which returns a dict in torchvision."""
+    output: Tensor = returned["out"] if isinstance(returned, dict) else returned
+    return output
 
 
 def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
@@ -132,7 +128,7 @@ def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
         `ScoreKind`.
     """
     if kind == "labels":
-        values = scores if scores.ndim == _LABEL_MAP else scores[:, 0]
+        values = scores if scores.ndim == _MAP else scores[:, 0]
         known = (values >= 0) & (values < num_labels)  # False for NaN
         labels = torch.where(known, values.long(), num_labels)
         return functional.one_hot(labels, num_labels + 1).movedim(-1, 1) * _CERTAIN
@@ -155,21 +151,24 @@ def _sum(scores: Tensor, group: Sequence[int]) -> Tensor:
     return chosen if len(group) == 1 else chosen.logsumexp(1, keepdim=True)
 
 
-def _tiled_scores(network: Any, images: Tensor, tile: tuple[int, int]) -> Tensor:
+def _resized(images: Tensor, size: Any) -> Tensor:
+    return functional.interpolate(images, size, mode="bilinear", antialias=True)
+
+
+def _mean_of_tiles(
+    network: Callable[[Tensor], Tensor], images: Tensor, tile: tuple[int, int]
+) -> Tensor:
     """Return the mean scores of evenly spaced tiles that cover larger images."""
-    starts = [
+    tops, lefts = (
         torch.linspace(0, side - part, -(-side // part)).round().int().tolist()
         for side, part in zip(images.shape[-2:], tile, strict=True)
-    ]
-    total: Any = 0
-    count = images.new_zeros(images.shape[-2:])
-    for top in starts[0]:
-        for left in starts[1]:
-            area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
-            scores = network(images[area])
-            if not count.any():
-                total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
-            total[area] += scores
-            count[area] += 1
-    result: Tensor = total / count
-    return result
+    )
+    total, count = torch.zeros(()), images.new_zeros(images.shape[-2:])
+    for top, left in itertools.product(tops, lefts):
+        area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
+        scores = network(images[area])
+        if not total.ndim:
+            total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
+        total[area] += scores
+        count[area] += 1
+    return total / count

@@ -1,14 +1,15 @@
-"""Scores of the classes of any network."""
+"""Outputs of any network: scores of classes, or depth."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor, nn
 
 from tangent_train.checkpoints.kinds import ScoreKind
-from tangent_train.checkpoints.scores import ClassScoreNetwork, as_logits
-from tangent_train.errors import SettingError
+from tangent_train.checkpoints.outputs import OutputNetwork, as_logits
 
 
 class LabelMaps(nn.Module):
@@ -18,21 +19,10 @@ class LabelMaps(nn.Module):
         return images[:, 0]
 
 
-@pytest.mark.parametrize(
-    ("num_classes", "groups", "message"),
-    [(4, None, "found 4, for 5 scores"), (6, None, "6, for 5"), (1, [[5]], "1, for 5")],
-)
-def test_other_numbers_of_names_than_of_scores_are_refused(
-    num_classes: int, groups: list[list[int]] | None, message: str
-) -> None:
-    with pytest.raises(SettingError, match=message):
-        ClassScoreNetwork(nn.Conv2d(3, 5, 1), num_classes, groups)(torch.zeros(1, 3, 2, 2))
-
-
 def test_label_maps_are_certain() -> None:
     """Other values are in the last group."""
     images = torch.tensor([0.0, 2.0, 1.0, -1.0, 3.0, 255.0, torch.nan]).expand(1, 3, 2, 7)
-    scores = ClassScoreNetwork(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
+    scores = OutputNetwork(LabelMaps(), 3, [[0], [1], [2], [3]], kind="labels")(images)
     assert scores.argmax(dim=1).tolist() == [[[0, 2, 1, 3, 3, 3, 3]] * 2]
     assert float(scores.softmax(dim=1).amax(dim=1).min()) > 0.999
 
@@ -52,7 +42,34 @@ def test_larger_images_are_divided(size: tuple[int, int]) -> None:
     expected, seen = network(images), []
     network.register_forward_pre_hook(lambda _, given: seen.append(given[0].shape[-2:]))
     with torch.no_grad():
-        found = ClassScoreNetwork(network, 2, tile=(4, 6))(images)
+        found = OutputNetwork(network, 2, tile=(4, 6))(images)
     torch.testing.assert_close(found, expected.detach())
     assert set(seen) == {(4, 6)}
     assert len(seen) == -(-size[0] // 4) * -(-size[1] // 6)
+
+
+class _MeanColor(nn.Module):
+    """Depth is the mean of the channels, of images of one size."""
+
+    def __init__(self, output: str) -> None:
+        super().__init__()
+        self.output = output
+
+    def forward(self, images: Tensor) -> Any:
+        assert images.shape[-2:] == (4, 6)
+        depth = images.mean(dim=1)
+        channel = depth[:, None]
+        return {"map": depth, "channel": channel, "dict": {"out": channel}}[self.output]
+
+
+@pytest.mark.parametrize("output", ["map", "channel", "dict"])
+def test_depth_has_one_channel_and_images_are_resized_for_it(output: str) -> None:
+    """A plane keeps its depth: no part of the image is predicted separately."""
+    network = OutputNetwork(_MeanColor(output), 1, tile=(4, 6), kind=None)
+    images = torch.randn(2, 3, 4, 6)
+    torch.testing.assert_close(network(images), images.mean(dim=1, keepdim=True))
+    x, y = torch.meshgrid(torch.linspace(-1, 1, 12), torch.linspace(-1, 1, 8), indexing="xy")
+    images = (2 + 0.5 * x + y).expand(1, 3, 8, 12)
+    found = network(images)
+    assert found.shape == (1, 1, 8, 12)
+    torch.testing.assert_close(found[..., 1:-1, 1:-1], images[:, :1, 1:-1, 1:-1], atol=0.1, rtol=0)
