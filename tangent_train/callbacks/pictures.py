@@ -12,7 +12,7 @@ from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, W
 
 from tangent_train.heads.pictures import evenly_spread
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.results.html import EncodedImage
+from tangent_train.results.page import EncodedImage
 
 _MOST_ROWS = 256
 """Larger images are reduced in logs, which contain the pictures of all validations."""

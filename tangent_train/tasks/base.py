@@ -19,9 +19,8 @@ from tangent_train.errors import at_least
 from tangent_train.heads import Head
 from tangent_train.heads.base import RGB
 from tangent_train.heads.pictures import shown_arrays
-from tangent_train.results.evaluation import evaluation_result
-from tangent_train.results.evaluation_result import EvaluationResult
-from tangent_train.results.html.page import EncodedImage, encode_image
+from tangent_train.results.evaluation import EvaluationResult, evaluation_result
+from tangent_train.results.page import EncodedImage, encode_image
 from tangent_train.tasks.divergence import check_weights, refuse_loss
 from tangent_train.tasks.parameter_groups import freeze, groups_of
 from tangent_train.tasks.schedules import Schedule
