@@ -10,6 +10,7 @@ from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from pydantic import ValidationError
 
 from tangent_train.errors import DataError, SettingError
 
@@ -41,6 +42,7 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
         if isinstance(cause, DataError | SettingError):
             raise cause from None
         is_call = isinstance(cause, TypeError) and "argument" in str(cause)
+        is_call |= isinstance(cause, ValidationError)  # of a function that checks its arguments
         if cause is not None and not is_call and not isinstance(cause, ImportError):
             raise cause from None
         reason = " ".join(str(cause or error).split())

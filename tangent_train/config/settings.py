@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from hydra.core.config_store import ConfigStore
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
 
 from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
@@ -80,7 +80,7 @@ class PredictSettings(ImageSettings):
     class)"""
     depth: ExistingPath | None = None
     """folder of depth images with the names of the inputs, for networks with depth"""
-    depth_scale: float = 1000
+    depth_scale: float = Field(1000, gt=0)
     """units per meter in depth files of integers, read or written"""
     projection: Literal["equirectangular", "perspective"] = "equirectangular"
     """equirectangular | perspective (photos)"""
@@ -109,9 +109,9 @@ class PredictSettings(ImageSettings):
     mask: float | ExistingPath | None = None
     """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
     a folder of them; null = none"""
-    min_confidence: float = 0
+    min_confidence: float = Field(0, ge=0, le=1)
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
-    min_share: float = 0
+    min_share: float = Field(0, ge=0, lt=1)
     """keep at least this share of each class's pixels, the most confident, below min_confidence
     too; found on up to 32 images"""
     align: Align | None = None
@@ -119,7 +119,7 @@ class PredictSettings(ImageSettings):
     view); null: by the network's kind of depth"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
-    points: int | None = None
+    points: int | None = Field(None, ge=1)
     """depth, write=[points]: points of an image, at most; null = 500000"""
     write: OneOrMore[str] | None = None
     """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
