@@ -18,7 +18,7 @@ from datamodules.core.images import Image, ImageFiles
 from datamodules.core.loading import sample_rng
 from datamodules.core.splits import Split
 from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.geometry.equirect import check_area
+from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
     PanoramaArea,
