@@ -127,7 +127,7 @@ class Task(lightning.LightningModule, ABC):
 
     def true_labels(self, batch: Any) -> Tensor:
         """Return the true labels of an evaluated batch, one item per prediction."""
-        labels: Tensor = batch.target
+        labels: Tensor = batch.labels
         return labels
 
     # Training

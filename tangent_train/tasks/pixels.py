@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from datamodules.core.samples import EvaluationSample, valid_mask
+from datamodules.core.dataset import Sample, valid_mask
 from tangent_train.errors import SettingError, at_least
 from tangent_train.heads import Head
 from tangent_train.inference.engine import scored_views, sees_rays, upright_rays, view_scores
@@ -141,8 +141,8 @@ class PixelTask(Task):
         """Add a batch of panoramas or photos to `metric`; return the predictions."""
         predictions = []
         for fields in zip(*batch, strict=True):
-            sample: EvaluationSample[Tensor] = EvaluationSample(*fields)
-            truth = self.head.truth(sample.target)
+            sample: Sample[Tensor] = Sample(*fields)
+            truth = self.head.truth(sample.labels)
             if truth.ndim == 2:
                 where = sample.rotation.cpu().numpy(), valid_mask(sample.valid)
                 predicted = self.predict_panorama(sample.images, tuple(truth.shape), *where, truth)
@@ -154,7 +154,7 @@ class PixelTask(Task):
             predictions.append(prediction)
         return torch.stack(predictions)
 
-    def predict_crops(self, sample: EvaluationSample[Tensor], truth: Tensor) -> Tensor:
+    def predict_crops(self, sample: Sample[Tensor], truth: Tensor) -> Tensor:
         """Predict the crops of a photo ``(n, h, w)``; see `predict_panorama`."""
         lengths = sample.ray_lengths
         lengths = lengths.expand(len(truth), *lengths.shape[-2:])

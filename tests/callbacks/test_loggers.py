@@ -20,8 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 )
 from torch import nn
 
+from datamodules.core.dataset import render_inputs
 from datamodules.core.inputs import normalize
-from datamodules.core.samples import render_inputs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run

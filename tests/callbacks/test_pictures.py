@@ -44,7 +44,7 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
         target = torch.ones((2, *SHAPE), dtype=torch.uint8)
         prediction = target.clone().long()
         prediction.flatten(1)[:, 0] = 2
-        batch = SimpleNamespace(index=torch.tensor([first, first + 1]), target=target)
+        batch = SimpleNamespace(index=torch.tensor([first, first + 1]), labels=target)
         panels.on_test_batch_end(trainer, task, prediction, batch, first // 2)
     panels.on_test_end(trainer, task)
     chosen = (0, 3, 6, 9)
