@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.geometry import FLIP_Y, equirect_directions
+from tangent_train.geometry import equirect_directions, to_right_handed
 from tangent_train.io.pixel_files import read_depth_m
 
 SIDE = 320
@@ -59,7 +59,7 @@ def main() -> None:
     arguments = parser.parse_args()
     bgr: Any = cv2.imread(arguments.panorama)
     rgb = bgr[..., ::-1]
-    rays = equirect_directions(rgb.shape[:2]) @ FLIP_Y
+    rays = to_right_handed(equirect_directions(rgb.shape[:2]))
     depths = [read_depth_m(path, arguments.depth_scale) for path in arguments.depth]
     clouds = [rays * np.where(depth > 0, depth, np.nan)[..., None] for depth in depths]
     half_m = 1.05 * float(np.nanpercentile(np.abs(clouds[0]), 99.9))

@@ -6,8 +6,9 @@ in `tangent_train.geometry`. A pose (R, c) takes room to camera coordinates by
 
 A panorama's pose is that of an upright camera facing the middle of the panorama. Its pixel
 with sphere direction s (`tangent_train.geometry`: x to the middle, y right, z up) and distance d is
-the room's point ``c + d Rᵀ (s_y, −s_z, s_x)``, which is ``c + d Rz(ψ) FLIP_Y s`` with the heading ψ
-counterclockwise from the room's x axis. A perspective pixel (column j, row i) with z-depth d is
+the room's point ``c + d Rᵀ (s_y, −s_z, s_x)``, which is ``c + d Rz(ψ) to_right_handed(s)`` with
+the heading ψ counterclockwise from the room's x axis. A perspective pixel (column j, row i)
+with z-depth d is
 ``c + d Rᵀ K⁻¹ (j, i, 1)`` with K for integer pixel centers.
 
 Angles in pose files are Blender's XYZ Euler angles of a camera facing its −z with +y up:

@@ -4,8 +4,8 @@ Convention, stated here once and used everywhere:
 
 * **Directions** are unit vectors ``x = cos φ cos λ, y = cos φ sin λ, z = sin φ`` with latitude φ
   growing upwards and longitude λ growing to the right, as seen from the center: x points to the
-  middle of the panorama, y to the right, z up. This frame is left-handed. In a right-handed room
-  frame y points to the left; `FLIP_Y` converts between the two.
+  middle of the panorama, y to the right, z up. This frame is left-handed. Files have the
+  right-handed frame with y to the left; `to_right_handed` converts between the two.
 * **Equirectangular (ERP) pixels** have integer centers ``(u, v)``, u to the right, v down:
   ``λ = (u + ½) / W · 2π − π``, ``φ = π/2 − (v + ½) / H · π``. Longitude wraps for every
   interpolation, nearest included; beyond a pole the row reflects with a half-turn in longitude.
@@ -40,16 +40,15 @@ from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolu
 from tangent_train.geometry.panorama_pose import PanoramaPose
 from tangent_train.geometry.pinhole_grid import PinholeGrid
 from tangent_train.geometry.sphere import (
-    FLIP_Y,
     checked_rotation,
     lonlat_to_xyz,
     random_rotation,
     rotation_about,
+    to_right_handed,
     xyz_to_lonlat,
 )
 
 __all__ = [
-    "FLIP_Y",
     "CubeGrid",
     "Icosphere",
     "PanoramaPose",
@@ -76,6 +75,7 @@ __all__ = [
     "ray_lengths",
     "rotation_about",
     "shift_range",
+    "to_right_handed",
     "vertex_resolution",
     "xyz_to_lonlat",
 ]

@@ -14,7 +14,7 @@ class PanoramaPose:
     A point at distance d in direction s of the panorama (`tangent_train.geometry`: x to the middle
     of the image, y to its right, z up) is ``location_m + d · world_from_panorama @ s``.
 
-    In a right-handed world the matrix is a reflection, like `FLIP_Y`: its determinant is −1.
+    In a right-handed world the determinant is −1, see `to_right_handed`.
 
     Args:
         world_from_panorama: ``(3, 3)`` orthogonal matrix of determinant 1 or −1.

@@ -164,8 +164,8 @@ class PinholeGrid:
     def world_from_camera(self) -> NDArray[np.float64]:
         """``(N, 3, 3)`` camera axes (x right, y down, z forward) as columns, read-only.
 
-        The determinant is −1, because the sphere frame is mirrored (see `tangent_train.geometry`);
-        ``FLIP_Y @ world_from_camera`` are proper rotations in a right-handed room.
+        The determinant is −1, because the frame of the sphere is left-handed,
+        see `to_right_handed`.
         """
         axes = self._axes.copy() if self.rotation is None else self.rotation @ self._axes
         axes.setflags(write=False)

@@ -7,10 +7,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from tangent_train.errors import SettingError
 
-FLIP_Y: NDArray[np.float64] = np.diag([1.0, -1.0, 1.0])
-"""Sphere frame (y right) <-> right-handed room frame (y left); its own inverse."""
-FLIP_Y.setflags(write=False)
-
 
 def lonlat_to_xyz(lonlat_rad: ArrayLike) -> NDArray[np.float64]:
     """Return unit vectors of longitudes and latitudes.
@@ -39,6 +35,18 @@ def xyz_to_lonlat(directions_xyz: ArrayLike) -> NDArray[np.float64]:
     """
     x, y, z = np.moveaxis(np.asarray(directions_xyz, np.float64), -1, 0)
     return np.stack([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))], axis=-1)
+
+
+def to_right_handed(vectors_xyz: ArrayLike) -> NDArray[np.float64]:
+    """Return vectors of the sphere's frame, y to the right, with y to the left, and back.
+
+    All files have the result's frame: point clouds, poses and cameras. Of a matrix that maps
+    vectors of the one frame, it returns the matrix that maps those of the other.
+
+    Args:
+        vectors_xyz: ``(..., 3)`` vectors.
+    """
+    return np.asarray(np.asarray(vectors_xyz, np.float64) @ np.diag([1.0, -1.0, 1.0]))
 
 
 def rotation_about(axis_xyz: ArrayLike, angle_rad: float) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from datamodules.core.label_map import DISTANCE
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
-from tangent_train.geometry import FLIP_Y, equirect_to_lonlat, lonlat_to_xyz
+from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
 from tangent_train.heads.aligned_mosaic import AlignedMosaic
 from tangent_train.heads.base import (
     RGB,
@@ -407,7 +407,7 @@ def points_of(
         of_rows, of_columns = image.area.places()
         rows, columns = of_rows[rows], of_columns[columns]
         lonlat_rad = equirect_to_lonlat(np.stack([columns, rows], axis=-1), image.shape)
-        rays = lonlat_to_xyz(lonlat_rad) @ FLIP_Y
+        rays = to_right_handed(lonlat_to_xyz(lonlat_rad))
     else:
         rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1)
         rays = rays @ np.linalg.inv(np.asarray(image.camera_matrix)).T

@@ -1,7 +1,7 @@
 """Files with the cameras of pinhole images: ``cameras.json``, and COLMAP's ``rig_config.json``.
 
 Their world frame is right-handed: x forward (to the middle column of the panorama), y left, z up.
-`FLIP_Y` converts between it and the frame of `tangent_train.geometry`.
+`to_right_handed` converts between it and the frame of `tangent_train.geometry`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,13 @@ from pydantic import Field
 
 from tangent_train.errors import DataError
 from tangent_train.files import write_text
-from tangent_train.geometry import FLIP_Y, PanoramaPose, PinholeGrid, TangentGrid, checked_rotation
+from tangent_train.geometry import (
+    PanoramaPose,
+    PinholeGrid,
+    TangentGrid,
+    checked_rotation,
+    to_right_handed,
+)
 
 CAMERAS_FILE = "cameras.json"
 """Name of the file in a folder of tangent images."""
@@ -100,7 +106,7 @@ class _CamerasJson(pydantic.BaseModel):
             rotation = self.icosahedron_rotation
             in_world = None if rotation is None else _in_world(np.array(rotation))
             return TangentGrid(self.base_level, self.level, self.dim, in_world)
-        axes = np.array([FLIP_Y @ checked_rotation(np.array(view)) for view in self.views])
+        axes = np.array([to_right_handed(checked_rotation(view).T).T for view in self.views])
         size, focal = (self.camera.height, self.camera.width), self.camera.matrix[0][0]
         if not len(axes) or focal <= 0:
             raise ValueError(f"{len(axes)} views with a focal length of {focal}")
@@ -172,12 +178,12 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
 
 def _world_from_camera(grid: PinholeGrid, face: int) -> NDArray[np.float64]:
     """Return the ``(3, 3)`` rotation from camera axes to the right-handed world of the files."""
-    return np.asarray(FLIP_Y @ grid.world_from_camera[face])
+    return to_right_handed(grid.world_from_camera[face].T).T
 
 
 def _in_world(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """Convert a rotation between the library's frame and the right-handed world, either way."""
-    return np.asarray(FLIP_Y @ rotation @ FLIP_Y)
+    return to_right_handed(to_right_handed(rotation).T).T
 
 
 def read_cameras(path: Path) -> CameraFile:
@@ -294,7 +300,7 @@ def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:
         {
             "file": file,
             "location": pose.location_m.tolist(),
-            "world_from_panorama": (pose.world_from_panorama @ FLIP_Y).tolist(),
+            "world_from_panorama": to_right_handed(pose.world_from_panorama).tolist(),
         }
         for file, pose in poses.items()
     ]

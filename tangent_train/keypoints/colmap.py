@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError
-from tangent_train.geometry import FLIP_Y, PanoramaPose
+from tangent_train.geometry import PanoramaPose, to_right_handed
 from tangent_train.io.camera_files import RigFile
 from tangent_train.keypoints.spherical import SphericalKeypoints
 from tangent_train.keypoints.two_view import TwoView, colmap, rigid_matrix
@@ -130,7 +130,7 @@ def panorama_poses(model: Path, rig: RigFile) -> dict[str, PanoramaPose]:
         prefix = f"{folder}/"
         if prefix in rig.world_from_camera and name in rig.panoramas:
             camera_from_world = image.cam_from_world().rotation.matrix()
-            axes = camera_from_world.T @ rig.world_from_camera[prefix].T @ FLIP_Y
+            axes = to_right_handed(camera_from_world.T @ rig.world_from_camera[prefix].T)
             pose = PanoramaPose(axes, image.projection_center())
             poses.setdefault(rig.panoramas[name], pose)
     if not poses:

@@ -11,7 +11,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tangent_train.geometry import FLIP_Y, PinholeGrid, RingGrid, TangentGrid, random_rotation
+from tangent_train.geometry import (
+    PinholeGrid,
+    RingGrid,
+    TangentGrid,
+    random_rotation,
+    to_right_handed,
+)
 from tangent_train.io.camera_files import read_rig
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tangent_train.keypoints.colmap import panorama_poses
@@ -68,7 +74,7 @@ def _database(project: Path) -> Any:
 def _grid(project: Path, resting: PinholeGrid = TangentGrid(0, 5)) -> PinholeGrid:  # noqa: B008
     """The images by the matrix of the first camera: all are turned as a whole."""
     first = next(iter(read_rig(project / "rig_config.json").world_from_camera.values()))
-    return resting.with_rotation(FLIP_Y @ first @ resting.world_from_camera[0].T)
+    return resting.with_rotation(to_right_handed((first @ resting.world_from_camera[0].T).T).T)
 
 
 # Rigs and cameras.

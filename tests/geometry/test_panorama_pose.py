@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation, xyz_to_lonlat
+from tangent_train.geometry import PanoramaPose, random_rotation, to_right_handed, xyz_to_lonlat
 
 
 def posed(seed: int, mirrored: bool) -> PanoramaPose:
     rng = np.random.default_rng(seed)
     rotation = random_rotation(rng)
-    return PanoramaPose(rotation @ FLIP_Y if mirrored else rotation, rng.normal(size=3) * 4)
+    return PanoramaPose(to_right_handed(rotation) if mirrored else rotation, rng.normal(size=3) * 4)
 
 
 def test_a_panorama_in_a_right_handed_room() -> None:

@@ -7,7 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPair
-from tangent_train.geometry import FLIP_Y, PanoramaPose, equirect_directions, random_rotation
+from tangent_train.geometry import (
+    PanoramaPose,
+    equirect_directions,
+    random_rotation,
+    to_right_handed,
+)
 from tests.keypoints.textures import volume_texture
 
 RADIUS_M = 3.0
@@ -28,7 +33,7 @@ def ball_panorama(name: str, pose: PanoramaPose, shape: tuple[int, int] = SHAPE)
 def ball_pair(name: str = "ball", shape: tuple[int, int] = SHAPE) -> PanoramaPair:
     """Two panoramas 0.5 m apart, randomly rotated."""
     rng = np.random.default_rng(1)
-    left = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.1, 0.2, -0.1])
-    right = PanoramaPose(random_rotation(rng) @ FLIP_Y, [0.4, -0.2, -0.1])
+    left = PanoramaPose(to_right_handed(random_rotation(rng)), [0.1, 0.2, -0.1])
+    right = PanoramaPose(to_right_handed(random_rotation(rng)), [0.4, -0.2, -0.1])
     sides = (ball_panorama(f"{name}_l", left, shape), ball_panorama(f"{name}_r", right, shape))
     return PanoramaPair(name, None, *sides)

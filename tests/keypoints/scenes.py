@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
+from tangent_train.geometry import PanoramaPose, random_rotation, to_right_handed
 from tangent_train.keypoints import SphericalKeypoints
 from tests.geometry.directions import unit
 
@@ -32,8 +32,10 @@ def two_views(
     points_m = unit(rng.normal(size=(count, 3))) * rng.uniform(1.5, 5, (count, 1))
     special = np.array([(0, 0, 2), (0, 0, -2), (-3, 0, 0), (-2, 1e-3, 0.1)])
     points_m[:4] = special[:count]
-    left = PanoramaPose(random_rotation(rng) @ FLIP_Y, np.zeros(3))
-    right = PanoramaPose(random_rotation(rng) @ FLIP_Y, baseline_m * unit(rng.normal(size=3)))
+    left = PanoramaPose(to_right_handed(random_rotation(rng)), np.zeros(3))
+    right = PanoramaPose(
+        to_right_handed(random_rotation(rng)), baseline_m * unit(rng.normal(size=3))
+    )
     left_xyz, right_xyz = (pose.project(points_m)[0] for pose in (left, right))
     order = rng.permutation(count)  # the special points are not the wrong ones
     left_xyz, right_xyz = left_xyz[order], right_xyz[order]

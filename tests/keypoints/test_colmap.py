@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tangent_train.geometry import FLIP_Y, PanoramaPose, random_rotation
+from tangent_train.geometry import PanoramaPose, random_rotation, to_right_handed
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.two_view import estimate_two_view
 from tests.geometry.directions import random_directions, unit
@@ -23,7 +23,7 @@ def test_colmap_reads_what_was_written(tmp_path: Path) -> None:
     points_m = random_directions(250, 4) * rng.uniform(1.5, 5, (250, 1))
     found, positions, pairs = [], [], {}
     for left in range(3):
-        pose = PanoramaPose(random_rotation(rng) @ FLIP_Y, rng.normal(size=3) * 0.6)
+        pose = PanoramaPose(to_right_handed(random_rotation(rng)), rng.normal(size=3) * 0.6)
         order = rng.permutation(250)
         seen_xyz = pose.project(points_m[order])[0] + rng.normal(size=(250, 3)) * 3e-4
         found.append(keypoints_at(unit(seen_xyz)))

@@ -9,12 +9,12 @@ import pytest
 from numpy.typing import NDArray
 
 from tangent_train.geometry import (
-    FLIP_Y,
     PanoramaPose,
     equirect_directions,
     lonlat_to_xyz,
     random_rotation,
     rotation_about,
+    to_right_handed,
 )
 from tangent_train.keypoints.covisibility import (
     DepthView,
@@ -66,11 +66,11 @@ ROOM = Room(WALLS, (CUPBOARD, SHELF))
 
 
 def upright(place: tuple[float, float, float], heading_deg: float = 0) -> PanoramaPose:
-    return PanoramaPose(rotation_about((0, 0, 1), np.radians(heading_deg)) @ FLIP_Y, place)
+    return PanoramaPose(to_right_handed(rotation_about((0, 0, 1), np.radians(heading_deg))), place)
 
 
 def tilted(place: tuple[float, float, float], seed: int) -> PanoramaPose:
-    return PanoramaPose(random_rotation(np.random.default_rng(seed)) @ FLIP_Y, place)
+    return PanoramaPose(to_right_handed(random_rotation(np.random.default_rng(seed))), place)
 
 
 LEFT, RIGHT = upright((-1.8, 0.2, 1.5), 20), upright((1.6, -0.4, 1.4), 170)

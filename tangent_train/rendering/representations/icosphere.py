@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import (
-    FLIP_Y,
     equirect_directions,
     equirect_shape,
     icosphere,
     lonlat_to_equirect,
     random_rotation,
     rotation_about,
+    to_right_handed,
     xyz_to_lonlat,
 )
 from tangent_train.geometry.icosphere_signals import (
@@ -281,7 +281,7 @@ class IcosphereRepresentation:
         elif self.random_rotation == "yaw":
             matrix = matrix @ rotation_about((0, 0, 1), rng.uniform(0, 2 * np.pi))
         if self.mirror and rng.random() < 0.5:
-            matrix = matrix @ FLIP_Y
+            matrix = to_right_handed(matrix)
         return self._views(matrix)
 
     def view_sets(self, valid: NDArray[np.bool_] | None = None) -> list[IcosphereViews]:
