@@ -14,7 +14,7 @@ from torch import Tensor
 from tangent_train.heads.base import RGB
 from tangent_train.heads.pictures import evenly_spread, shown_arrays
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.results.html import EncodedImage, encode_image
+from tangent_train.results.page import EncodedImage, encode_image
 
 _MOST_ROWS = 256
 """Larger images are reduced in logs, which contain the pictures of all validations."""

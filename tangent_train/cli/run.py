@@ -37,14 +37,16 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.results.evaluation import (
+    EvaluationResult,
     confusion_table,
     evaluation_result,
+    flat_settings,
+    plain_scores,
     result_tables,
     summary_lines,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult, flat_settings, plain_scores
-from tangent_train.results.html import write_report
+from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.optimization import Schedule
 

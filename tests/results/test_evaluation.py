@@ -16,13 +16,13 @@ from torch import nn
 
 from tangent_train.metrics.segmentation import SegmentationCounts
 from tangent_train.results.evaluation import (
+    EvaluationResult,
     confusion_table,
     evaluation_result,
     headline,
     result_tables,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult
 from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import shape_task
 
