@@ -56,7 +56,7 @@ class Pictures(Callback):
             return
         task: Any = pl_module
         source, index = _dataset(trainer, "val"), int(batch.index[0])
-        labels = batch.target[0], outputs[0]
+        labels = batch.labels[0], outputs[0]
         panel = _panel(task, source.read(index), *labels, most_rows=_MOST_ROWS)
         if panel is not None:
             tag = f"val_images/{source.name(index).replace('/', '_')}"
@@ -71,7 +71,7 @@ class Pictures(Callback):
         task: Any = pl_module
         source = _dataset(trainer, "test")
         chosen = evenly_spread(self.test, len(source))
-        predictions = zip(batch.index.tolist(), batch.target, outputs, strict=True)
+        predictions = zip(batch.index.tolist(), batch.labels, outputs, strict=True)
         for index, *labels in predictions:
             if index in chosen:
                 name, image = source.name(index), source.read(index)

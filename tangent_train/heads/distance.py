@@ -13,8 +13,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.core.images import STEPS_PER_M
-from datamodules.core.labels import DISTANCE
+from datamodules.core.depth import STEPS_PER_M
+from datamodules.core.label_map import DISTANCE
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes

@@ -11,7 +11,7 @@ import pytest
 from torchvision.datasets import Cityscapes as Published
 
 from datamodules.cityscapes import Cityscapes
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import PerspectiveRepresentation
 from tests.datamodules import street_format as streets
@@ -110,6 +110,6 @@ def test_crops_lower_than_wide_cover_the_photo_once(shared: Path) -> None:
     assert sample.images[0].shape == (1, 16, 32, 3)
     evaluated: Any = data.dataset("test")[0]
     labels = data.dataset("test").read(0).labels
-    share = (evaluated.target > 0).sum() / (labels > 0).sum()
+    share = (evaluated.labels > 0).sum() / (labels > 0).sum()
     crop_pixel = (2 * np.tan(np.deg2rad(22.5)) * streets.CAMERA["fx"] / 16 / 32) ** 2
     assert share * crop_pixel == pytest.approx(1, abs=0.05)
