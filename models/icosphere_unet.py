@@ -61,7 +61,12 @@ def levels_of(widths: Sequence[int], level: int) -> range:
     Args:
         widths: Channels at each level.
         level: Level of the finest icosphere.
+
+    Raises:
+        SettingError: There are more widths than levels.
     """
+    if len(widths) > level + 1:
+        raise SettingError("network.widths", found=widths, expected=f"at most {level + 1}")
     return range(level, level - len(widths), -1)
 
 
@@ -87,7 +92,8 @@ class IcosphereUNet(ResidualUNet):
         normalized_ups: True to normalize and rectify after that convolution.
 
     Raises:
-        SettingError: A kind of pooling does not fit the positions of the table.
+        SettingError: There are more widths than levels, or a kind of pooling does not fit the
+            positions of the table.
 
     Example:
         >>> from models import mesh_operators
