@@ -55,7 +55,7 @@ class Pictures(Callback):
         if not is_logged or batch_idx not in chosen:
             return
         source, index = _dataset(trainer, "val"), int(batch.index[0])
-        panel = _panel(pl_module, source.read(index), batch.target[0], outputs[0], _MOST_ROWS)
+        panel = _panel(pl_module, source.read(index), batch.labels[0], outputs[0], _MOST_ROWS)
         tag = f"val_images/{source.name(index).replace('/', '_')}"
         # The step at which Lightning logs the validation, one less than `global_step`.
         step = trainer.fit_loop.epoch_loop._batches_that_stepped
@@ -67,7 +67,7 @@ class Pictures(Callback):
     ) -> None:
         source = _dataset(trainer, "test")
         chosen = evenly_spread(self.test, len(source))
-        for index, *labels in zip(batch.index.tolist(), batch.target, outputs, strict=True):
+        for index, *labels in zip(batch.index.tolist(), batch.labels, outputs, strict=True):
             name = source.name(index)
             image = source.read(index) if index in chosen else None
             panel = None if image is None else _panel(pl_module, image, *labels)
