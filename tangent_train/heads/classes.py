@@ -17,8 +17,7 @@ from pydantic import validate_call
 from torch import Tensor
 from torch.nn.functional import cross_entropy, pad
 
-from datamodules.core.class_weights import ClassWeights
-from datamodules.core.labels import IMAGE_CLASS, PIXEL_CLASSES
+from datamodules.core.label_map import IMAGE_CLASS, PIXEL_CLASSES, ClassWeights
 from tangent_train.heads import pictures
 from tangent_train.heads.base import NOTHING, RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from pydantic import Field, validate_call
 from torch import Tensor
 
-from datamodules.core.images import STEPS_PER_M
-from datamodules.core.labels import DISTANCE
+from datamodules.core.depth import STEPS_PER_M
+from datamodules.core.label_map import DISTANCE
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, of_extra
 from tangent_train.files import write_bytes
