@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
+from itertools import takewhile
 from numbers import Integral
+from typing import Any
 
 _LONGEST = 400
 """Largest number of characters of the value found, which may come from a file."""
@@ -84,6 +87,44 @@ class SettingError(_ExplainedError):
 
 class DataError(_ExplainedError):
     """A file or folder that cannot be used."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a remedy that names the most similar of the known names, or nothing.
+
+    >>> nearest("levl", ["level", "seed"])
+    'Did you mean level?'
+    """
+    return "".join(f"Did you mean {similar}?" for similar in get_close_matches(name, known, 1))
+
+
+def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> SettingError:
+    """Return the first error of a validation; errors of a setting's alternatives are joined.
+
+    Args:
+        error: pydantic's ValidationError.
+        known: Comments of the known settings by name.
+        prefix: Prefix of the setting's name in the message.
+    """
+    first = error.errors()[0]
+    same = [one for one in error.errors() if one["loc"][:1] == first["loc"][:1]]
+    parts = zip(*(one["loc"] for one in same), strict=False)
+    common = takewhile(lambda part: len({*part}) == 1 and isinstance(part[0], str), parts)
+    name = ".".join(part[0] for part in common)
+    texts = (str(one.get("ctx", {}).get("error") or one["msg"]) for one in same)
+    expected = dict.fromkeys(text.removeprefix("Input should be ") for text in texts)
+    found, remedy = "null" if first["input"] is None else first["input"], ""
+    if first["type"].startswith("missing"):
+        found, expected = "nothing", {known.get(name, "a value"): None}
+    elif first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
+        expected, remedy = {"a known setting": None}, nearest(name, known)
+    return SettingError(prefix + name, found=found, expected=" or ".join(expected), remedy=remedy)
+
+
+def wrong_field(error: Any) -> str:
+    """Return the first error of a validation of a file's content, for a message."""
+    wrong = wrong_setting(error, {})
+    return f"{wrong.subject}={wrong.found}, not {wrong.expected}"
 
 
 def at_least(name: str, value: object, least: int) -> int:

@@ -102,12 +102,7 @@ class Run:
 
     def contents(self) -> dict[str, Any]:
         """Return what checkpoints of the run store besides tensors: plain values."""
-        # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
-        return {
-            METADATA_KEY: self.as_loaded().plain(),
-            "config": {name: v for name, v in self.plain_settings().items() if name != "logger"},
-            **inputs_and_classes(self.data),
-        }
+        return {METADATA_KEY: self.as_loaded().plain()}
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
         """Evaluate the task on the test fold and write the results.

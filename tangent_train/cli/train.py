@@ -12,13 +12,13 @@ import warnings
 from pathlib import Path
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
-from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
 from tangent_train.cli.run import Run, build, write_settings
@@ -61,7 +61,8 @@ def train(settings: TrainSettings) -> float | None:
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)
     if len(run.data.dataset("test")):
-        run.task.load_state_dict(read_checkpoint(tested, ["state_dict"])["state_dict"])
+        weights = torch.load(tested, map_location="cpu", weights_only=True, mmap=True)
+        run.task.load_state_dict(weights["state_dict"])
         run.test(trainer, tested)
     else:
         rank_zero_only(print_text)(f"No {run.data.noun} to test: no results are written.")
