@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -39,6 +40,18 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker("slow")
         if item.get_closest_marker("gpu") and not torch.cuda.is_available():
             item.add_marker(pytest.mark.skip(reason="no CUDA device"))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Start the server of processes here: the folder of the first test that needs it may go."""
+    modules = ["datamodules.synthrooms.generate"]
+    if any(item.get_closest_marker("slow") for item in session.items):
+        modules += ["tangent_train.cli.train", "tangent_train.cli.transfer", "tensorboard"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("OMP_NUM_THREADS", "1")  # forked processes have no threads
+        patch.setenv("NUMBA_NUM_THREADS", "1")
+        forkserver.set_forkserver_preload(modules)
+        forkserver.ensure_running()
 
 
 def fabricate(

@@ -130,12 +130,12 @@ class ShapeSample(NamedTuple):
     Attributes:
         images: ``(N, h, w, 6)`` int16 in steps of `STEPS`, which is half the bytes; normalized
             later, to ``(N, 6, h, w)`` float32.
-        label: Class, int64.
+        target: Class, int64.
         index: Index in its split, int64.
     """
 
     images: Tensor
-    label: Tensor
+    target: Tensor
     index: Tensor  # type: ignore[assignment]  # hides tuple.index
 
 

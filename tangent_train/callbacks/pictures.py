@@ -9,17 +9,19 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
+from torch import Tensor
 
-from tangent_train.heads.pictures import evenly_spread
+from tangent_train.heads.base import RGB
+from tangent_train.heads.pictures import evenly_spread, shown_arrays
 from tangent_train.io.pixel_files import write_pixels
-from tangent_train.results.html import EncodedImage
+from tangent_train.results.page import EncodedImage, encode_image
 
 _MOST_ROWS = 256
 """Larger images are reduced in logs, which contain the pictures of all validations."""
 
 
 class Pictures(Callback):
-    """Draws predictions of images that are spread over a split, see `PixelTask.picture`.
+    """Draws predictions of images that are spread over a split, see `Head.panel`.
 
     Validation images are logged as ``val_images/<name>``, the same ones after every validation.
 
@@ -54,8 +56,8 @@ class Pictures(Callback):
             return
         task: Any = pl_module
         source, index = _dataset(trainer, "val"), int(batch.index[0])
-        labels = task.true_labels(batch)[0], outputs[0]
-        panel = task.picture(source.read(index), *labels, most_rows=_MOST_ROWS)
+        labels = batch.target[0], outputs[0]
+        panel = _panel(task, source.read(index), *labels, most_rows=_MOST_ROWS)
         if panel is not None:
             tag = f"val_images/{source.name(index).replace('/', '_')}"
             # The step at which Lightning logs the validation, one less than `global_step`.
@@ -69,15 +71,15 @@ class Pictures(Callback):
         task: Any = pl_module
         source = _dataset(trainer, "test")
         chosen = evenly_spread(self.test, len(source))
-        predictions = zip(batch.index.tolist(), task.true_labels(batch), outputs, strict=True)
+        predictions = zip(batch.index.tolist(), batch.target, outputs, strict=True)
         for index, *labels in predictions:
             if index in chosen:
                 name, image = source.name(index), source.read(index)
-                panel = task.picture(image, *labels)
+                panel = _panel(task, image, *labels)
                 if panel is not None:
                     file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
                     write_pixels(self.folder / file, panel)
-                    self._encoded[index] = task.report_image(name, image, *labels)
+                    self._encoded[index] = _encoded(task, name, image, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
@@ -86,6 +88,34 @@ class Pictures(Callback):
             torch.distributed.all_gather_object(parts, self._encoded)
         gathered = {index: image for part in parts for index, image in part.items()}
         self.images = [gathered[index] for index in sorted(gathered)]
+
+
+def _panel(
+    task: Any, image: Any, target: Tensor, prediction: Tensor, most_rows: int | None = None
+) -> RGB | None:
+    """Draw one prediction; None if the head draws no pictures.
+
+    Args:
+        task: Task with the head.
+        image: `Panorama` or `Photo`.
+        target: True labels of the image.
+        prediction: Prediction for the image, one item of the result of `Task.evaluate`.
+        most_rows: Largest number of rows of the image in the picture; None for all.
+    """
+    if not target.ndim:
+        return None
+    truth = task.head.truth(target)
+    shown = shown_arrays(image, truth, prediction, task.representation, most_rows)
+    panel: RGB | None = task.head.panel(*shown)
+    return panel
+
+
+def _encoded(task: Any, name: str, image: Any, target: Tensor, prediction: Tensor) -> EncodedImage:
+    """Return an image with its true and predicted pixels for the report's viewer, see `_panel`."""
+    truth, count = task.head.truth(target), len(task.head.class_names)
+    rgb, true, shown = shown_arrays(image, truth, prediction, task.representation, cut=False)
+    how: dict[str, Any] = {"sphere": target.ndim == 2, "note": task.head.note(prediction, truth)}
+    return encode_image(name, rgb, count, prediction=shown, truth=true, **how)
 
 
 def _dataset(trainer: Trainer, split: str) -> Any:

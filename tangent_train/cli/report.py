@@ -20,12 +20,12 @@ def report(arguments: Sequence[str]) -> None:
     """
     options = _parser().parse_args(arguments)
     # Slow imports, not needed to refuse a command line.
-    from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
+    from tangent_train.results.evaluation import find_runs, load_result
     from tangent_train.results.report import runs_report
 
-    results = [load_result(folder) for folder in find_runs(options.folders)]
-    notes = [f"{run}: not finished, ignored." for run in unfinished_runs(options.folders)]
-    runs = runs_report(results, notes)
+    finished, begun = find_runs(options.folders)
+    notes = [f"{run}: not finished, ignored." for run in begun]
+    runs = runs_report([load_result(folder) for folder in finished], notes)
     runs.write(options.output, "report")
     runs.means().print()
     for note in runs.notes:

@@ -37,15 +37,18 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.results.evaluation import (
+    EvaluationResult,
     confusion_table,
+    evaluation_result,
+    flat_settings,
+    plain_scores,
     result_tables,
     summary_lines,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult, flat_settings, plain_scores
-from tangent_train.results.html import write_report
+from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table
-from tangent_train.tasks.schedules import Schedule
+from tangent_train.tasks.optimization import Schedule
 
 # lightning 2.6 uses a function of torch's tree library that torch ≥ 2.13 deprecates.
 warnings.filterwarnings("ignore", r"`isinstance\(treespec, LeafSpec\)`", FutureWarning)
@@ -117,7 +120,8 @@ class Run:
         trainer.test(self.task, datamodule=self.data, verbose=False)
         noun, total = self.data.noun, len(self.data.dataset("test"))
         tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        result = self.task.evaluation_result(noun) if tested else None
+        of_task = self.task.head, self.task.result, noun, self.task.evaluated
+        result = evaluation_result(*of_task) if tested else None
         if result and result.images == total:
             result = replace(result, groups=self._groups(trainer.world_size))
             self._report(result, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]

@@ -42,7 +42,7 @@ from tangent_train.files import write_text
 from tangent_train.inference.engine import views_per_forward
 from tangent_train.inference.views import PERSPECTIVE, panorama_settings
 from tangent_train.manifest import Manifest
-from tangent_train.results.evaluation_result import load_result
+from tangent_train.results.evaluation import load_result
 from tangent_train.results.report import levels_report, transfer_report
 
 _HEAD = {"defaults": ["_self_", {"override hydra/job_logging": "none"}]}

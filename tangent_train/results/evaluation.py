@@ -1,25 +1,124 @@
-"""Write the tables and files of one evaluation, and build its parts."""
+"""The result of an evaluation: its data, settings and scores, its tables and its files.
+
+The folder of a finished run contains ``results.json``, and the settings as ``config.yaml``.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+import yaml  # type: ignore[import-untyped]
+from pydantic import TypeAdapter
 
-from tangent_train.errors import counted
-from tangent_train.files import csv_text, write_text
-from tangent_train.heads import Head
-from tangent_train.metrics.score_columns import SOLID_ANGLE
-from tangent_train.metrics.segmentation import BAND_EDGES_DEG
-from tangent_train.results.evaluation_result import RESULTS_FILE, EvaluationResult, plain_scores
+from tangent_train.errors import DataError, counted
+from tangent_train.files import csv_text, read_json, write_text
+from tangent_train.metrics.score_columns import SOLID_ANGLE, ScoreColumn
+from tangent_train.metrics.segmentation import BAND_EDGES_DEG, Interval
 from tangent_train.results.tables import Table, score_text
 
-_OTHER_COLUMNS = {"images": "images", "share": "pixels %"}
+if TYPE_CHECKING:
+    from tangent_train.heads import Head
+
+RESULTS_FILE = "results.json"
+
+Band = tuple[float, float]
+"""South and north of a latitude band, in degrees."""
+
+_COUNTS = {"images": "images", "share": "pixels %"}
 """Titles of the columns per class that are not scores."""
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """One evaluation. Scores are shares of 1, or in a unit; None if undefined.
+
+    Attributes:
+        noun: Plural name of the images: panoramas, photos, shapes.
+        images: Number of images.
+        columns: Names and units of all scores, in the order of the tables.
+        scores: Scores over all images. The first is the main score, used by charts and latitudes.
+        classes: Name (``class``) and scores of each class; empty without classes.
+        latitude_bands: Edges ``latitude_deg`` (south, north) and scores of each band; empty for
+            photos.
+        groups: Name (``group``), number of ``images`` and scores of groups of images, such as
+            weathers; empty for data without groups.
+        confusion: Counts; rows are true, columns predicted classes. Empty without classes.
+        intervals: 95 % bootstrap intervals over the images, for scores that have one.
+        protocol: Facts that make scores comparable, see `results.published`.
+        checkpoint: File of the network, relative to the run folder if it is inside.
+        label_map: File or name of the map to the classes of the data; None without a map.
+        folds: All folds of the data set; empty for data without folds.
+        settings: Resolved config of the run, with names ``section.setting``; not in the file.
+        folder: Run folder; not in the file.
+    """
+
+    noun: str
+    images: int
+    columns: Mapping[str, ScoreColumn]
+    scores: Mapping[str, float | None]
+    classes: Sequence[Mapping[str, Any]] = ()
+    latitude_bands: Sequence[Mapping[str, Any]] = ()
+    groups: Sequence[Mapping[str, Any]] = ()
+    confusion: Sequence[Sequence[int]] = ()
+    intervals: Mapping[str, Interval] = field(default_factory=dict)
+    protocol: Mapping[str, str] = field(default_factory=dict)
+    checkpoint: str = ""
+    label_map: str | None = None
+    folds: Sequence[int] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    folder: Path = Path()
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes."""
+        return tuple(entry["class"] for entry in self.classes)
+
+    @property
+    def main(self) -> str:
+        """Name of the main score."""
+        return next(iter(self.scores))
+
+    @property
+    def main_columns(self) -> dict[str, ScoreColumn]:
+        """Columns of the main scores, see `ScoreColumn.is_main`."""
+        return {name: column for name, column in self.columns.items() if column.is_main}
+
+    @property
+    def class_means(self) -> dict[str, str]:
+        """Names of the means by the scores of one class, in the order of the tables."""
+        return {c.of_class: name for name, c in self.columns.items() if c.of_class}
+
+    @property
+    def main_of_class(self) -> str:
+        """Name of the main score of a class; "" without classes."""
+        return next(filter(None, (self.columns[name].of_class for name in self.scores)), "")
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Classes that do not occur in the labels and are left out of the means."""
+        return tuple(e["class"] for e in self.classes if e[self.main_of_class] is None)
+
+    @property
+    def fold(self) -> int | None:
+        """Test fold; None for data without folds."""
+        return self.settings.get("data.fold")
+
+    @property
+    def seed(self) -> int | None:
+        """Seed of the run."""
+        return self.settings.get("seed")
+
+    def json(self) -> str:
+        """Return the content of ``results.json``."""
+        adapter = TypeAdapter(EvaluationResult)
+        content = adapter.dump_json(self, indent=1, exclude={"settings", "folder"})
+        return content.decode() + "\n"
 
 
 def evaluation_result(head: Head, result: Any, noun: str, images: int) -> EvaluationResult:
@@ -32,57 +131,92 @@ def evaluation_result(head: Head, result: Any, noun: str, images: int) -> Evalua
         images: Number of images.
     """
     means, of_classes, bands, confusion = head.scores(result)
+    scores = list(zip(*(values.tolist() for values in of_classes.values()), strict=True))
+    names = head.class_names[len(head.class_names) - len(scores) :]  # without the unknown class
+    edges = itertools.pairwise(BAND_EDGES_DEG)
     return EvaluationResult(
         noun,
         images,
         head.columns,
         {**plain_scores(means), **{name: None for name in head.columns if name not in means}},
-        classes=class_entries(of_classes, head.class_names),
-        latitude_bands=latitude_entries(bands) if bands else (),
+        classes=[
+            {"class": name} | plain_scores(dict(zip(of_classes, values, strict=True)))
+            for name, values in zip(names, scores, strict=True)
+        ],
+        latitude_bands=[
+            {"latitude_deg": [south, north]} | plain_scores(band)
+            for (north, south), band in zip(edges, bands, strict=False)
+        ],
         confusion=() if confusion is None else confusion.tolist(),
         intervals=head.intervals(result),
     )
 
 
-def class_entries(
-    scores: Mapping[str, NDArray[Any]], class_names: Sequence[str]
-) -> list[dict[str, Any]]:
-    """Return name and scores of each class, see `EvaluationResult`.
+def plain_scores(scores: Mapping[str, Any]) -> dict[str, Any]:
+    """Replace NaN, which JSON lacks, by None."""
+    return {name: None if math.isnan(value) else value for name, value in scores.items()}
+
+
+def flat_settings(config: Mapping[Any, Any], prefix: str = "") -> dict[str, Any]:
+    """Return settings of nested sections by name, ``section.setting``."""
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        flat |= flat_settings(value, f"{name}.") if isinstance(value, Mapping) else {name: value}
+    return flat
+
+
+def load_result(folder: Path) -> EvaluationResult:
+    """Read the results and settings of a finished run.
 
     Args:
-        scores: Scores of the classes ``(K,)`` by name; empty without classes.
-        class_names: Names of the K classes, or of K + 1 labels with the unknown class first.
+        folder: Run folder.
+
+    Raises:
+        DataError: The results are missing, or were not written by ``tangent-train``.
     """
-    of_classes = zip(*(values.tolist() for values in scores.values()), strict=True)
-    rows = [plain_scores(dict(zip(scores, values, strict=True))) for values in of_classes]
-    names = class_names[len(class_names) - len(rows) :]
-    return [{"class": name} | row for name, row in zip(names, rows, strict=True)]
+    expected = "results written by tangent-train or tangent-evaluate"
+    result: EvaluationResult = read_json(folder / RESULTS_FILE, expected, kind=EvaluationResult)
+    settings = flat_settings(yaml.safe_load((folder / "config.yaml").read_bytes()))
+    return replace(result, settings=settings, folder=folder)
 
 
-def latitude_entries(scores: Iterable[Mapping[str, float]]) -> list[dict[str, Any]]:
-    """Return edges and scores of latitude bands, see `EvaluationResult.latitude_bands`.
+def find_runs(folders: Sequence[Path]) -> tuple[list[Path], list[Path]]:
+    """Find runs in and below folders, each once, sorted within each folder.
 
-    Args:
-        scores: Scores of the bands, from north to south.
+    Returns:
+        Finished runs, and runs that were started but have no results.
+
+    Raises:
+        DataError: A folder contains no results.
     """
-    return [
-        {"latitude_deg": [south, north]} | plain_scores(of_band)
-        for (north, south), of_band in zip(itertools.pairwise(BAND_EDGES_DEG), scores, strict=True)
-    ]
+    finished: dict[Path, None] = {}
+    begun: set[Path] = set()
+    for folder in folders:
+        found = sorted(path.parent.resolve() for path in folder.rglob(RESULTS_FILE))
+        begun |= {path.parent.resolve() for path in folder.rglob("checkpoints")}
+        if not found:
+            raise DataError(
+                folder / RESULTS_FILE,
+                found="no such file, and none below",
+                expected="the results of a finished run",
+                remedy=f"Finish it: tangent-train resume={folder}" * bool(begun),
+            )
+        finished |= dict.fromkeys(found)
+    return list(finished), sorted(begun - finished.keys())
 
 
 def headline(result: EvaluationResult) -> str:
     """Return the scores over all images in one line."""
     means = [
-        f"{h.text} {score_text(value, h.unit, result.intervals.get(name))}\u00a0{h.unit}".strip()
-        for name, h in result.main_columns.items()
-        if (value := result.scores.get(name)) is not None
+        f"{column.text} {_mean(result, name)}\u00a0{column.unit}".strip()
+        for name, column in result.main_columns.items()
+        if result.scores.get(name) is not None
     ]
-    absent = result.absent
-    some = f", {len(result.classes) - len(absent)} of {len(result.classes)} classes"
+    count = len(result.classes)
+    some = f", {count - len(result.absent)} of {count} classes" if result.absent else ""
     legend = " (in brackets: 95\u00a0% intervals)" if result.intervals else ""
-    over = counted(result.images, result.noun) + (some if absent else "")
-    return f"{', '.join(means)} over {over}".strip() + legend
+    return f"{', '.join(means)} over {counted(result.images, result.noun)}".strip() + some + legend
 
 
 def summary_lines(result: EvaluationResult) -> list[str]:
@@ -100,20 +234,22 @@ def result_tables(result: EvaluationResult) -> list[Table]:
         result: The evaluation.
     """
     tables = [_per_class(result) if result.classes else _over_all(result)]
-    bands = [["{}° … {}°".format(*band["latitude_deg"])] for band in result.latitude_bands]
-    groups = [[group["group"], str(group["images"])] for group in result.groups]
-    for title, firsts, entries, header in (
-        ("By latitude", bands, result.latitude_bands, ["latitude"]),
-        ("By group", groups, result.groups, ["group", "images"]),
+    bands = [
+        {"latitude": "{}° … {}°".format(*band["latitude_deg"]), **band}
+        for band in result.latitude_bands
+    ]
+    for title, firsts, entries in (
+        ("By latitude", ["latitude"], bands),
+        ("By group", ["group", "images"], result.groups),
     ):
         if entries:
             columns = {n: result.columns[n] for n in entries[0] if n in result.columns}
             rows = [
-                [*first, *(score_text(entry[name], c.unit) for name, c in columns.items())]
-                for first, entry in zip(firsts, entries, strict=True)
+                [str(entry[name]) for name in firsts]
+                + [score_text(entry[name], c.unit) for name, c in columns.items()]
+                for entry in entries
             ]
-            titles = (column.title for column in columns.values())
-            tables.append(Table(title, [*header, *titles], rows))
+            tables.append(Table(title, [*firsts, *(c.title for c in columns.values())], rows))
     return tables
 
 
@@ -122,44 +258,39 @@ def _mean(result: EvaluationResult, name: str) -> str:
     return score_text(result.scores[name], unit, result.intervals.get(name))
 
 
+def _is_shown(result: EvaluationResult, name: str) -> bool:
+    """Return False for a score by solid angle of photos."""
+    return bool(result.latitude_bands) or not name.endswith(SOLID_ANGLE)
+
+
 def _over_all(result: EvaluationResult) -> Table:
     rows = [
         [column.title, _mean(result, name)]
         for name, column in result.columns.items()
-        if result.latitude_bands or not name.endswith(SOLID_ANGLE)
+        if _is_shown(result, name)
     ]
     return Table("Scores", ("score", f"over all {result.noun}"), rows)
 
 
 def _per_class(result: EvaluationResult) -> Table:
-    mean_of = result.class_means
-    titles = _OTHER_COLUMNS | {
-        name: result.columns[mean].class_title for name, mean in mean_of.items()
-    }
-    units = {name: result.columns[mean].unit for name, mean in mean_of.items()}
-    columns = [
-        name
-        for name in result.classes[0]
-        if name != "class" and (result.latitude_bands or not name.endswith(SOLID_ANGLE))
-    ]
+    names = [n for n in result.classes[0] if n != "class" and _is_shown(result, n)]
+    columns = {n: result.columns[mean] for n, mean in result.class_means.items()}
     predicted = np.sum(result.confusion, axis=0)[-len(result.classes) :]
     rows = [
-        [entry["class"], *(_cell(entry[name], units.get(name, "%")) for name in columns)]
+        [entry["class"]]
+        + [
+            str(entry[n]) if n == "images" else score_text(entry[n], getattr(c, "unit", "%"))
+            for n, c in zip(names, map(columns.get, names), strict=True)
+        ]
         for entry, count in zip(result.classes, predicted, strict=True)
         if count or entry[result.main_of_class] is not None
     ]
-    means = (_mean(result, mean_of[name]) if name in mean_of else "" for name in columns)
+    titles = (columns[n].class_title if n in columns else _COUNTS[n] for n in names)
+    means = (_mean(result, result.class_means[n]) if n in columns else "" for n in names)
     note = f"Means without classes that do not occur in the labels: {', '.join(result.absent)}."
     return Table(
-        "Per class",
-        ["class", *(titles[name] for name in columns)],
-        [*rows, ["mean", *means]],
-        note if result.absent else "",
+        "Per class", ["class", *titles], [*rows, ["mean", *means]], note * bool(result.absent)
     )
-
-
-def _cell(value: Any, unit: str) -> str:
-    return score_text(value, unit) if value is None or isinstance(value, float) else str(value)
 
 
 def confusion_table(result: EvaluationResult) -> Table:

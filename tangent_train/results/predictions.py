@@ -13,7 +13,7 @@ from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
 from tangent_train.io.image_files import composed
 from tangent_train.io.videos import write_video
-from tangent_train.results.html import EncodedImage, encode_image, write_report
+from tangent_train.results.page import EncodedImage, encode_image, write_report
 from tangent_train.results.tables import Table
 
 if TYPE_CHECKING:
@@ -63,8 +63,10 @@ class PredictionFolder:
         kinds = set(self.kinds)
         if job.is_frame and kinds.intersection(_PICTURES):
             kinds = kinds.difference(_PICTURES) | {self.head.source}
-        suffixes = self.head.suffixes
-        return {kind: self.path / kind / f"{job.name}{suffixes[kind]}" for kind in kinds}
+        return {kind: self._file(kind, job.name) for kind in kinds}
+
+    def _file(self, kind: str, name: str) -> Path:
+        return self.path / kind / f"{name}{self.head.suffixes[kind]}"
 
     def write_videos(self, name: str, video: Video, every: int, entries: Sequence[Entry]) -> None:
         """Write the missing videos of pictures, from the predicted pixels of the frames.
@@ -78,12 +80,10 @@ class PredictionFolder:
         Raises:
             DataError: The video, or the prediction of a frame, cannot be read.
         """
-        source = self.head.source
         frames = {number: frame for frame, number in video.frames.items()}
 
         def painted(paint: Painter, number: int, rgb: NDArray[Any]) -> NDArray[Any]:
-            file = self.path / source / f"{frames[number]}{self.head.suffixes[source]}"
-            return paint(rgb, self.head.read(file))
+            return paint(rgb, self.head.read(self._file(self.head.source, frames[number])))
 
         for kind in _PICTURES:
             file = self.path / kind / f"{name}.mp4"
@@ -100,17 +100,21 @@ class PredictionFolder:
         """
         content = {**settings, "images": entries}
         write_text(self.path / "summary.json", json.dumps(content, indent=1) + "\n")
-        if self.head.class_names:
-            write_text(self.path / "classes.json", _labels_by_name(self.head.class_names))
+        labels: dict[str, list[int]] = {}
+        for label, name in enumerate(map(composed, self.head.class_names)):
+            if name != UNKNOWN_NAME:
+                labels.setdefault(name, []).append(label)
+        if labels:
+            lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
+            write_text(self.path / "classes.json", "{\n" + ",\n".join(lines) + "\n}\n")
         columns, names = (
-            ("name", "file", "rows", "columns"),
+            ["name", "file", "rows", "columns"],
             dict.fromkeys(self.head.summary_columns),
         )
-        summaries = (entry.get(self.head.summary, {}) for entry in entries)
-        rows = [
-            [*map(entry.get, columns), *map(summary.get, names), entry.get("error")]
-            for entry, summary in zip(entries, summaries, strict=True)
-        ]
+        rows = []
+        for entry in entries:
+            summary = entry.get(self.head.summary, {})
+            rows.append([*map(entry.get, columns), *map(summary.get, names), entry.get("error")])
         write_text(self.path / "summary.csv", csv_text([*columns, *names, "error"], rows))
 
     def table(self, entries: Sequence[Entry]) -> Table:
@@ -125,26 +129,14 @@ class PredictionFolder:
             entries: Entries of all images.
             shown: Compressed images for the viewer.
         """
-        tables = [self.table(entries)]
         failed = [[entry["name"], entry["error"]] for entry in entries if "error" in entry]
-        if failed:
-            title, columns = "Images that could not be used", ("image", "error")
-            tables.append(Table(title, columns, failed, "", (0, 1)))
+        title = "Images that could not be used"
+        errors = [Table(title, ("image", "error"), failed, text_columns=(0, 1))] if failed else []
         write_report(
             self.path / "report.html",
             "Predictions",
-            tables=tables,
+            tables=[self.table(entries), *errors],
             images=shown,
             class_names=self.head.class_names,
             notes=[f"Shown: {len(shown)} of {counted(len(entries) - len(failed), 'images')}."],
         )
-
-
-def _labels_by_name(class_names: Sequence[str]) -> str:
-    """Return JSON of the labels by name, without classes that are called unknown."""
-    labels: dict[str, list[int]] = {}
-    for label, name in enumerate(map(composed, class_names)):
-        if name != UNKNOWN_NAME:
-            labels.setdefault(name, []).append(label)
-    lines = (f" {json.dumps(name)}: {values}" for name, values in labels.items())
-    return "{\n" + ",\n".join(lines) + "\n}\n"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -12,7 +11,7 @@ from typing import Any
 from tangent_train.files import csv_text, write_bytes, write_text
 from tangent_train.metrics.score_columns import SOLID_ANGLE
 from tangent_train.results.chart import report_png
-from tangent_train.results.evaluation_result import EvaluationResult
+from tangent_train.results.evaluation import EvaluationResult
 from tangent_train.results.published import published_rows
 from tangent_train.results.rows import Part, RunRow, check_alike, group_results
 from tangent_train.results.tables import Table, score_text
@@ -25,9 +24,7 @@ _LEGEND = (
     "in brackets that over seeds within a fold."
 )
 _LEGEND_OF_INTERVALS = "[…] of a single run: 95 % bootstrap interval over its images."
-_CHANGE_OF_STAGES = (
-    "Change: from photos after the same fine-tuning, over the folds and seeds that both have."
-)
+_CHANGE = "over the folds and seeds that both have."
 _REPRESENTATIONS = {
     "Cubemap": "cube map",
     "Equirect": "ERP",
@@ -74,15 +71,15 @@ class Report:
                 parts: dict[str, Part] = {c: c for c in first.class_names}
                 tables.append(self._parts(title[:1].upper() + title[1:], name, parts))
         bands = next((row.bands for row in self.rows if row.bands), [])
+        titles: dict[str, Part] = {f"{band[0]:g}° … {band[1]:g}°": band for band in bands}
         title = f"{first.columns[first.main].title} by latitude"
-        titles = [f"{south:g}° … {north:g}°" for south, north in bands]
-        tables.append(self._parts(title, first.main, dict(zip(titles, bands, strict=True))))
+        tables.append(self._parts(title, first.main, titles))
         return [table for table in tables if table.rows]
 
     def _views(self) -> Table:
         """Return the main score of the views in conditions; no rows with a single condition."""
-        main, by_angle = self.first.main, self.first.main + SOLID_ANGLE
-        name = by_angle if by_angle in self.first.columns else main
+        by_angle = self.first.main + SOLID_ANGLE
+        name = by_angle if by_angle in self.first.columns else self.first.main
         rows = {row.label: row for row in self.rows}
         scores = {cell: self._cell(rows[label], name) for label, cell in self.cells.items()}
         views, conditions = (dict.fromkeys(cell[k] for cell in scores) for k in (0, 1))
@@ -102,23 +99,23 @@ class Report:
 
     def means(self) -> Table:
         """Return the table of the scores over all images."""
-        scores = self.first.main_columns
-        names = dict.fromkeys(name for row in self.rows for name in row.facts)
-        facts = {name: [row.facts.get(name, "–") for row in self.rows] for name in names}
+        scores, rows = self.first.main_columns, self.rows
+        names = dict.fromkeys(name for row in rows for name in row.facts)
+        facts = {name: [row.facts.get(name, "–") for row in rows] for name in names}
         alike = [f"{name} {cells[0]}" for name, cells in facts.items() if len(set(cells)) == 1]
-        columns = [("", [row.label for row in self.rows])]
+        columns = [("", [row.label for row in rows])]
         columns += [(name, cells) for name, cells in facts.items() if len(set(cells)) > 1]
         texts = range(len(columns))
         for name, column in scores.items():
-            columns.append((column.title, [self._cell(row, name) for row in self.rows]))
+            columns.append((column.title, [self._cell(row, name) for row in rows]))
             if self.compared and not name.endswith(SOLID_ANGLE):
-                columns.append(("change", [_change(row.ratio(name)) for row in self.rows]))
+                columns.append(("change", [_change(row.ratio(name)) for row in rows]))
         header, cells_of = zip(*columns, strict=True)
+        has_intervals = any(row.score(name).interval for row in rows for name in scores)
         common = f"{'; '.join(alike)}." if alike else ""
-        has_intervals = any(row.score(name).interval for row in self.rows for name in scores)
-        intervals = _LEGEND_OF_INTERVALS if has_intervals else ""
-        note = " ".join(filter(None, (common, self._legend, intervals, self.compared)))
-        return Table(self.title, header, list(zip(*cells_of, strict=True)), note, texts)
+        notes = (common, self._legend, _LEGEND_OF_INTERVALS * has_intervals, self.compared)
+        cells = list(zip(*cells_of, strict=True))
+        return Table(self.title, header, cells, " ".join(filter(None, notes)), texts)
 
     def _cell(self, row: RunRow, name: str, part: Part = None) -> str:
         """Return a score with its spreads, and "of 2" if it is over fewer folds than the row."""
@@ -146,9 +143,8 @@ class Report:
     def csv_lines(self) -> Iterator[dict[str, Any]]:
         """Yield a line for each row, fold ("mean" over all folds), class or band, and score."""
         for row in self.rows:
-            parts = dict.fromkeys((score.part, score.name) for score in row.scores)
-            for fold in (*(fold for fold in row.folds if fold is not None), None):
-                for part, name in parts:
+            for fold in dict.fromkeys((*row.folds, None)):
+                for name, part in row.scores:
                     south, north = part if isinstance(part, tuple) else (None, None)
                     score = row.score(name, part, fold)._asdict()
                     low, high = score.pop("interval") or (None, None)
@@ -200,22 +196,21 @@ def runs_report(results: Sequence[EvaluationResult], notes: Sequence[str] = ()) 
     Raises:
         DataError: The runs have different scores or classes.
     """
-    check_alike(results)
+    protocols = [result.protocol for result in results]
     shown = [
         name
-        for name in dict.fromkeys(name for result in results for name in result.protocol)
-        if name not in ("data", "classes")
-        and len({result.protocol.get(name) for result in results}) > 1
+        for name in dict.fromkeys(name for protocol in protocols for name in protocol)
+        if name not in ("data", "classes") and len({p.get(name) for p in protocols}) > 1
     ]
-    rows = [
-        RunRow.of(label, group, _facts(group, shown))
-        for label, group in group_results(results).items()
-    ]
-    published, sources = published_rows(results, shown=shown)
-    merged = sorted(
-        [*published, *rows], key=lambda row: (row.facts["data"], row.facts["s"].zfill(2))
+    rows, sources = _rows(group_results(results), shown)
+    rows.sort(
+        key=lambda row: (
+            row.facts["data"],
+            row.facts["s"].zfill(2),
+            not row.label.endswith("(paper)"),
+        )
     )
-    return Report("Report", merged, [*_missing_folds(rows), *notes, *sources])
+    return Report("Report", rows, [*sources, *notes])
 
 
 def transfer_report(
@@ -228,17 +223,12 @@ def transfer_report(
             are compared with P and P-FT-10, tested on photos, after the same fine-tuning.
         cells: View and condition of stages that evaluate the same network.
     """
-    results = [result for group in stages.values() for result in group]
-    check_alike(results)
-    shown = ["test_rotation"]
-    rows = [RunRow.of(name, group, _facts(group, shown)) for name, group in stages.items()]
-    notes = _missing_folds(rows)
-    published, sources = published_rows(results, transfer=True, shown=shown)
-    by_name = {row.label: row for row in (*rows, *published)}
+    rows, notes = _rows(stages, ["test_rotation"], transfer=True)
+    by_name = {row.label: row for row in rows}
     rows = [replace(row, partner=by_name.get(_photos_of(name))) for name, row in by_name.items()]
-    compared = _CHANGE_OF_STAGES if any(row.partner for row in rows) else ""
-    title = "Transfer from photos to panoramas"
-    return Report(title, rows, [*notes, *sources], compared, cells or {})
+    compared = f"Change: from photos after the same fine-tuning, {_CHANGE}"
+    compared *= any(row.partner for row in rows)
+    return Report("Transfer from photos to panoramas", rows, notes, compared, cells or {})
 
 
 def _photos_of(stage: str) -> str:
@@ -265,57 +255,66 @@ def levels_report(levels: Mapping[int, Sequence[EvaluationResult]], trained_leve
         trained_level: Level with the angular resolution of the photos in training; a fraction if it
             is between two levels.
     """
-    check_alike([result for results in levels.values() for result in results])
-    rows = {
-        level: RunRow.of(f"level {level}", levels[level], _facts(levels[level]))
-        for level in sorted(levels)
-    }
-    nearest = min(rows, key=lambda level: abs(level - trained_level))
-    compared = [
-        row if level == nearest else replace(row, partner=rows[nearest])
-        for level, row in rows.items()
-    ]
-    note = f"Photos in training: the angular resolution of level {trained_level:g}."
-    change = f"Change: from level {nearest}, over the folds and seeds that both have."
-    notes = [*_missing_folds(compared), note]
-    return Report("One network at several levels", compared, notes, change)
+    ordered = sorted(levels)
+    nearest = min(ordered, key=lambda level: abs(level - trained_level))
+    rows, notes = _rows({f"level {level}": levels[level] for level in ordered}, published=False)
+    partner = rows[ordered.index(nearest)]
+    rows = [row if row is partner else replace(row, partner=partner) for row in rows]
+    notes.append(f"Photos in training: the angular resolution of level {trained_level:g}.")
+    change = f"Change: from level {nearest}, {_CHANGE}"
+    return Report("One network at several levels", rows, notes, change)
 
 
-def _missing_folds(rows: Sequence[RunRow]) -> list[str]:
-    """Return notes on rows without a run of each fold of their data set."""
-    notes: dict[str, list[str]] = defaultdict(list)
+def _rows(
+    groups: Mapping[str, Sequence[EvaluationResult]],
+    shown: Sequence[str] = (),
+    *,
+    published: bool = True,
+    transfer: bool = False,
+) -> tuple[list[RunRow], list[str]]:
+    """Return a row for each group, then published scores; and notes on missing folds and sources.
+
+    Args:
+        groups: Evaluations by label of the row.
+        shown: Facts of the protocols that are columns of the tables.
+        published: True for published scores too.
+        transfer: See `published_rows`.
+
+    Raises:
+        DataError: The evaluations have different scores or classes.
+    """
+    results = [result for group in groups.values() for result in group]
+    check_alike(results)
+    rows = [RunRow.of(label, some, _facts(some, shown)) for label, some in groups.items()]
+    notes = []
     for row in rows:
         folds = row.results[0].folds
-        missing = [str(fold) for fold in folds if fold not in row.folds]
-        if missing:
+        if missing := [str(fold) for fold in folds if fold not in row.folds]:
             text = f"fold {' and '.join(missing)} missing; not a mean of {len(folds)} folds."
-            notes[text].append(row.label)
-    return [f"{', '.join(labels)}: {text}" for text, labels in notes.items()]
+            notes.append(f"{row.label}: {text}")
+    if published:
+        others, sources = published_rows(results, transfer=transfer, shown=shown)
+        rows, notes = rows + others, notes + sources
+    return rows, notes
 
 
-def _facts(results: Sequence[EvaluationResult], shown: Sequence[str] = ()) -> dict[str, str]:
+def _facts(results: Sequence[EvaluationResult], shown: Sequence[str]) -> dict[str, str]:
     """Return data, inputs and views of a row, by column."""
     result, settings = results[0], results[0].settings
     folds = sorted({str(r.fold) for r in results if r.fold is not None})
-    label_map = {} if result.label_map is None else {"label map": result.label_map}
+    inputs = settings.get("data.inputs")
+    further = [name for name in inputs or () if name not in ("rgb", "depth")]
+    colors = "RGB-D" if "depth" in (inputs or ()) else "RGB"
     return {
         "data": str(settings.get("data._target_")).rpartition(".")[2],
         "s": str(settings.get("level") or "–"),
-        "input": _inputs(settings.get("data.inputs")),
+        "input": "–" if inputs is None else " + ".join([colors, *further]),
         "b": _base_level(settings),
         **{name: result.protocol.get(name, "–") for name in shown},
-        **label_map,
+        **({} if result.label_map is None else {"label map": result.label_map}),
         "folds": ", ".join(folds) or "–",
         "runs": str(len(results)),
     }
-
-
-def _inputs(names: Sequence[str] | None) -> str:
-    """Return RGB or RGB-D, as in the paper, and further inputs; a dash for shapes."""
-    if names is None:
-        return "–"
-    further = [name for name in names if name not in ("rgb", "depth")]
-    return " + ".join(["RGB-D" if "depth" in names else "RGB", *further])
 
 
 def _base_level(settings: Mapping[str, Any]) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import html
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 from rich import table as rich_table
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from tangent_train.errors import printable
 
@@ -46,8 +46,10 @@ class Table:
     def markdown(self) -> str:
         """Return the table as Markdown, below a heading."""
         rule = ["---" if k in self.text_columns else "---:" for k in range(len(self.header))]
+        rows = [[cell.replace("|", r"\|") for cell in row] for row in (self.header, *self.rows)]
+        rows.insert(1, rule)
         lines = [f"## {self.title}", ""] if self.title else []
-        lines += map(markdown_line, (self.header, rule, *self.rows))
+        lines += [f"| {' | '.join(row)} |" for row in rows]
         lines += ["", self.note] if self.note else []
         return "\n".join(lines) + "\n"
 
@@ -56,7 +58,7 @@ class Table:
         console = Console(highlight=False)
         if not console.is_terminal:
             console.width = _WIDEST
-        title, note = _shown(self.title) or None, _shown(self.note) or None
+        title, note = (_shown(text) if text else None for text in (self.title, self.note))
         table = rich_table.Table(title=title, caption=note, show_lines=self.lines)
         for k, name in enumerate(self.header):
             justify: Any = "left" if k in self.text_columns else "right"
@@ -68,52 +70,39 @@ class Table:
 
     def html(self) -> str:
         """Return the table as an HTML section."""
-        title, note = html.escape(self.title), html.escape(self.note)
-        kinds = ["" if k in self.text_columns else "number" for k in range(len(self.header))]
+        title, css = escape(self.title), ' class="heat"' if self.shades else ""
         header = "".join(
-            f'<th{_class(kind)} scope="col"><span>{html.escape(name)}</span></th>'
-            for name, kind in zip(self.header, kinds, strict=True)
+            f'<th class="{self._css(k)}" scope="col"><span>{escape(name)}</span></th>'
+            for k, name in enumerate(self.header)
         )
-        shades = self.shades or [[]] * len(self.rows)
-        rows = (_html_row(r, kinds, s) for r, s in zip(self.rows, shades, strict=True))
+        rows = "\n".join(map(self._html_row, self.rows, self.shades or [()] * len(self.rows)))
         # The scrolling region can have the focus, so that keys scroll it.
         return (
-            f'<section class="card">\n<h2>{title}</h2>\n<p class="note">{note}</p>\n'
+            f'<section class="card">\n<h2>{title}</h2>\n<p class="note">{escape(self.note)}</p>\n'
             f'<div class="wide" tabindex="0" role="region" aria-label="{title}">\n'
-            f"<table{_class('heat' if self.shades else '')}>\n<thead><tr>{header}</tr></thead>\n"
-            f"<tbody>\n{chr(10).join(rows)}\n</tbody></table></div></section>"
+            f"<table{css}>\n<thead><tr>{header}</tr></thead>\n"
+            f"<tbody>\n{rows}\n</tbody></table></div></section>"
         )
 
+    def _html_row(self, cells: Sequence[str], shades: Sequence[float]) -> str:
+        parts = [f'<th class="{self._css(0, cells[0])}" scope="row">{escape(cells[0])}</th>']
+        for k, text in enumerate(cells[1:], start=1):
+            css, style = self._css(k, text), ""
+            if shades:
+                css = "strong" if shades[k - 1] > 0.5 else ""
+                style = f' style="--share:{shades[k - 1]:.3f}"'
+            parts.append(f'<td class="{css}"{style}>{escape(text)}</td>')
+        return f"<tr>{''.join(parts)}</tr>"
 
-def _shown(text: str) -> str:
-    """Escape text for the terminal: names of classes and files are untrusted."""
-    return escape(printable(text))
-
-
-def _html_row(cells: Sequence[str], kinds: Sequence[str], shades: Sequence[float]) -> str:
-    first, *others = map(html.escape, cells)
-    lengths = ["long" if len(text) > _LONG else "" for text in cells]
-    parts = [f'<th{_class(lengths[0])} scope="row">{first}</th>']
-    for k, text in enumerate(others):
-        kind, style = kinds[k + 1] or lengths[k + 1], ""
-        if shades:
-            kind = "strong" if shades[k] > 0.5 else ""
-            style = f' style="--share:{shades[k]:.3f}"'
-        parts.append(f"<td{_class(kind)}{style}>{text}</td>")
-    return f"<tr>{''.join(parts)}</tr>"
+    def _css(self, column: int, text: str = "") -> str:
+        if column not in self.text_columns:
+            return "number"
+        return "long" if len(text) > _LONG else ""
 
 
-def _class(name: str) -> str:
-    return f' class="{name}"' if name else ""
-
-
-def markdown_line(cells: Sequence[str]) -> str:
-    r"""Return one line of a Markdown table.
-
-    >>> print(markdown_line(("a", "b|c")))
-    | a | b\|c |
-    """
-    return "| " + " | ".join(text.replace("|", r"\|") for text in cells) + " |"
+def _shown(text: str) -> Text:
+    """Return text for the terminal without markup: names of classes and files are untrusted."""
+    return Text(printable(text))
 
 
 def percent(share: float | None) -> str:

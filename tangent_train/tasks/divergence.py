@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import lightning
 from torch import Tensor
@@ -10,11 +12,11 @@ from torch import Tensor
 from tangent_train.errors import SettingError
 
 _NAMED = 5
-_REMEDY = "a smaller optimizer.lr or trainer.gradient_clip_val=1."
+"""Images and tensors that a message names, at most."""
 
 
-def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoReturn:
-    """Stop training at a non-finite loss and name its cause.
+def check_loss(task: lightning.LightningModule, loss: float, batch: Any) -> None:
+    """Stop training at a loss that is not finite, and name its cause.
 
     Args:
         task: Task with the weights before the step.
@@ -22,23 +24,18 @@ def refuse_loss(task: lightning.LightningModule, loss: float, batch: Any) -> NoR
         batch: Batch of this process.
 
     Raises:
-        SettingError: Always.
+        SettingError: The loss is NaN or infinite.
     """
-    reason = "from finite images and weights"
+    if math.isfinite(loss):
+        return
+    cause = "finite images and weights"
     if not batch.images.isfinite().all():
-        reason = "from images with NaN or infinite values"
-    elif broken := _not_finite(task):
-        reason = f"from weights that were not finite before: {_some(broken)}"
-    trainer: Any = task.trainer
-    names = [trainer.datamodule.dataset("train").name(k) for k in batch.index.tolist()]
-    half = str(trainer.precision).startswith("16")
-    precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
-    raise SettingError(
-        f"loss of step {trainer.global_step} (epoch {trainer.current_epoch}, {_some(names)})",
-        found=f"{loss}, {reason}",
-        expected="a finite number",
-        remedy=f"Try, in a new run, {precision}{_REMEDY}",
-    )
+        cause = "images with NaN or infinite values"
+    elif broken := _broken_tensors(task):
+        cause = f"weights that were not finite before: {broken}"
+    data: Any = task.trainer.datamodule  # type: ignore[attr-defined]
+    names = [data.dataset("train").name(index) for index in batch.index.tolist()]
+    _stop(task, "loss of", f"{loss}, from {cause}", names)
 
 
 def check_weights(task: lightning.LightningModule) -> None:
@@ -47,26 +44,30 @@ def check_weights(task: lightning.LightningModule) -> None:
     Raises:
         SettingError: A weight is NaN or infinite.
     """
-    if broken := _not_finite(task):
-        raise SettingError(
-            f"weights after step {task.trainer.global_step} (epoch {task.trainer.current_epoch})",
-            found=f"NaN or infinite values in {_some(broken)}",
-            expected="finite numbers; the last checkpoint has them",
-            remedy=f"Try, in a new run, {_REMEDY}",
-        )
+    if broken := _broken_tensors(task):
+        _stop(task, "weights after", f"NaN or infinite values in {broken}")
 
 
-def _not_finite(task: lightning.LightningModule) -> list[str]:
-    """Return the names of tensors with NaN or infinite weights; buffers may hold infinities."""
+def _broken_tensors(task: lightning.LightningModule) -> str:
+    """Return names of tensors with NaN or infinite weights; buffers may hold infinities."""
 
     def is_broken(tensor: Tensor) -> bool:
         return not (tensor.isfinite() if tensor.requires_grad else ~tensor.isnan()).all()
 
     tensors = (*task.named_parameters(), *task.named_buffers())
-    return [name for name, tensor in tensors if is_broken(tensor)]
+    return ", ".join([name for name, tensor in tensors if is_broken(tensor)][:_NAMED])
 
 
-def _some(names: list[str]) -> str:
-    """Return the first names of a list, and the number of the others."""
-    more = len(names) - _NAMED
-    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+def _stop(
+    task: lightning.LightningModule, subject: str, found: str, names: Sequence[str] = ()
+) -> None:
+    place = ", ".join([f"epoch {task.trainer.current_epoch}", *names[:_NAMED]])
+    half = str(task.trainer.precision).startswith("16")
+    precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
+    raise SettingError(
+        f"{subject} step {task.trainer.global_step} ({place})",
+        found=found,
+        expected="finite numbers",
+        remedy=f"Try, in a new run, {precision}a smaller optimizer.lr or "
+        "trainer.gradient_clip_val=1.",
+    )

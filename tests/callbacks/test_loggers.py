@@ -234,7 +234,7 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     mean = np.mean([values[-1][1] for values in of_classes])
     assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)
     images = torch.stack([shape.images for shape in Shapes().shapes])
-    labels = torch.stack([shape.label for shape in Shapes().shapes])
+    labels = torch.stack([shape.target for shape in Shapes().shapes])
     with torch.no_grad():
         loss = torch.nn.functional.cross_entropy(task.network(images), labels)
     assert scalars["val/loss"][-1][1] == pytest.approx(float(loss), rel=1e-5)

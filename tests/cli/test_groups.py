@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from datamodules.core.loading import gathered_order, share_of_process
-from tangent_train.results.evaluation_result import load_result
+from tangent_train.results.evaluation import load_result
 from tests.cli.tiny_runs import Run, results
 from tests.datamodules.street_format import write_synpass
 

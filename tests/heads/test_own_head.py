@@ -14,6 +14,7 @@ from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import PanoramaViews
 from tangent_train.rendering import TangentRepresentation
+from tangent_train.results.evaluation import evaluation_result
 from tangent_train.tasks import PixelTask
 from tests.heads.toy_share import ShareHead
 from tests.inference.trained import TANGENT, sphere, trained_network
@@ -27,7 +28,7 @@ def test_a_head_and_its_metric_are_enough() -> None:
     head, representation = ShareHead(NAMES, "b"), TangentRepresentation(base_level=0, level=4)
     task = PixelTask(nn.Conv2d(2, 1, 1), representation, head, partial(torch.optim.SGD, lr=5))
     (scores,) = quiet_trainer().test(task, datamodule=Data(), verbose=False)
-    result = task.evaluation_result("panoramas")
+    result = evaluation_result(head, task.result, "panoramas", task.evaluated)
     assert (result.main, result.scores["mae"]) == ("mae", scores["test/mae"])
 
     loaded: Any = trained_network(TANGENT)

@@ -10,7 +10,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from tangent_train.heads import ClassesHead
-from tangent_train.results.evaluation_result import EvaluationResult, flat_settings
+from tangent_train.results.evaluation import EvaluationResult, flat_settings
 from tangent_train.results.published import facts
 
 NAMES = ("wall", "floor", "sofa")

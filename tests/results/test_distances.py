@@ -18,7 +18,7 @@ from tangent_train.geometry import (
     perspective_directions,
 )
 from tangent_train.heads.pictures import colorize_distance, distance_limits
-from tangent_train.results.html import encode_image, write_report
+from tangent_train.results.page import encode_image, write_report
 from tests.decoded import decoded
 from tests.results.box_room import HIGHEST, LOWEST, exit_points
 

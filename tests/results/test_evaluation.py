@@ -16,12 +16,13 @@ from torch import nn
 
 from tangent_train.metrics.segmentation import SegmentationCounts
 from tangent_train.results.evaluation import (
+    EvaluationResult,
     confusion_table,
+    evaluation_result,
     headline,
     result_tables,
     write_results,
 )
-from tangent_train.results.evaluation_result import EvaluationResult
 from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import shape_task
 
@@ -47,16 +48,12 @@ def _record(
 ) -> EvaluationResult:
     """The record of seven images."""
     task = segmentation_task(nn.Identity(), NO_VIEWS, NAMES, SGD, absent_class=absent)
-    task.evaluated = 7
-    task.result = counts or _matrices()
-    return task.evaluation_result(noun)
+    return evaluation_result(task.head, counts or _matrices(), noun, 7)
 
 
 def _record_of_shapes() -> EvaluationResult:
     task = shape_task(nn.Identity(), SHAPES)
-    task.evaluated = 16
-    task.result = SHAPE_MATRIX
-    return task.evaluation_result("shapes")
+    return evaluation_result(task.head, SHAPE_MATRIX, "shapes", 16)
 
 
 def test_the_json_file_is_plain_and_complete(tmp_path: Path) -> None:

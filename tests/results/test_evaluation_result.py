@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from tangent_train.errors import DataError
-from tangent_train.results.evaluation_result import find_runs, load_result, unfinished_runs
+from tangent_train.results.evaluation import find_runs, load_result
 from tests.results.example_results import example_result, write_run
 
 SCORES = (0.1, 0.2, None)
@@ -29,9 +29,9 @@ def test_runs_are_found_once_and_unfinished_ones_named(tmp_path: Path) -> None:
     for name in ("b", "a"):
         write_run(tmp_path / name, example_result(SCORES))
     (tmp_path / "cut" / "checkpoints").mkdir(parents=True)
-    found = find_runs([tmp_path / "b", tmp_path])
+    found, begun = find_runs([tmp_path / "b", tmp_path])
     assert [path.name for path in found] == ["b", "a"]
-    assert unfinished_runs([tmp_path]) == [(tmp_path / "cut").resolve()]
+    assert begun == [(tmp_path / "cut").resolve()]
     with pytest.raises(DataError, match=r"cut/results.json: .*tangent-train resume=.*cut"):
         find_runs([tmp_path / "cut"])
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tangent_train.results.html import encode_image, write_report
+from tangent_train.results.page import encode_image, write_report
 from tangent_train.results.tables import Table
 from tests.decoded import decoded
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from tangent_train.errors import DataError
-from tangent_train.results.evaluation_result import EvaluationResult
+from tangent_train.results.evaluation import EvaluationResult
 from tangent_train.results.rows import RunRow, Statistic, check_alike, group_results
 from tests.results.example_results import example_result, without_solid_angle
 

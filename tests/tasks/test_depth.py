@@ -17,7 +17,7 @@ from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads.distances import from_distance, is_metric
 from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
-from tangent_train.results.evaluation import result_tables
+from tangent_train.results.evaluation import evaluation_result, result_tables
 from tests.tasks.builders import depth_task
 from tests.tasks.shapes import Spheres, gradients_of, quiet_trainer
 from tests.tasks.test_segmentation import WHOLE
@@ -104,7 +104,7 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     assert scores["val/absrel"] < 0.09
     assert scores["val/delta1"] > 0.9
     assert scores["val/missing"] == 0
-    record = task.evaluation_result("panoramas")
+    record = evaluation_result(task.head, task.result, "panoramas", 3)
     assert next(band["latitude_deg"] for band in record.latitude_bands) == [60, 90]
     assert record.intervals.keys() == record.scores.keys() == task.head.columns.keys()
     assert task.head.scores_of(task.result, [1])["mae"] == depth_scores(task.result[1, 0])["mae"]
@@ -136,11 +136,10 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     batch = EvaluationSample(images[None], target[None], rotation, lengths[None], area, index)
     task = _task(Right(kind, lengths), representation)
     torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
-    result, task.evaluated = task.metric.compute(), 1
+    result = task.metric.compute()
     assert task.head.scores(result).means["absrel"] < 1e-3
     assert "views_aligned" not in task.head.facts
-    task.result = result
-    (table,) = result_tables(task.evaluation_result("photos"))
+    (table,) = result_tables(evaluation_result(task.head, result, "photos", 1))
     assert not any("solid angle" in name for name, _ in table.rows)
 
 

@@ -42,9 +42,9 @@ def test_every_network_takes_its_data_s_channels_and_classes(network: str) -> No
         _, task = build(_composed(*of_data, *settings))
         assert len(task.head.class_names) == (40 if shapes else 14)
         images = torch.randn(2, *([3] if shapes else []), channels, 32, 32)
-        assert task(images).shape == ((2, 40) if shapes else (2, 13, 32, 32))
-    outputs = [task(images)] if shapes else task.outputs(images).values()
-    sum(output.square().mean() for output in outputs).backward()
+        outputs = {"out": task(images)} if shapes else task(images)
+        assert outputs["out"].shape == ((2, 40) if shapes else (2, 13, 32, 32))
+    sum(output.square().mean() for output in outputs.values()).backward()
     unused = [n for n, p in task.named_parameters() if p.grad is None and ".mixer." not in n]
     assert not unused, "parameters without gradient"
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tangent_train.cli.processes import command_line
-from tangent_train.results.evaluation_result import load_result
+from tangent_train.results.evaluation import load_result
 from tests.cli.test_train import CUT_SHORT
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.datamodules.data_files import write_png

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import shutil
 import subprocess
-from multiprocessing import forkserver
 from pathlib import Path
 
 import pytest
@@ -43,16 +42,15 @@ READ_FILES = (
 
 @pytest.fixture(scope="session")
 def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    # A server that another test started has not imported the modules of `run`.
-    forkserver._forkserver._stop()  # type: ignore[attr-defined]
     return build_world(tmp_path_factory.mktemp("documentation"))
 
 
 @pytest.mark.parametrize("block", OTHERS, ids=lambda block: block.location)
 def test_documented_settings_are_valid(
-    block: Block, template: Path, monkeypatch: pytest.MonkeyPatch
+    block: Block, template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(template)
+    world = shutil.copytree(template, tmp_path / "world")
+    monkeypatch.chdir(world)
     for name, content in block.files.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
         Path(name).write_text(content)
@@ -61,7 +59,7 @@ def test_documented_settings_are_valid(
         command = words[0].removeprefix("tangent-") if words else ""
         if command not in SETTINGS or "--help" in words or any("resume=" in w for w in words):
             continue
-        _, *arguments = words_in_world(words, template)
+        _, *arguments = words_in_world(words, world)
         overrides = [w for w in arguments if "=" in w and not w.startswith(ELSEWHERE)]
         for override in overrides:
             name, _, value = override.partition("=")
@@ -69,7 +67,7 @@ def test_documented_settings_are_valid(
                 Path(value).parent.mkdir(parents=True, exist_ok=True)
                 Path(value).touch()
         if "--config-dir" in arguments:
-            folder = template / arguments[arguments.index("--config-dir") + 1]
+            folder = world / arguments[arguments.index("--config-dir") + 1]
             overrides.append(f"hydra.searchpath=[file://{folder}]")
         composed_settings(command, *overrides)
 

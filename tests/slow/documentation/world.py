@@ -20,7 +20,6 @@ from typing import Any, NoReturn
 import av
 import cv2
 import numpy as np
-import pytest
 from PIL import ExifTags, Image
 
 from datamodules.cityscapes import CLASSES
@@ -177,7 +176,7 @@ def words_in_world(words: list[str], world: Path) -> list[str]:
 def run(words: list[str], variables: dict[str, str], world: Path) -> None:
     """Run a documented command on small data; it must succeed and write a file.
 
-    The process is forked from a server that has already imported the slow modules.
+    The process is forked from the server of conftest, which has imported the slow modules.
     """
     words = words_in_world(words, world)
     for name, _, value in (word.partition("=") for word in words):
@@ -187,10 +186,7 @@ def run(words: list[str], variables: dict[str, str], world: Path) -> None:
     words += small_settings(words, world)
     before = _times(world)
     context = multiprocessing.get_context("forkserver")
-    with tempfile.NamedTemporaryFile() as log, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("OMP_NUM_THREADS", "1")  # forked processes have no threads
-        patch.setenv("NUMBA_NUM_THREADS", "1")
-        context.set_forkserver_preload(["tangent_train.cli.train", "tangent_train.cli.transfer"])
+    with tempfile.NamedTemporaryFile() as log:
         process = context.Process(target=_child, args=(words, variables, str(world), log.name))
         process.start()
         process.join(300)

@@ -45,7 +45,6 @@ _SETTINGS = (
 def _start(run: Path, root: Path, before: Callable[[], None] | None = None) -> BaseProcess:
     """Start or resume a run, in a process forked from one that has imported all it needs."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["tangent_train.cli.train", "tensorboard", "hydra.main"])
     arguments = ["--config-dir", str(run.parent), *_SETTINGS, f"hydra.run.dir={run}"]
     if _last(run).exists():
         arguments = [f"resume={run}", TRUST]

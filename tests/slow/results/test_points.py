@@ -19,7 +19,7 @@ from tangent_train.geometry import (
     perspective_directions,
 )
 from tangent_train.heads.pictures import colorize_distance, distance_limits
-from tangent_train.results.html import EncodedImage, encode_image, write_report
+from tangent_train.results.page import EncodedImage, encode_image, write_report
 from tests.results.box_room import colors_at, exit_points
 from tests.slow.results.browser import OpenReport, close, opened
 

@@ -15,7 +15,7 @@ from playwright.sync_api import Browser
 
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.palette import class_colors
-from tangent_train.results.html import EncodedImage, encode_image, write_report
+from tangent_train.results.page import EncodedImage, encode_image, write_report
 from tests.rendering.reference import sample_panorama, to_lonlat
 from tests.slow.results.browser import EDGE, OpenReport, close, opened
 
