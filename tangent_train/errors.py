@@ -17,6 +17,16 @@ _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
 """Characters that terminals interpret as commands."""
 
 
+_UNKNOWN = "a known setting"
+_EXPECTED = {
+    "extra_forbidden": _UNKNOWN,
+    "unexpected_keyword_argument": _UNKNOWN,
+    "path_not_file": "an existing file",
+    "path_not_directory": "an existing folder",
+}
+"""Texts for errors of pydantic whose messages name no value."""
+
+
 def printable(text: str) -> str:
     r"""Escape terminal control sequences in lines of text.
 
@@ -111,14 +121,17 @@ def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> Set
     parts = zip(*(one["loc"] for one in same), strict=False)
     common = takewhile(lambda part: len({*part}) == 1 and isinstance(part[0], str), parts)
     name = ".".join(part[0] for part in common)
-    texts = (str(one.get("ctx", {}).get("error") or one["msg"]) for one in same)
-    expected = dict.fromkeys(text.removeprefix("Input should be ") for text in texts)
-    found, remedy = "null" if first["input"] is None else first["input"], ""
     if first["type"].startswith("missing"):
-        found, expected = "nothing", {known.get(name, "a value"): None}
-    elif first["type"] in ("extra_forbidden", "unexpected_keyword_argument"):
-        expected, remedy = {"a known setting": None}, nearest(name, known)
-    return SettingError(prefix + name, found=found, expected=" or ".join(expected), remedy=remedy)
+        return SettingError(prefix + name, found="nothing", expected=known.get(name, "a value"))
+    texts = (_EXPECTED.get(one["type"]) or one.get("ctx", {}).get("error") for one in same)
+    messages = (re.sub("^Input should be |, unable to .*", "", one["msg"]) for one in same)
+    expected = dict.fromkeys(str(text or m) for text, m in zip(texts, messages, strict=True))
+    return SettingError(
+        prefix + name,
+        found="null" if first["input"] is None else first["input"],
+        expected=" or ".join(expected),
+        remedy=nearest(name, known) if _UNKNOWN in expected else "",
+    )
 
 
 def wrong_field(error: Any) -> str:

@@ -23,6 +23,7 @@ from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.outputs import OutputNetwork
+from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import load_plain
@@ -194,13 +195,7 @@ def completed_settings(
         restored: True if the tensors come from a checkpoint: pretrained weights are not fetched.
     """
     known = dict.fromkeys(_FROM_DATA, num_classes) | {"in_channels": in_channels}
-
-    def complete(value: Any, name: str = "") -> Any:
-        if isinstance(value, Mapping):
-            return {inner: complete(value[inner], inner) for inner in value}
-        return known.get(name) if value is None else value
-
-    return complete(without_weights(settings) if restored else settings)
+    return filled(without_weights(settings) if restored else settings, known)
 
 
 def _without_data_settings(section: Any) -> Any:

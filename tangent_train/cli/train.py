@@ -21,7 +21,7 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
-from tangent_train.cli.run import Run, build, write_settings
+from tangent_train.cli.run import Run, build
 from tangent_train.config.settings import TrainSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
@@ -48,7 +48,7 @@ def train(settings: TrainSettings) -> float | None:
     if resumed is None:
         _create_folder(folder)
         load_pretrained(run, settings.init_from)
-    rank_zero_only(write_settings)(folder, settings)
+    rank_zero_only(run.write_settings)()
     checkpoints = folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))

@@ -5,6 +5,7 @@ Sections of a file of somebody else are built by `tangent_train.config.from_file
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from inspect import signature
 from typing import Any
@@ -45,3 +46,13 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
             raise cause from None
         found = f"{section['_target_']}, which cannot be built ({' '.join(str(cause).split())})"
         raise SettingError(place, found=found, expected="settings that it accepts") from error
+
+
+def filled(section: Any, known: Mapping[str, Any]) -> Any:
+    """Return a section in which null settings, also of inner sections, have known values."""
+    if not isinstance(section, Mapping):
+        return section
+    return {
+        name: known.get(name) if value is None else filled(value, known)
+        for name, value in section.items()
+    }
