@@ -34,7 +34,6 @@ class SynthRoomsImages(StanfordImages):
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
         generate_rooms(self.root, self.rooms)
-        vars(self).pop("_divided", None)  # listed before there were files
 
 
 @data_set

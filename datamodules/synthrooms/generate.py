@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, NonNegativeInt, PositiveInt
 from pydantic.dataclasses import dataclass
 
-from datamodules.core.processes import in_processes
 from datamodules.stanford2d3ds.files import (
     AREAS,
     CLASSES,
@@ -52,6 +51,7 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_bytes, write_text
 from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
+from tangent_train.threads import in_processes
 
 INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
 """Number of entries per room and class in the label table, used or not.
@@ -164,7 +164,7 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
         SettingError: The folder holds other files, or rooms of other settings.
     """
     about = {"generator": "SynthRooms", "version": _VERSION}
-    manifest = Manifest.open(root, about | asdict(settings))
+    manifest = Manifest.open(root, about | asdict(settings), is_shared=True)
     plans = {f"area_{plan.area}/{plan.name}": plan for plan in plan_rooms(settings)}
     missing = manifest.missing(plans)
     if missing:

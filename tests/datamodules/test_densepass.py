@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.densepass import DensePASS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation

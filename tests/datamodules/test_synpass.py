@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.synpass import SynPASS
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation

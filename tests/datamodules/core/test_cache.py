@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.core.cache import Cache
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.manifest import Shard
 from tests.conftest import fabricate
@@ -81,7 +81,7 @@ def test_a_changed_source_is_read_again(
 def _samples(module: Any) -> list[torch.Tensor]:
     training, testing = list(module.train_dataloader()), list(module.test_dataloader())
     tensors = [part for one in training for part in (*one.images, one.labels)]
-    return tensors + [part for one in testing for part in (*one.images, one.target)]
+    return tensors + [part for one in testing for part in (*one.images, one.labels)]
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,7 @@ def test_shards_fill_a_cache_and_only_missing_files_are_decoded(
 ) -> None:
     cache = tmp_path / "cache"
     counts = [
-        Stanford2D3DS(root, erp, cache=cache).fill_cache(Shard(number, 3).part)
-        for number in (1, 2, 3)
+        Stanford2D3DS(root, erp, cache=cache).prepare(Shard(number, 3)) for number in (1, 2, 3)
     ]
     assert sum(counts) == 8
     sorted(cache.rglob("*.npy"))[0].unlink()
