@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import DataError, counted
-from tangent_train.files import is_text, read_json
+from tangent_train.files import read_json
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import read_pixels, read_rgb
 
@@ -199,7 +199,9 @@ def read_label_map(path: Path) -> LabelMap:
         items = content.items() if isinstance(content, dict) else ()
         named = [(name, keys if isinstance(keys, list) else [keys]) for name, keys in items]
     labels: dict[Any, int] = {}
-    wrong = [json.dumps(name) for name, _ in named if not is_text(name) or name == UNKNOWN_NAME]
+    names = [name for name, _ in named if name != UNKNOWN_NAME]
+    usable = [name for name in names if isinstance(name, str) and name.isprintable()]
+    wrong = [json.dumps(name) for name, _ in named if name not in usable]
     for label, (name, keys) in enumerate(named, start=1):
         for key in keys:
             is_value = type(key) is int and 0 <= key <= _MOST_VALUE
