@@ -37,7 +37,7 @@ from datamodules.core.labels import IMAGE_CLASS
 from datamodules.core.loading import sample_key, sample_rng
 from datamodules.core.processes import in_processes
 from datamodules.core.splits import Split, draw_groups
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
+from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
 from tangent_train.errors import DataError
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.rendering import TangentRepresentation
@@ -99,15 +99,18 @@ def find_shapes(root: Path) -> list[ShapeFile]:
     Raises:
         DataError: The folder is missing or has another layout.
     """
-    shapes: list[ShapeFile] = []
     parts: tuple[Literal["train", "test"], ...] = ("train", "test")
-    for part in parts:
-        for path in (*root.glob(f"*/{part}/*.off"), *root.glob(f"modelnet40_{part}/*.off")):
-            by_class = path.parent.name == part
-            label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
-            name = path.relative_to(root).with_suffix("").as_posix()
-            if not path.name.startswith("."):
-                shapes.append(ShapeFile(path, name, label, part))
+    shapes = [
+        ShapeFile(
+            path,
+            path.relative_to(root).with_suffix("").as_posix(),
+            path.parents[1].name if path.parent.name == part else path.stem.rpartition("_")[0],
+            part,
+        )
+        for part in parts
+        for pattern in (f"*/{part}/[!.]*.off", f"modelnet40_{part}/[!.]*.off")
+        for path in root.glob(pattern)
+    ]
     if not shapes:
         expected = "<class>/{train,test}/*.off or modelnet40_{train,test}/<class>_<number>.off"
         raise DataError(root, found="no meshes", expected=expected, remedy=_GET_IT)
@@ -155,10 +158,10 @@ class ShapeDataset(SplitDataset):
 
     def _views(self, epoch: int, index: int) -> list[Any]:
         data = self.data
+        representation = data.representation
         if self.split == "train":
             seed = (data.seed, data.sampling_seed)
-            return [data.representation.sample(sample_rng(seed, epoch, index))]
-        representation = data.representation
+            return [representation.sample(sample_rng(seed, epoch, index))]
         if self.split == "test" and data.test_rotation is not None:
             # Rotated back, it sees what a rotated shape shows.
             representation = representation.with_rotation(self.shape_rotation(index).T)
@@ -237,7 +240,7 @@ class ModelNet40(DataModule):
     def read(self, files: ShapeFile) -> Spheres:
         """See `DataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        values = mesh_spheres(clean_mesh(read_off(files.path)), shape)
+        values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
     def decode_settings(self) -> dict[str, Any]:
