@@ -172,8 +172,8 @@ def _seat(rng: np.random.Generator, row: dict[str, str]) -> Iterator[Trimesh]:
         for side in (-1, 1):
             edge, rise = side * width / 2, between(0.14, 0.26)
             yield _box((0, edge, height + rise), (depth * between(0.6, 1), 0.05, 0.03))
-            foot, x = height - thick, depth * 0.3
-            yield _rod((x, edge, foot), (x, edge, height + rise), 0.02)
+            foot, ahead = height - thick, depth * 0.3
+            yield _rod((ahead, edge, foot), (ahead, edge, height + rise), 0.02)
 
 
 def _vessel(rng: np.random.Generator, row: dict[str, str]) -> Iterator[Trimesh]:
