@@ -27,7 +27,7 @@ from datamodules.core.cache import Cache
 from datamodules.core.dataset import SplitDataset
 from datamodules.core.files import SPLITS, Problems, Split, draw_groups
 from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights, class_weights, label_doubts
-from datamodules.core.loading import EpochSampler, ResumedOrder, share_of_process, this_process
+from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.manifest import Shard
@@ -210,7 +210,6 @@ class DataModule(LightningDataModule, ABC):
 
     def finish(self, item: Any, split: Split, index: int) -> Any:
         """Return an item that was read or cached as samples are rendered from it."""
-        del split, index
         return item
 
     def check_files(self, files: Any) -> None:
@@ -227,7 +226,6 @@ class DataModule(LightningDataModule, ABC):
 
     def groups(self, files: Any) -> Sequence[str]:
         """Return the groups of an image that get rows in the results, such as its weather."""
-        del files
         return ()
 
     def make_files(self) -> None:
@@ -241,15 +239,9 @@ class DataModule(LightningDataModule, ABC):
         """Yield results of a function for all items as they come."""
         return in_threads(work, items)
 
-    def count_labels(self, item: Any) -> NDArray[np.int64] | None:
-        """Return the number of pixels of each of the `label_names`; None for shapes."""
-        del item
-        return None
-
-    def warning(self, files: Any, item: Any) -> str:
-        """Return a warning about usable files for `check`, or an empty string."""
-        del files, item
-        return ""
+    def inspect(self, files: Any, item: Any) -> tuple[NDArray[np.int64] | None, str]:
+        """Return the pixels of each label name, None for shapes, and perhaps a warning."""
+        return None, ""
 
     # --- finding, checking and reading ---------------------------------------------------------
 
@@ -359,7 +351,7 @@ class DataModule(LightningDataModule, ABC):
     @cached_property
     def _cache(self) -> Cache:
         folder: Any = self.cache
-        return Cache.of(folder, self.decode_settings(), self.kind)
+        return Cache(folder, self.decode_settings(), self.kind)
 
     def prepare_data(self) -> None:
         """Generate the files and complete the cache."""
@@ -457,13 +449,10 @@ class DataModule(LightningDataModule, ABC):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return the training batches; with ``overfit_batches``, the same views in every epoch."""
-        dataset = self.dataset("train")
-        if getattr(self.trainer, "overfit_batches", 0):
-            dataset = share_of_process(dataset)
-            order = ResumedOrder(dataset, self._start[1])
-            return self._loader(dataset, self.batch_size, order)
-        seed = self.seed, self.sampling_seed
-        sampler = EpochSampler(len(dataset), seed, *this_process(), self._start)
+        dataset, seed = self.dataset("train"), (self.seed, self.sampling_seed)
+        is_fixed = bool(getattr(self.trainer, "overfit_batches", 0))
+        order = (*this_process(), self._start)
+        sampler = EpochSampler(len(dataset), seed, *order, is_fixed=is_fixed)
         return self._loader(dataset, self.batch_size, sampler)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
@@ -547,9 +536,9 @@ def _try_read(
     (split, files), problems = item, Problems()
     with problems.noted(files.name, files.paths[0]):
         if is_check:
-            found = data.read(files)
-            problems.warnings += filter(None, [data.warning(files, found)])
-            return split, problems, data.count_labels(found)
+            counts, warning = data.inspect(files, data.read(files))
+            problems.warnings += [warning] if warning else []
+            return split, problems, counts
         data.read_cached(files)
     return split, problems, None
 

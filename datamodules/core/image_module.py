@@ -186,7 +186,6 @@ class ImageDataModule(DataModule):
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64] | None:
         """Return ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama."""
-        del files
         return None
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
@@ -194,7 +193,6 @@ class ImageDataModule(DataModule):
 
         In a photo's axes, x is the optical axis, y points to the right and z up in the image.
         """
-        del files
         return None
 
     # --- reading -------------------------------------------------------------------------------
@@ -253,21 +251,20 @@ class ImageDataModule(DataModule):
         settings = {"shape": self.read_shape, "unknown": self.unknown, "labels": self.labels}
         return {**super().decode_settings(), **settings, "label map": repr(self.label_map)}
 
-    def count_labels(self, item: Image) -> NDArray[np.int64]:
-        """See `DataModule`: classes, or pixels without and with a distance."""
-        labels = item.labels > 0 if self.has_distances else item.labels
-        return np.bincount(labels.ravel(), minlength=len(self.label_names))
-
-    def warning(self, files: ImageFiles, item: Image) -> str:
-        """See `DataModule`: of distances that are probably in other units."""
-        if not self.has_distances:
-            return ""
-        known = item.labels[item.labels > 0]
-        median_m = np.median(known) / STEPS_PER_M if known.size else 0
-        if _USUAL_M[0] <= median_m <= _USUAL_M[1]:
-            return ""
-        found = f"median distance {median_m:.3g} m" if median_m else "no distance below 128 m"
-        return f"{files.depth}: {found}; check the units and the missing value."
+    def inspect(self, files: ImageFiles, item: Image) -> tuple[NDArray[np.int64], str]:
+        """See `DataModule`; of distances that are probably in other units is warned."""
+        labels: Any = item.labels
+        warning = ""
+        if self.has_distances:
+            known = labels[labels > 0]
+            median_m = np.median(known) / STEPS_PER_M if known.size else 0
+            if not _USUAL_M[0] <= median_m <= _USUAL_M[1]:
+                found = (
+                    f"median distance {median_m:.3g} m" if known.size else "no distance below 128 m"
+                )
+                warning = f"{files.depth}: {found}; check the units and the missing value."
+            labels = labels > 0
+        return np.bincount(labels.ravel(), minlength=len(self.label_names)), warning
 
     # --- samples -------------------------------------------------------------------------------
 
