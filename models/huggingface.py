@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.unet import check_sides
+from models.unet import check_size
 from tangent_train.errors import SettingError, of_extra
 
 _Value = bool | int | float | str | None
@@ -145,7 +145,7 @@ class _TransformersNetwork(nn.Module):
         """
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
-        check_sides(images, self.size_multiple, type(self.network).__name__)
+        check_size(images, self.network, multiple=self.size_multiple)
         return images
 
 

@@ -13,7 +13,7 @@ from models.mapped import MappedConv, Table, collect
 from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
-from tangent_train.geometry.icosphere_signals import IcosphereElements
+from tangent_train.geometry.icosphere import IcosphereElements
 
 Pooling = Literal["first", "mean", "max"]
 Unpooling = Literal["zeros", "ones", "mean", "repeat"]

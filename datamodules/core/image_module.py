@@ -36,7 +36,7 @@ from datamodules.core.inputs import (
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about, shift_range
-from tangent_train.geometry.equirect import check_area
+from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
     PanoramaArea,

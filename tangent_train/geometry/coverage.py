@@ -5,14 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry.equirect import equirect_directions, equirect_solid_angles
-from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import lonlat_to_xyz, xyz_to_lonlat
+from tangent_train.geometry.sphere import (
+    equirect_directions,
+    equirect_solid_angles,
+    lonlat_to_xyz,
+    xyz_to_lonlat,
+)
+
+if TYPE_CHECKING:
+    from tangent_train.geometry.grids import PinholeGrid
 
 _ROWS = 180
 _COARSE_ROWS = 60

@@ -10,7 +10,7 @@ from PIL import Image
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair
 from tangent_train.geometry.coverage import is_valid
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 from tests.keypoints.ball_room import ball_pair
