@@ -32,6 +32,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError
 from tangent_train.manifest import Shard
 from tangent_train.progress import show_progress
+from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_threads
 
 _Class = TypeVar("_Class", bound=type[Any])
@@ -102,6 +103,8 @@ class DataModule(LightningDataModule, ABC):
         noun: Name of the images or shapes, in the plural.
         kind: Named tuple of the arrays of an image or shape.
         samples: Class of the samples of a split.
+        default_representation: Function that returns the representation of a level.
+        default_level: Its level without a setting.
         suitable: Attribute that a representation must have, and the name of one that has it.
         get_it: Where to get the data set, for messages.
         class_names: Name of every label; for pixel labels the first is unknown, not a class. Empty
@@ -121,6 +124,8 @@ class DataModule(LightningDataModule, ABC):
     kind: ClassVar[type[Any]]
     samples: ClassVar[type[SplitDataset]]
     suitable: ClassVar[tuple[str, str]] = ("erp_height", "tangent")
+    default_representation: ClassVar[Any] = staticmethod(partial(TangentRepresentation, 0))
+    default_level: ClassVar[int] = 7
     get_it: ClassVar[str] = ""
     labels: ClassVar[str] = PIXEL_CLASSES
     class_names: ClassVar[tuple[str, ...]] = ()
@@ -146,7 +151,8 @@ class DataModule(LightningDataModule, ABC):
         is_given = self.representation is not None
         self.refuse("level", is_given and self.level is not None, "null: the representation has it")
         if not is_given:
-            self.representation = self.default_representation()
+            level = self.default_level if self.level is None else self.level
+            self.representation = self.default_representation(level)
         if not hasattr(self.representation, self.suitable[0]):
             raise SettingError(
                 "representation",
@@ -175,10 +181,6 @@ class DataModule(LightningDataModule, ABC):
             raise SettingError(f"data.{setting}", found=found, expected=expected)
 
     # --- defined by subclasses ---------------------------------------------------------------
-
-    @abstractmethod
-    def default_representation(self) -> Any:
-        """Return the representation used without a setting for it, at `level`."""
 
     @abstractmethod
     def files(self) -> Mapping[Split, Sequence[Any]]:
@@ -286,7 +288,7 @@ class DataModule(LightningDataModule, ABC):
         found = self._find_files()
         size = len(self.label_names)
         self.label_counts = {split: np.zeros(size, np.int64) for split in SPLITS}
-        self._read_all(self._usable(found), "Checking", is_check=True)
+        self._read_all(found, "Checking", is_check=True)
         names = {files.name for files in chain.from_iterable(found.values())}
         return self.problems, len(names | self.problems.items)
 
@@ -319,8 +321,7 @@ class DataModule(LightningDataModule, ABC):
             with self.problems.noted(files.name):
                 self.check_files(files)
 
-        for _ in in_threads(check, chain.from_iterable(self._usable(found).values())):
-            pass
+        list(in_threads(check, chain.from_iterable(self._usable(found).values())))
         return found
 
     def _usable(self, found: Mapping[Split, Sequence[Any]]) -> dict[Split, list[Any]]:

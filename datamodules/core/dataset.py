@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
@@ -142,10 +142,6 @@ class SplitDataset(Dataset[Any]):
         index = range(len(self))[index]  # also negative
         data = self.data
         return self.sample(index, sample_rng((data.seed, data.sampling_seed), epoch, index))
-
-    def __iter__(self) -> Iterator[Any]:
-        """Iterate over the samples of epoch 0."""
-        return map(self.__getitem__, range(len(self)))
 
     @abstractmethod
     def sample(self, index: int, rng: np.random.Generator) -> Any:

@@ -53,7 +53,6 @@ from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
 from tangent_train.rendering import (
     PerspectiveRepresentation,
-    TangentRepresentation,
     rotate_equirect,
 )
 from tangent_train.rendering.resampling import resize
@@ -291,6 +290,7 @@ class PhotoDataModule(ImageDataModule):
 
     noun: ClassVar[str] = "photos"
     suitable = ("of_camera", "perspective")
+    default_representation = staticmethod(PerspectiveRepresentation)  # crops of 45°
     fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     batch_size: PositiveInt = 16
@@ -306,25 +306,20 @@ class PhotoDataModule(ImageDataModule):
         height, width = self.representation.image_size
         return f"crops of {self.representation.fov_deg:g}° in {width} × {height}"
 
-    def default_representation(self) -> PerspectiveRepresentation:
-        """Crops of 45° at the resolution of level 7."""
-        return PerspectiveRepresentation(7 if self.level is None else self.level)
-
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: the crops fit into the photo."""
         camera: Any = self.decode_camera(files)
         fov_deg, (_, columns) = self.representation.fov_deg, self.representation.image_size
+        rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
         try:
             shift_range(camera, size, fov_deg, self.representation.image_size)
         except SettingError as error:
-            rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
             # A setting: if it fits none of the photos, it is refused once.
             raise SettingError(
                 "representation.fov_deg",
                 found=f"{error.found}, {files.rgb}",
                 expected=f"all of a crop of {fov_deg:g}°",
-                remedy="Lower it, make the crops less high with "
-                f"representation.dim=[{rows},{columns}] or fewer rows, or remove the photo.",
+                remedy=f"Lower it, or crop fewer rows: representation.dim=[{rows},{columns}].",
             ) from error
 
 
@@ -389,10 +384,6 @@ class PanoramaDataModule(ImageDataModule):
         """Rows and columns of the area in panoramas of `erp_height` rows."""
         return self.canvas.image_shape
 
-    def default_representation(self) -> TangentRepresentation:
-        """Tangent images of base level 0, at level 7."""
-        return TangentRepresentation(0, 7 if self.level is None else self.level)
-
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: enough pixels, in the shape of the area, and a mask."""
         if self.canvas.is_whole:
@@ -407,25 +398,22 @@ class PanoramaDataModule(ImageDataModule):
         files: ImageFiles = self.splits()[split][index]
         image, canvas, rotation = item, self.canvas, None
         if not canvas.is_whole:
-            image = image._replace(
-                rgb=canvas.filled(canvas.place(image.rgb), self.fill),
-                depth=None if image.depth is None else canvas.place(image.depth),
-                labels=canvas.place(image.labels),
-                valid=canvas.valid,
-            )
+            colors = canvas.filled(canvas.place(image.rgb), self.fill)
+            image = _changed(image, colors, canvas.place)._replace(valid=canvas.valid)
         if self.mask is not None:
             counts, labels = self._masks.read(files.name, canvas), image.labels
             image = image._replace(labels=np.where(counts, labels, labels.dtype.type(0)))
-        if self.upright is not None:
-            image = image._replace(up=read_up(files.rgb))
+        up = None if self.upright is None else read_up(files.rgb)
         if split == "test" and self.test_rotation is not None:
             rotation = draw_rotation(self.test_rotation, self.seed, index)
-            image = _rotated(image, rotation, is_known=self.upright == "pose")
-        if self.upright == "auto" and image.up is None:
+            colors = rotate_equirect(image.rgb, rotation, "bilinear")
+            image = _changed(image, colors, partial(_rotated, rotation=rotation))
+            up = None if self.upright != "pose" else rotation @ ([0, 0, 1] if up is None else up)
+        if self.upright == "auto" and up is None:
             if (split, index) not in self._ups:
                 self._ups[split, index] = self._estimated_up(image, files, rotation, split)
-            image = image._replace(up=self._ups[split, index])
-        return image
+            up = self._ups[split, index]
+        return image._replace(up=up)
 
     def _estimated_up(
         self, image: Image, files: ImageFiles, rotation: NDArray[np.float64] | None, split: Split
@@ -502,16 +490,16 @@ def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> ND
     return tilt @ rotation_about((0, 0, 1), yaw)
 
 
-def _rotated(image: Image, rotation: NDArray[np.float64], *, is_known: bool) -> Image:
-    """Return a rotated panorama: RGB bilinear, the rest nearest; perhaps its up is then known."""
-    up = rotation[:, 2] if image.up is None else rotation @ image.up
-    valid, depth = image.valid, image.depth
-    if valid is not None:
-        valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
-    return image._replace(
-        rgb=rotate_equirect(image.rgb, rotation, "bilinear"),
-        depth=None if depth is None else rotate_equirect(depth, rotation, "nearest"),
-        labels=rotate_equirect(image.labels, rotation, "nearest"),
-        up=up if is_known else None,
-        valid=valid,
-    )
+def _changed(
+    image: Image, rgb: NDArray[np.uint8], change: Callable[[NDArray[Any]], NDArray[Any]]
+) -> Image:
+    """Return a panorama of other colors, with its other pixels changed."""
+    others = {name: getattr(image, name) for name in ("depth", "labels", "valid")}
+    changed = {name: change(array) for name, array in others.items() if array is not None}
+    return image._replace(rgb=rgb, **changed)
+
+
+def _rotated(pixels: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+    if pixels.dtype == np.bool_:
+        return rotate_equirect(pixels.view(np.uint8), rotation, "nearest") > 0
+    return rotate_equirect(pixels, rotation, "nearest")

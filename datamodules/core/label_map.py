@@ -213,7 +213,7 @@ def read_label_map(path: Path) -> LabelMap:
         raise DataError(path, found=found, expected=_EXPECTED)
     if is_list:
         others = [value for value, name in enumerate(content) if name is None]
-        labels = dict.fromkeys([*others, 255, _MOST_VALUE], 0) | labels
+        labels = {**dict.fromkeys([*others, 255, _MOST_VALUE], 0), **labels}
     return LabelMap(names, labels, refuses_others=is_list)
 
 
