@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +11,6 @@ from torch import nn
 from models import HexUNet, IcoCNN, UNet, ZonalClassifier
 from models.unet import Down
 from tangent_train.errors import SettingError
-from tests.running import run_python
 
 
 def test_pooling_first_equals_halving_after_the_first_convolution() -> None:
@@ -70,16 +68,3 @@ def test_images_that_do_not_fit_are_refused(
 ) -> None:
     with pytest.raises(SettingError, match=message):
         network(torch.zeros(1, *shape))
-
-
-def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
-    program = "import sys, models.unet; print(*(n for n in sys.modules if n[:4] in {}))"
-    done = run_python(tmp_path, "-c", program.format("('mode', 'tang', 'data')"))
-    assert {name for name in done.stdout.split() if name.partition(".")[0] != "dataclasses"} == {
-        "datamodules",  # the package alone: all names in it are imported when they are used
-        "models",
-        "models.unet",
-        "tangent_train",
-        "tangent_train.errors",
-        "tangent_train.imports",
-    }
