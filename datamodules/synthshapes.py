@@ -78,7 +78,7 @@ def generate_shapes(root: Path, settings: ShapeSettings) -> None:
         SettingError: The folder holds other files, or shapes of other settings.
     """
     about = {"generator": "SynthShapes", "version": _VERSION}
-    manifest = Manifest.open(root, about | asdict(settings))
+    manifest = Manifest.open(root, about | asdict(settings), is_shared=True)
     parts = ["train"] * settings.train + ["test"] * settings.test
     shapes = {
         f"{label}/{part}/{label}_{number:04d}.off": (label, number)

@@ -19,8 +19,13 @@ from numpy.typing import NDArray
 
 from studies.output import Row, save
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.heads.alignment import align_views, sample_views, sphere_points
-from tangent_train.heads.distances import distance_of, from_distance
+from tangent_train.heads.alignment import (
+    align_views,
+    distance_of,
+    from_distance,
+    sample_views,
+    sphere_points,
+)
 from tangent_train.io.pixel_files import read_depth_m
 from tangent_train.rendering import HorizontalRepresentation
 
@@ -100,9 +105,9 @@ def depth_alignment(
             errors.append((distance / truth).log().flatten(1).numpy())
             first += len(part)
         of_views = np.concatenate(errors) - np.nanmedian(np.concatenate(errors))
-        name, report = "" if mode is None else f", {mode}", alignment.report
-        row.setdefault("step before", 100 * (report.step_before or 0))
-        row[f"step{name}"] = 100 * (report.step_after or 0)
+        name, report = "" if mode is None else f", {mode}", alignment.facts
+        row.setdefault("step before", 100 * (report["step_before"] or 0))
+        row[f"step{name}"] = 100 * (report["step_after"] or 0)
         row[f"error{name}"] = 100 * float(np.nanmedian(np.abs(of_views)))
         row[f"view{name}"] = 100 * float(np.abs(np.nanmedian(of_views, axis=1)).max())
     return row

@@ -2,7 +2,7 @@
 
 Every command that writes many files opens the manifest of its folder first. A folder with the same
 settings is continued with what is missing; a folder with others is refused, and nothing is written,
-unless nothing in it is finished.
+unless nothing in it is finished and no other process shares it.
 Shards of one work (`items[i::n]`) share the folder and its settings.
 
 A folder holds ``manifest.json``, and for each shard a file ``finished*.jsonl`` with a line for each
@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Self, TypeVar
 
 from tangent_train.errors import SettingError
-from tangent_train.files import write_text
 
 MANIFEST = "manifest.json"
 
@@ -85,13 +84,22 @@ class Manifest:
     _shard: Shard = field(default_factory=Shard)
 
     @classmethod
-    def open(cls, folder: Path, settings: Mapping[str, Any], shard: Shard | None = None) -> Self:
+    def open(
+        cls,
+        folder: Path,
+        settings: Mapping[str, Any],
+        shard: Shard | None = None,
+        *,
+        is_shared: bool = False,
+    ) -> Self:
         """Create an output folder, or continue one that was written with the same settings.
 
         Args:
             folder: Output folder: new, empty, begun with the same settings, or nothing is finished.
             settings: Settings that decide the content, plain values; paths as text.
             shard: Part of the work that this process does; None for all of it.
+            is_shared: True if several processes may begin at once, as shards do: the first one
+                decides the settings.
 
         Raises:
             SettingError: The folder holds other files, or items finished with other settings.
@@ -109,11 +117,16 @@ class Manifest:
         finished: dict[str, dict[str, Any]] = {}
         for file in sorted(folder.glob("finished*.jsonl")):
             finished |= _read_lines(file)
-        if finished:
+        shard = shard or Shard()
+        if not (finished or is_shared or shard.count > 1):
+            path.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            with path.open("x", encoding="utf-8") as new:
+                new.write(json.dumps(wanted, indent=1) + "\n")
+        except FileExistsError:
             cls._check_same(path, wanted)
-        else:
-            write_text(path, json.dumps(wanted, indent=1) + "\n")
-        return cls(folder, finished, shard or Shard())
+        return cls(folder, finished, shard)
 
     @staticmethod
     def _check_same(path: Path, wanted: Mapping[str, Any]) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix

@@ -8,9 +8,7 @@ from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from datamodules.core.splits import SPLITS, Split, draw_groups
+from datamodules.core.files import SPLITS, ImageFiles, Problems, Split, draw_groups
 from tangent_train.errors import DataError, counted
 from tangent_train.io.image_files import composed
 

@@ -22,14 +22,14 @@ from typing import Literal
 from pydantic import PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import resize_depth, steps_to_meters
+from datamodules.core.depth import resize_depth, steps_to_meters
+from datamodules.core.files import Problems
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
     PanoramaPairs,
     PublishedPair,
     paired_shape,
 )
-from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS
 from datamodules.stanford2d3ds.panoramas import (
     GET_IT,

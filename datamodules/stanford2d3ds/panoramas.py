@@ -39,12 +39,9 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split, draw_groups
 from datamodules.stanford2d3ds.files import (
     AREAS,
     CAMERA_FROM_SPHERE,
@@ -171,9 +168,10 @@ class StanfordImages(ImageDataModule):
 
     label_maps: ClassVar[Mapping[str, LabelMap]] = {
         "13": _THIRTEEN,
-        "8": _THIRTEEN.regrouped(LabelMap.grouped(EIGHT)),
+        "8": _THIRTEEN.regrouped(EIGHT),
     }
     group: ClassVar[Literal["pano", "data"]]
+    get_it = GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
     folds: ClassVar[tuple[int, ...]] = tuple(FOLDS)
 
@@ -188,12 +186,8 @@ class StanfordImages(ImageDataModule):
             expected = f"some for testing ({', '.join(FOLDS[self.fold])}) and some for training"
             raise SettingError("data.areas", found=list(self.areas), expected=expected)
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ImageFiles]]:
         pictures = [
             picture
             for area in self.areas
@@ -217,7 +211,7 @@ class StanfordImages(ImageDataModule):
         label_map: Any = self.label_map
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         path = self.label_table or next(filter(Path.is_file, places), places[0])
-        return read_label_table(path).regrouped(LabelMap.grouped(label_map.names))
+        return read_label_table(path).regrouped(label_map.names)
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`: by the class table."""

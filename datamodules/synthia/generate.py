@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.images import distance_from_z_depth
-from datamodules.core.problems import Problems
+from datamodules.core.depth import distance_from_z_depth
+from datamodules.core.files import Problems
 from datamodules.synthia import reader
 from tangent_train.geometry import (
     equirect_latitudes,
@@ -147,7 +147,7 @@ def make_panoramas(
         if is_published or not views:
             continue
         settings = {"generator": "OmniSYNTHIA", "frames": frames, "height": height}
-        manifest = Manifest.open(folder / "pano", settings)
+        manifest = Manifest.open(folder / "pano", settings, is_shared=True)
         chosen = reader.choose_frames(views, frames)
         missing = manifest.missing(chosen)
         first = reader.view_files(root, sequence, chosen[0], reader.VIEWS[0], with_depth=False)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from itertools import chain
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,13 +24,11 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles, units_to_steps
+from datamodules.core.depth import units_to_steps
+from datamodules.core.files import ImageFiles, Problems, Split
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
 from tangent_train.errors import DataError, SettingError
@@ -77,6 +74,7 @@ class SynthiaSequences(ImageDataModule):
     label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": _LABELS}
     normalizations = _NORMALIZATIONS
     units_per_m = 100
+    get_it = reader.GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
     inputs: Sequence[Input] = ("rgb",)
@@ -94,12 +92,8 @@ class SynthiaSequences(ImageDataModule):
     def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """Return the images of every frame of a sequence, if any."""
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
         for sequence in (*self.train_sequences, *self.test_sequences):
             found = self.list_images(sequence)
@@ -155,7 +149,6 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         sequences = (*self.train_sequences, *self.test_sequences)
         size = {"frames": self.frames, "height": self.panorama_height}
         make_panoramas(self.root, sequences, broken, **size)
-        vars(self).pop("_divided", None)  # listed before there were files
         if not self.skip_broken:
             broken.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 

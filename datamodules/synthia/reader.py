@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_pixels
 

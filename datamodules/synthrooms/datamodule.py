@@ -24,7 +24,6 @@ from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, Positiv
 from pydantic.dataclasses import dataclass
 
 from datamodules.core.data_module import data_set
-from datamodules.core.processes import in_processes
 from datamodules.stanford2d3ds.files import (
     AREAS,
     BLENDER,
@@ -57,6 +56,7 @@ from datamodules.synthrooms.render import (
 from tangent_train.files import write_bytes, write_text
 from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
+from tangent_train.threads import in_processes
 
 INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
 """Number of entries per room and class in the label table, used or not.
@@ -159,7 +159,7 @@ def generate_rooms(root: Path, settings: RoomSettings, *, workers: int | None = 
         SettingError: The folder holds other files, or rooms of other settings.
     """
     about = {"generator": "SynthRooms", "version": _VERSION}
-    manifest = Manifest.open(root, about | asdict(settings))
+    manifest = Manifest.open(root, about | asdict(settings), is_shared=True)
     plans = {f"area_{plan.area}/{plan.name}": plan for plan in plan_rooms(settings)}
     missing = manifest.missing(plans)
     if missing:
@@ -302,7 +302,6 @@ class SynthRoomsImages(StanfordImages):
     def make_files(self) -> None:
         """Generate the files, unless they are there."""
         generate_rooms(self.root, self.rooms)
-        vars(self).pop("_divided", None)  # listed before there were files
 
 
 @data_set

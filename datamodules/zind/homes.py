@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from datamodules.core.problems import Problems
+from datamodules.core.files import Problems
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json

@@ -35,7 +35,7 @@ Dataset: Annotated Floor Plans With 360º Panoramas and 3D Room Layouts", CVPR 2
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from functools import cached_property
 from itertools import combinations
@@ -47,13 +47,11 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split, draw_groups
 from datamodules.zind.homes import HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR
 from tangent_train.errors import DataError
@@ -86,25 +84,21 @@ class Zind(PanoramaDataModule):
     test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
     split_seed: NonNegativeInt = 0
 
-    def files(self, split: Split) -> list[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        panoramas = zip(self._panoramas, self._split_of_each, strict=True)
-        if split == "val" and not self.val_fraction:
-            return []
-        return [ImageFiles(p.name, p.image, p.file) for p, part in panoramas if part == split]
-
-    @cached_property
-    def _panoramas(self) -> list[HomePanorama]:
         found = list_home_panoramas(self.root, self.problems)
-        return [panorama for panorama in found if panorama.record.layout_visible]
+        panoramas = [panorama for panorama in found if panorama.record.layout_visible]
+        splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
+        for p, split in zip(panoramas, self._split_of_each(panoramas), strict=True):
+            splits[split].append(ImageFiles(p.name, p.image, p.file))
+        return splits
 
     @cached_property
     def _by_name(self) -> dict[str, HomePanorama]:
-        return {panorama.name: panorama for panorama in self._panoramas}
+        return {one.name: one for one in list_home_panoramas(self.root, Problems())}
 
-    @cached_property
-    def _split_of_each(self) -> list[Split]:
-        homes = {panorama.home for panorama in self._panoramas}
+    def _split_of_each(self, panoramas: Sequence[HomePanorama]) -> list[Split]:
+        homes = {panorama.home for panorama in panoramas}
         partition = self.root / "zind_partition.json"
         if partition.is_file():
             kind = dict[Split, list[str]]
@@ -113,8 +107,8 @@ class Zind(PanoramaDataModule):
             if missing := sorted(homes - of_home.keys()):
                 found = f"no home {', '.join(missing[:5])}"
                 raise DataError(partition, found=found, expected=f"every home of {self.root}")
-            return [of_home[panorama.home] for panorama in self._panoramas]
-        groups = [p.home if len(homes) > 1 else p.room for p in self._panoramas]
+            return [of_home[panorama.home] for panorama in panoramas]
+        groups = [p.home if len(homes) > 1 else p.room for p in panoramas]
         test, held = set(groups), set[str]()
         if self.test_fraction < 1:
             test = draw_groups(groups, self.test_fraction, [self.split_seed, 0])

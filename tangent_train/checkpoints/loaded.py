@@ -19,7 +19,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.outputs import OutputNetwork
@@ -56,7 +56,7 @@ class NetworkDescription:
     """Everything that a file contains about its network, besides the tensors.
 
     Attributes:
-        predicts: Kind of labels that the network predicts, see `datamodules.core.labels`.
+        predicts: Kind of labels that the network predicts, see `datamodules.core.label_map`.
         class_names: Names of the K + 1 labels, the unknown class first; score k is that of label
             k + 1. Empty for depth networks.
         inputs: Inputs of the network, see `datamodules.core.inputs.Input`; empty for shapes.
@@ -106,7 +106,7 @@ class NetworkDescription:
         """Refuse networks with other predictions than needed.
 
         Args:
-            needed: Kind of labels, see `datamodules.core.labels`.
+            needed: Kind of labels, see `datamodules.core.label_map`.
             remedy: Remedy in the message.
 
         Raises:

@@ -18,7 +18,7 @@ from torch import nn
 
 from datamodules.core.data_module import DataModule
 from datamodules.core.image_module import ImageDataModule
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.pictures import Pictures

@@ -1,4 +1,4 @@
-"""Bring the depth of the views of a panorama to one scale.
+"""Bring the depth of the views of a panorama to one scale, and blend them.
 
 A depth network estimates each view on its own, up to an error of its scale, or up to an unknown
 scale and shift. Views are compared at the directions of an icosphere that two or more of them see,
@@ -21,9 +21,9 @@ shrinks slowly, so that views with a wrong start are not taken for outliers.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -32,16 +32,30 @@ from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import spsolve
 from torch import Tensor
+from torch.nn import functional
 
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
-from tangent_train.geometry import icosphere, lonlat_to_equirect, xyz_to_lonlat
-from tangent_train.heads.distances import RAY_POWERS, along_rays, is_disparity, is_metric
-from tangent_train.rendering.checks import check_choice
+from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
+from tangent_train.rendering import Blend
+from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
+
+RAY_POWERS: dict[str, int] = {
+    "metric_distance": 0,
+    "metric_z": 1,
+    "relative_depth": 1,
+    "relative_disparity": -1,
+}
+"""Powers of the ray length that convert depth, or disparity, to that along the ray."""
+
+_FARTHEST_M = 1e4
+_FARTHEST = 100.0
+"""Multiples of the median beyond which relative depth is unknown, like sky: small errors of the
+disparity change it without limit."""
 
 _LEVEL = 5
 _PHOTO_POINTS = 2**13
@@ -68,6 +82,94 @@ _NODES = 5
 """Nodes of a grid of corrections per side."""
 _SLOPE_PRIOR, _NODE_PRIOR = 0.1, 0.3
 """Standard deviations of differences of neighboring nodes, and of nodes, in logarithms."""
+
+
+def is_disparity(kind: DepthKind) -> bool:
+    """Return True if views are blended in disparity, False if in the logarithm of distance."""
+    return kind == "relative_disparity"
+
+
+def is_metric(kind: DepthKind) -> bool:
+    """Return True if distances are in meters, False if only their ratios are known."""
+    return not kind.startswith("relative")
+
+
+def depth_of_output(
+    output: Tensor, kind: DepthKind, ray_lengths: Tensor
+) -> tuple[Tensor, DepthKind]:
+    """Convert `log_distance` and `canonical_inverse` to meters; others are returned unchanged.
+
+    The canonical inverse depth C is divided by the focal length in image widths (Bochkovskii et al.
+    2024, section 3.2). That follows from the rays: at columns of distance d, the second difference
+    of 1 + x² is 2 (d p)², with the pitch p of pixels on the image plane. Depth is at most 10 km, as
+    in the authors' code.
+
+    Args:
+        output: Output of a network for whole images, ``(n, 1, h, w)``.
+        kind: Kind of the output.
+        ray_lengths: ``(1 or n, 1, h, w)``, see `Views.ray_lengths`.
+
+    Returns:
+        Depth, and its kind, which is in `RAY_POWERS`.
+    """
+    if kind == "log_distance":
+        return output.exp(), "metric_distance"
+    if kind == "canonical_inverse":
+        inverse = output * _span(ray_lengths)
+        return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
+    return output, kind
+
+
+def _span(ray_lengths: Tensor) -> Any:
+    """Return the width of images ``(…, h, w)`` on the image plane at distance 1."""
+    width = ray_lengths.shape[-1]
+    if width == 1:  # not a pinhole image: the radians of an equirectangular image
+        return 2 * math.pi
+    half = (width - 1) // 2
+    left, middle, right = ray_lengths[..., [0, half, 2 * half]].square().unbind(-1)
+    squared = ((left + right) / 2 - middle).mean(-1)[..., None, None]
+    return squared.sqrt() * width / half
+
+
+def along_rays(depth: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
+    """Convert depth to the quantity in which views are blended.
+
+    Args:
+        depth: Values of the kind.
+        kind: Kind of the values, see `depth_of_output`.
+        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+
+    Returns:
+        Disparity along the ray, 1 / distance, for `relative_disparity`; for other kinds the natural
+        logarithm of the distance. NaN where the depth is not finite, or not positive where its
+        logarithm is taken.
+    """
+    values = depth * ray_lengths ** RAY_POWERS[kind]
+    values = values if is_disparity(kind) else values.log()
+    return values.where(values.isfinite(), torch.nan)
+
+
+def from_distance(distance: Tensor, kind: DepthKind, ray_lengths: Tensor) -> Tensor:
+    """Convert distances along the rays to the output of a network: the inverse of `distance_of`.
+
+    Args:
+        distance: Distances ``(n, …, h, w)``.
+        kind: Kind of the result.
+        ray_lengths: Distance divided by z-depth at each pixel, see `Views.ray_lengths`.
+    """
+    if kind == "log_distance":
+        return distance.log()
+    if kind == "canonical_inverse":
+        return ray_lengths / (distance * _span(ray_lengths))
+    values = 1 / distance if is_disparity(kind) else distance
+    return values * ray_lengths ** -RAY_POWERS[kind]
+
+
+def distance_of(values: Tensor, kind: DepthKind) -> Tensor:
+    """Convert blended values, see `along_rays`, to distances; NaN where disparity is ≤ 0."""
+    if not is_disparity(kind):
+        return values.exp()
+    return (1 / values).where(values > 0, torch.nan)
 
 
 class ViewSamples(NamedTuple):
@@ -133,66 +235,22 @@ def sample_views(
     rays = np.stack([rows[0] * columns[0], rows[0] * columns[1], rows[1]])
     u, v, w = np.moveaxis(geometry.matrices @ rays, 1, 0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        x, y = (2 * u / w + 1) / width - 1, (2 * v / w + 1) / height - 1
-    view, point = np.nonzero((np.maximum(np.abs(x), np.abs(y)) <= 1) & (w > 0))
-    position = np.stack([x[view, point], y[view, point]], axis=-1)
-    value = _interpolated(placed[:, 0], view, position)
-    lengths, length = torch.from_numpy(views.ray_lengths()), np.ones(len(view))
-    if lengths.numel() > 1:
-        length = _interpolated(lengths, view % len(lengths), position)
-    if images is not views:
-        position = np.full_like(position, np.nan)
-    return ViewSamples(len(placed), view, point, value, length, position)
+        positions = (2 * np.stack([u, v], axis=-1) / w[..., None] + 1) / (width, height) - 1
+    view, point = np.nonzero((np.abs(positions).max(axis=-1) <= 1) & (w > 0))
+    places = torch.from_numpy(np.where(np.isfinite(positions), positions, 0))[:, :, None]
+
+    def sampled(pixels: Tensor) -> Floats:
+        """Return bilinear values ``(n,)`` of images ``(N, 1, h, w)``; NaN where not finite."""
+        how: Any = {"padding_mode": "border", "align_corners": False}
+        values = functional.grid_sample(pixels.double(), places, **how)[view, 0, point, 0].numpy()
+        return np.where(np.isfinite(values), values, np.nan)
+
+    lengths = torch.from_numpy(views.ray_lengths())[:, None].expand(len(placed), -1, -1, -1)
+    position = positions[view, point] if images is views else np.full((len(view), 2), np.nan)
+    return ViewSamples(len(placed), view, point, sampled(placed), sampled(lengths), position)
 
 
-def _interpolated(images: Tensor, image: Indices, position: Floats) -> Floats:
-    """Return bilinear values ``(n,)`` at positions ``(n, 2)``; NaN where one is not finite."""
-    height, width = images.shape[1:]
-    u, v = (((position + 1) * (width, height) - 1) / 2).T
-    left, top = (
-        np.floor(line).clip(0, side - 2).astype(np.int64)
-        for line, side in ((u, width), (v, height))
-    )
-    right, below = (u - left).clip(0, 1), (v - top).clip(0, 1)
-    array = images.double().numpy()
-    upper = (1 - right) * array[image, top, left] + right * array[image, top, left + 1]
-    lower = (1 - right) * array[image, top + 1, left] + right * array[image, top + 1, left + 1]
-    values = (1 - below) * upper + below * lower
-    return np.where(np.isfinite(values), values, np.nan)
-
-
-@dataclass(frozen=True)
-class AlignmentReport:
-    """Facts about an alignment.
-
-    Attributes:
-        mode: The correction.
-        views: Number of views.
-        groups: Number of groups of views that overlap, directly or through others. Each has a
-            scale of its own.
-        isolated: Views that overlap with no other view.
-        empty: Views without a valid value.
-        constant: Views with constant output, which got a scale but no shift.
-        invalid: Share of samples without a valid value, such as sky.
-        outliers: Share of pairs of samples with a robust weight below ½.
-        step_before: Median difference of the logarithms of two views at a direction.
-        step_after: The same after the alignment.
-    """
-
-    mode: Align
-    views: int
-    groups: int = 0
-    isolated: tuple[int, ...] = ()
-    empty: tuple[int, ...] = ()
-    constant: tuple[int, ...] = ()
-    invalid: float = 0.0
-    outliers: float = 0.0
-    step_before: float | None = None
-    step_after: float | None = None
-
-
-@dataclass(frozen=True)
-class Alignment:
+class Alignment(NamedTuple):
     """Corrections of the depth of N views.
 
     Attributes:
@@ -201,14 +259,18 @@ class Alignment:
         shift: ``(N,)`` shifts, added after multiplication with the scale.
         grid: ``(N, k, k)`` corrections of the logarithm, added bilinearly; rows from top to bottom.
             None without them.
-        report: Facts about the alignment.
+        facts: Facts for summaries: the correction (``mode``); numbers of ``views``, of ``groups``
+            that overlap, directly or through others, and have a scale of their own, of ``isolated``
+            views that overlap with no other view, of ``empty`` ones without a valid value, and of
+            ``constant`` ones, which got a scale but no shift; ``step_before`` and ``step_after``,
+            the median difference of the logarithms of two views at a direction.
     """
 
     kind: DepthKind
     scale: Floats
     shift: Floats
     grid: Floats | None
-    report: AlignmentReport
+    facts: dict[str, Any]
 
     def applied(self, outputs: Tensor, part: slice, ray_lengths: Tensor) -> Tensor:
         """Return corrected depth in the quantity in which views are blended, see `along_rays`.
@@ -252,9 +314,8 @@ def align_views(
             `grid` adds a grid of corrections. A single view is not corrected.
 
     Raises:
-        SettingError: The mode is unknown, or `grid` is given for views without positions.
+        SettingError: `grid` is given for views without positions.
     """
-    check_choice("align", mode or "none", get_args(Align))
     samples = ViewSamples.joined(parts)
     view, count, value = samples.view, samples.num_views, samples.value
     usual: Align = "scale" if is_metric(kind) else "affine"
@@ -266,44 +327,45 @@ def align_views(
     factor = samples.ray_length ** RAY_POWERS[kind]
     is_valid = np.isfinite(value) & (value != 0 if base == "affine" else value > 0)
     value = np.where(is_valid, value, np.nan)
-    before, pairs = _logarithm(value * factor), _pairs(samples, np.flatnonzero(is_valid))
-    scale, shift, grid = np.ones(count), np.zeros(count), None
-    outliers, is_constant = np.zeros(0, bool), np.zeros(count, bool)
-    if base == "scale" and len(pairs.a):
-        scale, outliers = _fit_scales(pairs, before, count)
-    elif base == "affine" and len(pairs.a):
-        scale, shift, is_constant, outliers = _fit_affine(pairs, value, factor, view, count)
-    links = sparse.coo_array((np.ones(len(pairs.a)), (pairs.a, pairs.b)), (count, count))
+    before, (first, second) = _logarithm(value * factor), _pairs(samples, is_valid)
+    pairs = first, second, view[first], view[second]
+    scale, shift, grid, is_constant = np.ones(count), np.zeros(count), None, np.zeros(count, bool)
+    if base == "scale" and len(first):
+        scale = _fit_scales(pairs, before, count)
+    elif base == "affine" and len(first):
+        scale, shift, is_constant = _fit_affine(pairs, value, factor, view, count)
+    links = sparse.coo_array((np.ones(len(first)), pairs[2:]), (count, count))
     groups: Indices = connected_components(links, directed=False)[1]
-    after, changes = _logarithm((scale[view] * value + shift[view]) * factor), np.zeros(count)
-    for number in np.unique(view[np.isfinite(after - before)]):
-        changes[number] = np.nanmedian((after - before)[view == number])
-    unit = _medians(changes, groups)
+    after = _logarithm((scale[view] * value + shift[view]) * factor)
+    unit = _medians(_medians(after - before, view, count), groups, count)[groups]
     scale, shift, after = scale / np.exp(unit), shift / np.exp(unit), after - unit[view]
-    if mode == "grid" and len(pairs.a):
-        grid, added, outliers = _fit_grid(pairs, after, samples)
-        grid -= _medians(grid.mean(axis=(1, 2)), groups)[:, None, None]
+    if mode == "grid" and len(first):
+        grid, added = _fit_grid(pairs, after, samples)
+        grid -= _medians(grid.mean(axis=(1, 2)), groups, count)[groups, None, None]
         after = after + added
     is_empty = np.bincount(view[is_valid], minlength=count) == 0
-    alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
-    report = AlignmentReport(
-        mode,
-        count,
-        groups=len(np.unique(groups[~is_empty])),
-        isolated=tuple(np.flatnonzero(alone).tolist()),
-        empty=tuple(np.flatnonzero(is_empty).tolist()),
-        constant=tuple(np.flatnonzero(is_constant).tolist()),
-        invalid=1 - float(is_valid.mean()) if len(view) else 0.0,
-        outliers=float(outliers.mean()) if len(outliers) else 0.0,
-        step_before=pairs.step(before),
-        step_after=pairs.step(after),
+    is_alone = (np.bincount(groups)[groups] == 1) & ~is_empty & (count > 1)
+    steps = [np.abs(logs[first] - logs[second]) for logs in (before, after)]
+    step_before, step_after = (
+        float(np.nanmedian(step)) if np.isfinite(step).any() else None for step in steps
     )
-    return Alignment(kind, scale, shift, grid, report)
+    facts = {
+        "mode": mode,
+        "views": count,
+        "groups": len(np.unique(groups[~is_empty])),
+        "isolated": int(is_alone.sum()),
+        "empty": int(is_empty.sum()),
+        "constant": int(is_constant.sum()),
+        "step_before": step_before,
+        "step_after": step_after,
+    }
+    return Alignment(kind, scale, shift, grid, facts)
 
 
-def _medians(values: Floats, groups: Indices) -> Floats:
-    """Return the median of the group of each value."""
-    return np.array([np.median(values[groups == k]) for k in range(groups.max() + 1)])[groups]
+def _medians(values: Floats, numbers: Indices, count: int) -> Floats:
+    """Return the medians ``(count,)`` of the finite values of each number; 0 without any."""
+    known = [values[(numbers == k) & np.isfinite(values)] for k in range(count)]
+    return np.array([np.median(part) if len(part) else 0.0 for part in known])
 
 
 def _logarithm(values: Floats) -> Floats:
@@ -311,29 +373,14 @@ def _logarithm(values: Floats) -> Floats:
     return np.log(np.where(values > 0, values, np.nan))
 
 
-class _Pairs(NamedTuple):
-    """Pairs of samples of the same point in two views.
-
-    Attributes:
-        first: ``(m,)`` indices of samples.
-        second: ``(m,)`` indices of the samples in the other view.
-        a: ``(m,)`` view of the first.
-        b: ``(m,)`` view of the second.
-    """
-
-    first: Indices
-    second: Indices
-    a: Indices
-    b: Indices
-
-    def step(self, logs: Floats) -> float | None:
-        """Return the median difference of logarithms."""
-        steps = np.abs(logs[self.first] - logs[self.second])
-        return float(np.nanmedian(steps)) if np.isfinite(steps).any() else None
+_Pairs = tuple[Indices, Indices, Indices, Indices]
+"""Indices ``(m,)`` of samples, those of a sample of the same point in another view each, and the
+views of both."""
 
 
-def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
+def _pairs(samples: ViewSamples, is_valid: NDArray[np.bool_]) -> tuple[Indices, Indices]:
     """Pair valid samples of the same point, of all views that share enough points."""
+    valid = np.flatnonzero(is_valid)
     shared = np.bincount(samples.point[valid])
     every = max(1, -(-int((shared * (shared - 1) // 2).sum()) // _MOST_PAIRS))
     valid = valid[samples.point[valid] % every == 0]
@@ -348,8 +395,8 @@ def _pairs(samples: ViewSamples, valid: Indices) -> _Pairs:
     a, b = samples.view[first], samples.view[second]
     views = np.minimum(a, b) * samples.num_views + np.maximum(a, b)
     _, number, counts = np.unique(views, return_inverse=True, return_counts=True)
-    kept = counts[number] >= _LEAST_SAMPLES
-    return _Pairs(first[kept], second[kept], a[kept], b[kept])
+    is_kept = counts[number] >= _LEAST_SAMPLES
+    return first[is_kept], second[is_kept]
 
 
 def _slopes(entries: Sequence[Floats], unknowns: Sequence[Indices], count: int) -> sparse.csr_array:
@@ -363,7 +410,7 @@ def _robust_fit(
     evaluate: Callable[[Floats], tuple[Floats, sparse.csr_array]],
     start: Floats,
     prior: sparse.csr_array | None = None,
-) -> tuple[Floats, NDArray[np.bool_]]:
+) -> Floats:
     """Minimize the Cauchy loss of residuals, in units of their median absolute deviation.
 
     Gauss-Newton steps on reweighted squares. Priors are measured in the noise of the residuals:
@@ -374,11 +421,8 @@ def _robust_fit(
         start: ``(n,)`` first values of the unknowns.
         prior: ``(k, n)`` matrix; its product with the unknowns is expected to be that with `start`,
             with a standard deviation of 1.
-
-    Returns:
-        The unknowns, and a mask of residuals with a weight below ½.
     """
-    unknowns, weight, noise = start, np.ones(0), _NO_NOISE
+    unknowns, noise = start, _NO_NOISE
     for _ in range(_ITERATIONS):
         residual, slopes = evaluate(unknowns)
         spread = _MAD_TO_STD * float(np.median(np.abs(residual)))
@@ -394,21 +438,21 @@ def _robust_fit(
         unknowns = unknowns + step.clip(-1, 1)
         if np.abs(step).max() < _TOLERANCE:
             break
-    return unknowns, weight < 1 / 2
+    return unknowns
 
 
-def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return scales ``(N,)``, and a mask of outliers."""
-    ones, offset = np.ones(len(pairs.a)), logs[pairs.first] - logs[pairs.second]
-    slopes = _slopes([ones, -ones], [pairs.a, pairs.b], count)
-    fit, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count))
-    return np.exp(fit), outliers
+def _fit_scales(pairs: _Pairs, logs: Floats, count: int) -> Floats:
+    """Return scales ``(N,)``."""
+    first, second, a, b = pairs
+    ones, offset = np.ones(len(a)), logs[first] - logs[second]
+    slopes = _slopes([ones, -ones], [a, b], count)
+    return np.exp(_robust_fit(lambda x: (slopes @ x + offset, slopes), np.zeros(count)))
 
 
 def _fit_affine(
     pairs: _Pairs, value: Floats, factor: Floats, view: Indices, count: int
-) -> tuple[Floats, Floats, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return scales and shifts ``(N,)``, a mask of constant views, and a mask of outliers.
+) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """Return scales and shifts ``(N,)``, and a mask of constant views.
 
     The unknowns are u and b in ``s x + t = exp(u) (x / unit + b)``.
     """
@@ -435,23 +479,20 @@ def _fit_affine(
         return residual, _slopes(entries, [a, b, count + a, count + b], 2 * count)
 
     prior = sparse.diags_array(np.repeat([1 / _SCALE_PRIOR, 1 / _SHIFT_PRIOR], count)).tocsr()
-    start = np.concatenate([np.log(unit), np.zeros(count)])
-    fit, outliers = _robust_fit(evaluate, start, prior)
+    fit = _robust_fit(evaluate, np.concatenate([np.log(unit), np.zeros(count)]), prior)
     scale = np.exp(fit[:count])
-    return scale / unit, scale * fit[count:], is_constant, outliers
+    return scale / unit, scale * fit[count:], is_constant
 
 
-def _fit_grid(
-    pairs: _Pairs, logs: Floats, samples: ViewSamples
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
-    """Return corrections ``(N, k, k)``, their values at the samples, and a mask of outliers."""
+def _fit_grid(pairs: _Pairs, logs: Floats, samples: ViewSamples) -> tuple[Floats, Floats]:
+    """Return corrections ``(N, k, k)``, and their values at the samples."""
     count, nodes = samples.num_views, _NODES**2
     x, y = (_hat(samples.position[:, axis]) for axis in (0, 1))
     hats = sparse.csr_array((y[:, :, None] * x[:, None, :]).reshape(-1, nodes)).tocoo()
     columns = samples.view[hats.row] * nodes + hats.col
     at_samples = sparse.csr_array((hats.data, (hats.row, columns)), (len(x), count * nodes))
-    comparable = np.isfinite(logs[pairs.first] - logs[pairs.second])
-    first, second = pairs.first[comparable], pairs.second[comparable]
+    is_comparable = np.isfinite(logs[pairs[0]] - logs[pairs[1]])
+    first, second = (part[is_comparable] for part in pairs[:2])
     slopes, offset = at_samples[first] - at_samples[second], logs[first] - logs[second]
     one = sparse.eye_array(_NODES)
     next_node = sparse.diags_array([-1.0, 1.0], offsets=[0, 1], shape=(_NODES - 1, _NODES))
@@ -459,8 +500,8 @@ def _fit_grid(
     small = sparse.vstack([smooth / _SLOPE_PRIOR, sparse.eye_array(nodes) / _NODE_PRIOR])
     prior = sparse.kron(sparse.eye_array(count), small).tocsr()
     start = np.zeros(count * nodes)
-    fit, outliers = _robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
-    return fit.reshape(count, _NODES, _NODES), at_samples @ fit, outliers
+    fit = _robust_fit(lambda x: (slopes @ x + offset, slopes), start, prior)
+    return fit.reshape(count, _NODES, _NODES), at_samples @ fit
 
 
 def _hat(positions: Floats) -> Floats:
@@ -472,3 +513,98 @@ def _hat(positions: Floats) -> Floats:
     nodes = np.linspace(-1, 1, _NODES)
     distance = np.abs(positions[:, None] - nodes) * (_NODES - 1) / 2
     return np.maximum(0, 1 - distance)
+
+
+class AlignedMosaic:
+    """Distances along the rays of a panorama or photo, whose views are aligned, then blended.
+
+    Views are blended in the logarithm of distance, or in disparity for networks that return it.
+
+    Args:
+        shape: ``(H, W)`` of the panorama or photo.
+        kind: Kind of the network's output.
+        blend: Blend of the views.
+        align: See `align_views`.
+        valid: ``(H, W)`` valid pixels of a partial panorama, at which views are compared; None if
+            all are valid.
+        camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
+
+    Attributes:
+        facts: Facts about the alignment, after `pixels` or `distances`, see `Alignment`.
+    """
+
+    facts: dict[str, Any]
+
+    def __init__(
+        self,
+        shape: tuple[int, int],
+        kind: DepthKind,
+        blend: Blend,
+        align: Align | None = None,
+        *,
+        valid: NDArray[np.bool_] | None = None,
+        camera_matrix: NDArray[np.float64] | None = None,
+    ) -> None:
+        self._shape, self._kind, self._align = shape, kind, align
+        self._blend: Blend = blend
+        self._lengths = None if camera_matrix is None else ray_lengths(camera_matrix, shape)
+        points = sphere_points(shape) if camera_matrix is None else lattice(shape)
+        self._points = points if valid is None else points[valid[tuple(points.T)]]
+        self._parts: list[tuple[Views, Tensor, Tensor]] = []
+
+    def add(self, outputs: Tensor, views: Views) -> None:
+        """Add some views, which together cover the image, once or several times.
+
+        Args:
+            outputs: Outputs of the network ``(n, 1, h, w)``.
+            views: The views.
+        """
+        self._parts.append((views, outputs, torch.from_numpy(views.ray_lengths()).to(outputs)))
+
+    def distances(self) -> Tensor:
+        """Return distances ``(H, W)`` from the center along the rays, NaN where unknown.
+
+        They are in meters, or for relative kinds in multiples of the median of known distances, of
+        a photo of z-depth, by solid angle.
+
+        Raises:
+            SettingError: The views cannot be aligned in this way.
+        """
+        samples, depths = [], []
+        for views, outputs, lengths in self._parts:
+            depth, kind = depth_of_output(outputs, self._kind, lengths[:, None])
+            depths.append(depth)
+            array = depth[:, 0].cpu().numpy()
+            samples.append(sample_views(array, views, self._shape, self._points))
+        alignment = align_views(samples, kind, self._align)
+        self.facts = alignment.facts
+        mosaic = MeanMosaic(self._shape, self._blend, device=depths[0].device)
+        first = 0
+        for (views, _, lengths), depth in zip(self._parts, depths, strict=True):
+            part = slice(first, first + len(views))
+            mosaic.add(alignment.applied(depth, part, lengths), views)
+            first = part.stop
+        distance = distance_of(mosaic.values()[0], kind)
+        if not is_metric(self._kind):
+            distance = distance / self._median(distance)
+            distance = distance.where(distance <= _FARTHEST, torch.nan)
+            distance = distance / self._median(distance)  # without what was too far
+        return distance
+
+    def pixels(self) -> Tensor:
+        """Return what users get: z-depth of a photo, distances of a panorama."""
+        distance = self.distances()
+        if self._lengths is None:
+            return distance
+        return distance / torch.from_numpy(self._lengths).to(distance)
+
+    def _median(self, distance: Tensor) -> float:
+        """Return the median of known depth at points, by solid angle; 1 if all are unknown."""
+        points = tuple(self._points.T)
+        values = distance.cpu().numpy()[points]
+        lengths = np.ones(len(values)) if self._lengths is None else self._lengths[points]
+        known = np.isfinite(values)
+        if not known.any():
+            return 1.0
+        weights, values = lengths[known] ** -3.0, (values / lengths)[known]
+        return float(np.quantile(values, 0.5, weights=weights, method="inverted_cdf"))

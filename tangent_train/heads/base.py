@@ -97,7 +97,7 @@ class Head(nn.Module, ABC):
 
     Attributes:
         kind: Kind of the predictions, by which files and commands select the head.
-        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
+        labels: Kind of labels that a data set must have, see `datamodules.core.label_map`.
         columns: Names and units of the scores over a split, in the order of the tables.
         main_score: Score that selects the best epoch.
         takes: Input and output of a network for this head, for messages.

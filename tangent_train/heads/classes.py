@@ -15,8 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.core.class_weights import ClassWeights
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights
 from tangent_train.errors import SettingError
 from tangent_train.heads.base import (
     RGB,

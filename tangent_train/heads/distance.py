@@ -13,13 +13,21 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.core.images import STEPS_PER_M
-from datamodules.core.labels import DISTANCE
+from datamodules.core.depth import STEPS_PER_M
+from datamodules.core.label_map import DISTANCE
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, at_least, of_extra
 from tangent_train.files import write_bytes
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
-from tangent_train.heads.aligned_mosaic import AlignedMosaic
+from tangent_train.heads.alignment import (
+    AlignedMosaic,
+    along_rays,
+    depth_of_output,
+    distance_of,
+    from_distance,
+    is_disparity,
+    is_metric,
+)
 from tangent_train.heads.base import (
     RGB,
     Head,
@@ -28,14 +36,6 @@ from tangent_train.heads.base import (
     Scores,
     SummaryTable,
     solid_angles,
-)
-from tangent_train.heads.distances import (
-    along_rays,
-    depth_of_output,
-    distance_of,
-    from_distance,
-    is_disparity,
-    is_metric,
 )
 from tangent_train.heads.losses import DepthLoss, log_error_sum
 from tangent_train.heads.pictures import (
@@ -260,7 +260,7 @@ class DistanceHead(Head):
 
         The alignment of views is known after an evaluation on panoramas.
         """
-        views = {} if self._aligned is None else {"views_aligned": self._aligned.report.mode}
+        views = {} if self._aligned is None else {"views_aligned": self._aligned.facts["mode"]}
         return {"weighting": "pixels, then images", **self.protocol.facts, **views}
 
     def comparable(

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from datamodules.core.labels import IMAGE_CLASS
+from datamodules.core.label_map import IMAGE_CLASS
 from tangent_train.heads.base import Head, Scores
 from tangent_train.metrics.classification import ClassificationMetric, classification_scores
 from tangent_train.metrics.score_columns import ScoreColumn

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
-from tangent_train.heads.aligned_mosaic import AlignedMosaic
+from tangent_train.heads.alignment import AlignedMosaic
 from tangent_train.rendering.backward import tangent_to_equirect
 from tangent_train.rendering.checks import Blend, blend_of, check_panorama
 from tangent_train.rendering.forward import Pixels, equirect_to_tangent

@@ -20,8 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 )
 from torch import nn
 
+from datamodules.core.dataset import render_inputs
 from datamodules.core.inputs import normalize
-from datamodules.core.samples import render_inputs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
@@ -234,7 +234,7 @@ def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
     mean = np.mean([values[-1][1] for values in of_classes])
     assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)
     images = torch.stack([shape.images for shape in Shapes().shapes])
-    labels = torch.stack([shape.target for shape in Shapes().shapes])
+    labels = torch.stack([shape.labels for shape in Shapes().shapes])
     with torch.no_grad():
         loss = torch.nn.functional.cross_entropy(task.network(images), labels)
     assert scalars["val/loss"][-1][1] == pytest.approx(float(loss), rel=1e-5)

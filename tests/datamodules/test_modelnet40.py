@@ -10,7 +10,7 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.splits import SPLITS, Split
+from datamodules.core.files import SPLITS, Split
 from datamodules.modelnet40.meshes import mesh_spheres, read_mesh
 from datamodules.modelnet40.shapes import MODELNET40, STEPS, ModelNet40, find_shapes
 from tangent_train.errors import DataError

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.images import distance_from_z_depth, steps_to_meters
-from datamodules.core.splits import SPLITS
+from datamodules.core.depth import distance_from_z_depth, steps_to_meters
+from datamodules.core.files import SPLITS
 from datamodules.stanford2d3ds.files import AREAS, CLASSES, FOLDS
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,

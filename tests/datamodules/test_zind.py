@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.zind.panoramas import Zind, ZindPairs
 from tangent_train.errors import DataError, SettingError
 from tangent_train.geometry import equirect_directions

@@ -25,10 +25,9 @@ from tangent_train.geometry import (
     equirect_solid_angles,
     rotation_about,
 )
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.heads import head_of
-from tangent_train.heads.aligned_mosaic import AlignedMosaic
-from tangent_train.heads.distances import from_distance, is_metric
+from tangent_train.heads.alignment import AlignedMosaic, from_distance, is_metric
 from tangent_train.inference.api import Network
 from tangent_train.inference.applying import apply
 from tangent_train.inference.engine import Predictor
@@ -196,7 +195,7 @@ def test_a_predictor_aligns_what_its_network_scales(kind: DepthKind) -> None:
     assert sum(shares) == pytest.approx(2)
     assert found["none"] > 0.08
     assert found[None] < 0.02
-    before, after = result.report.step_before, result.report.step_after
+    before, after = result.facts["step_before"], result.facts["step_after"]
     assert before is not None
     assert after is not None
     assert after < 0.2 * before

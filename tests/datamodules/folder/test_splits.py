@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.errors import DataError
 from tests.datamodules.data_files import names_of

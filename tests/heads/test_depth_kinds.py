@@ -10,7 +10,7 @@ import torch
 
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
-from tangent_train.heads.distances import (
+from tangent_train.heads.alignment import (
     along_rays,
     depth_of_output,
     distance_of,
