@@ -36,7 +36,6 @@ from datamodules.core.label_map import IMAGE_CLASS
 from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
 from tangent_train.errors import DataError
 from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_processes
 
 MODELNET40 = (
@@ -190,6 +189,7 @@ class ModelNet40(DataModule):
     noun: ClassVar[str] = "shapes"
     kind = Spheres
     samples = ShapeDataset
+    default_level = 5
     get_it = _GET_IT
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
@@ -204,10 +204,6 @@ class ModelNet40(DataModule):
         self.class_names = self.find_classes()  # type: ignore[misc]
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
-
-    def default_representation(self) -> TangentRepresentation:
-        """Tangent images of base level 0, at level 5."""
-        return TangentRepresentation(0, 5 if self.level is None else self.level)
 
     def find_classes(self) -> tuple[str, ...]:
         """Return the names of the classes, even before the files exist."""
