@@ -5,6 +5,7 @@ from __future__ import annotations
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar
@@ -23,8 +24,13 @@ from tangent_train.heads.base import NOTHING, RGB, Head, PredictedImage, Scores
 from tangent_train.io.palette import class_colors
 from tangent_train.io.pixel_files import array_file, read_pixels
 from tangent_train.metrics import segmentation
-from tangent_train.metrics.classification import ClassificationMetric, classification_scores
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
+from tangent_train.metrics.scores import (
+    Interval,
+    ScoreColumn,
+    bootstrap,
+    by_solid_angle,
+    with_solid_angle,
+)
 from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import ScoreMosaic
@@ -112,35 +118,38 @@ class ClassesHead(Head):
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
         return segmentation.SegmentationMetric(len(self.class_names))
 
-    def _both(self, pixels: Any, angles: Any, compute: Callable[..., Any]) -> dict[str, Any]:
-        """Return scores by pixels; for panoramas, whose matrix has solid angles, by these too."""
-        by_angle = by_solid_angle(compute(angles, self.absent_class)) if angles.any() else {}
-        return {**compute(pixels, self.absent_class), **by_angle}
+    def _both(self, pixels: Any, angles: Any, compute: Callable[[Any], Any]) -> dict[str, Any]:
+        """Return scores by pixels; for panoramas, which have solid angles, by these too."""
+        by_angle = by_solid_angle(compute(angles)) if angles.any() else {}
+        return {**compute(pixels), **by_angle}
 
     def scores(self, result: SegmentationCounts) -> Scores:
         """Return scores by pixels; for panoramas, also by solid angle and latitude."""
-        score, given = segmentation.segmentation_scores, (result.pixels, result.solid_angle)
+        score = partial(segmentation.segmentation_scores, absent_class=self.absent_class)
+        given = result.pixels, result.solid_angle
         bands = [
-            score(band, self.absent_class if band.any() else "skip").means for band in result.bands
+            (score(band) if band.any() else score(band, absent_class="skip")).means
+            for band in result.bands
         ]
-        of_classes = self._both(*given, lambda counts, absent: score(counts, absent).of_classes)
+        of_classes = self._both(*given, lambda counts: score(counts).of_classes)
         return Scores(
-            self._both(*given, lambda counts, absent: score(counts, absent).means),
+            self._both(*given, lambda counts: score(counts).means),
             of_classes | {"share": score(result.pixels).share},
             bands if result.solid_angle.any() else (),
             result.pixels,
         )
 
-    def intervals(self, result: SegmentationCounts) -> dict[str, segmentation.Interval]:
+    def intervals(self, result: SegmentationCounts) -> dict[str, Interval]:
         """Return intervals of the means."""
+        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
         pixels, angles = result.of_images.swapaxes(0, 1)
-        return self._both(pixels, angles, segmentation.bootstrap_intervals)
+        return self._both(pixels, angles, lambda images: bootstrap(images, score))
 
     def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
         """Return mIoU and mAcc, of panoramas also by solid angle."""
+        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
         pixels, angles = result.of_images[list(places)].sum(axis=0)
-        scores = self._both(pixels, angles, segmentation.mean_scores)
-        return {name: float(score) for name, score in scores.items()}
+        return {name: float(mean) for name, mean in self._both(pixels, angles, score).items()}
 
     @property
     def facts(self) -> dict[str, str]:
@@ -183,7 +192,7 @@ class ClassesHead(Head):
             return ""
         count = len(self.class_names)
         counts = segmentation.count_image(prediction.cpu(), truth.cpu(), count).pixels
-        return f"mIoU {100 * segmentation.segmentation_scores(counts).miou:.1f}\u00a0%"
+        return f"mIoU {100 * segmentation.segmentation_scores(counts).means['miou']:.1f}\u00a0%"
 
     def count(self, mosaics: Iterable[LabelMosaic]) -> str:
         """Find the confidence that pixels of each class need for `min_share`.
@@ -323,13 +332,13 @@ class ImageClassHead(Head):
         """Return the number of shapes."""
         return torch.full((), float(len(targets)), device=targets.device)
 
-    def build_metric(self) -> ClassificationMetric:
+    def build_metric(self) -> segmentation.ClassificationMetric:
         """Build the confusion matrix of whole shapes."""
-        return ClassificationMetric(len(self.class_names))
+        return segmentation.ClassificationMetric(len(self.class_names))
 
     def scores(self, result: Any) -> Scores:
         """Return the accuracy over shapes, its mean over classes, and that of every class."""
-        found = classification_scores(result)
+        found = segmentation.classification_scores(result)
         means = {"accuracy": found.accuracy, "class_accuracy": found.class_accuracy}
         return Scores(means, {"images": found.counts, "accuracy": found.of_class}, confusion=result)
 

@@ -27,8 +27,7 @@ from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.heads.classes import exact
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 from tangent_train.metrics import depth as metrics
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering import Blend
 
 DepthLoss = Literal["log_l1", "scale_invariant"]

@@ -27,9 +27,8 @@ from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.segmentation import (
+from tangent_train.metrics.scores import (
     BAND_EDGES_DEG,
     ImagesMetric,
     Interval,
@@ -158,12 +157,7 @@ def error_sums(
     Returns:
         ``(8, 10)`` float64 sums by weighting: pixels, solid angles, and pixels of the latitude
         bands `BAND_EDGES_DEG`; the last seven are 0 for photos. See `depth_scores`.
-
-    Raises:
-        SettingError: The shapes differ.
     """
-    if prediction.shape != truth.shape:
-        raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
     known = truth > 0  # False for NaN
     predicted = known & (prediction > 0) & prediction.isfinite()
     d, g = (torch.where(predicted, x, 1.0).double() for x in (prediction, truth))
