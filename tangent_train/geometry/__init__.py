@@ -24,7 +24,6 @@ from tangent_train.geometry.grids import CubeGrid as CubeGrid
 from tangent_train.geometry.grids import PinholeGrid as PinholeGrid
 from tangent_train.geometry.grids import RingGrid as RingGrid
 from tangent_train.geometry.grids import TangentGrid as TangentGrid
-from tangent_train.geometry.icosphere import Icosphere as Icosphere
 from tangent_train.geometry.icosphere import icosphere as icosphere
 from tangent_train.geometry.icosphere import vertex_resolution as vertex_resolution
 from tangent_train.geometry.sphere import PanoramaPose as PanoramaPose

@@ -44,8 +44,8 @@ def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
     """Return True for a ``(3, 3)`` K without skew and with focal lengths above 0."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return False
-    plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0
-    return bool(plain and np.diag(matrix).min() > 0)
+    is_plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0
+    return bool(is_plain and np.diag(matrix).min() > 0)
 
 
 def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:
@@ -115,13 +115,12 @@ def shift_range(
     least = extent - center - 0.5
     greatest = np.array(size[::-1]) - 0.5 - extent - center
     if np.any(least > greatest + 1e-9):
-        half_widths = extent / focal, np.array(size[::-1]) / (2 * focal)
-        wanted, widest = (
-            "{:.4g}° × {:.4g}°".format(*np.degrees(2 * np.arctan(half))) for half in half_widths
-        )
+        wanted, widest = np.degrees(
+            2 * np.arctan([extent / focal, np.array(size[::-1]) / (2 * focal)])
+        ).round(2)
         raise SettingError(
             "field of view",
-            found=f"{wanted} for an image that spans {widest}",
+            found=f"{wanted.tolist()}° for an image that spans {widest.tolist()}°",
             expected="a field of view inside the image",
             remedy="Choose a smaller one, or leave the image out.",
         )

@@ -193,11 +193,8 @@ class PinholeGrid:
         """
         directions = np.asarray(directions_xyz, np.float64)
         flat = directions.reshape(-1, 3)
-        owner = np.empty(len(flat), np.int64)
-        step = max(1, _AT_ONCE // self.num_images)
-        for start in range(0, len(flat), step):
-            part = slice(start, start + step)
-            owner[part] = (flat[part] @ self.centers_xyz.T).argmax(axis=1)
+        parts = np.array_split(flat, 1 + len(flat) * self.num_images // _AT_ONCE)
+        owner = np.concatenate([(part @ self.centers_xyz.T).argmax(axis=1) for part in parts])
         return owner.reshape(directions.shape[:-1])
 
     def project(self, directions_xyz: ArrayLike, faces: ArrayLike) -> NDArray[np.float64]:
@@ -211,12 +208,9 @@ class PinholeGrid:
             ``(..., 2)`` column and row; NaN where the direction is behind the image.
         """
         axes = self.world_from_camera[np.asarray(faces)]
-        x, y, z = np.moveaxis(
-            np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes), -1, 0
-        )
-        depth = np.where(z > 0, z, np.nan)
-        plane = np.stack([x / depth, y / depth], axis=-1)
-        return plane / self.pitch + self.camera_matrix[:2, 2]
+        points = np.einsum("...w,...wc->...c", np.asarray(directions_xyz, np.float64), axes)
+        depth = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
+        return points[..., :2] / depth / self.pitch + self.camera_matrix[:2, 2]
 
     def insets(self, directions_xyz: NDArray[np.float64]) -> NDArray[np.float32]:
         """Return how far directions are inside the images.
@@ -228,17 +222,14 @@ class PinholeGrid:
             ``(N, n)`` sines of the angles from the nearest outer edges; negative outside an image.
         """
         across, down = self.half_size
-        insets = np.empty((self.num_images, len(directions_xyz)), np.float32)
-        step = max(1, _AT_ONCE // max(1, len(directions_xyz)))
-        for start in range(0, self.num_images, step):
-            x, y, z = np.moveaxis(
-                directions_xyz @ self.world_from_camera[start : start + step], -1, 0
-            )
-            insets[start : start + step] = np.minimum(
-                (across * z - np.abs(x)) / math.hypot(1, across),
-                (down * z - np.abs(y)) / math.hypot(1, down),
-            )
-        return insets
+        sections = 1 + len(directions_xyz) * self.num_images // _AT_ONCE
+        insets = []
+        for axes in np.array_split(self.world_from_camera, sections):
+            x, y, z = np.moveaxis(directions_xyz @ axes, -1, 0)
+            beside = (across * z - np.abs(x)) / math.hypot(1, across)
+            above = (down * z - np.abs(y)) / math.hypot(1, down)
+            insets.append(np.minimum(beside, above).astype(np.float32))
+        return np.concatenate(insets)
 
     @cached_property
     def _key(self) -> tuple[object, ...]:
@@ -438,31 +429,14 @@ def cell_neighbors(centers_xyz: NDArray[np.float64]) -> NDArray[np.int32]:
     from scipy.spatial import ConvexHull, QhullError  # slow to import
 
     count = len(centers_xyz)
-    pairs = np.argwhere(~np.eye(count, dtype=np.bool_))
+    sides = np.empty((0, 2), np.int64)
     with suppress(QhullError, ValueError):  # centers in a plane
         triangles = ConvexHull(centers_xyz).simplices
         sides = triangles[:, [[0, 1], [1, 2], [2, 0], [1, 0], [2, 1], [0, 2]]].reshape(-1, 2)
-        if len(np.unique(sides)) == count:
-            pairs = np.unique(sides, axis=0)
-    cells, others = pairs.T
+    if len(np.unique(sides)) < count:
+        sides = np.argwhere(~np.eye(count, dtype=np.bool_))
+    cells, others = np.unique(sides, axis=0).T
     number = np.arange(len(cells)) - np.searchsorted(cells, cells)
     neighbors = np.repeat(np.arange(count)[:, None], 1 + number.max(initial=0), axis=1)
     neighbors[cells, number] = others
     return neighbors.astype(np.int32)
-
-
-def cell_corners(
-    centers_xyz: NDArray[np.float64],
-) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return the corners of the cells: the normals of the convex hull of the centers.
-
-    Args:
-        centers_xyz: ``(N, 3)`` different unit vectors around the origin.
-
-    Returns:
-        ``(n, 3)`` cells that meet at each corner, and ``(n, 3)`` corners, unit vectors.
-    """
-    from scipy.spatial import ConvexHull  # slow to import
-
-    hull = ConvexHull(centers_xyz)
-    return hull.simplices.astype(np.int64), hull.equations[:, :3]

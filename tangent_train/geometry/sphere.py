@@ -284,11 +284,10 @@ def tangent_axes(directions_xyz: ArrayLike) -> NDArray[np.float64]:
     """
     xyz = np.asarray(directions_xyz, np.float64)
     xyz = xyz / np.linalg.norm(xyz, axis=-1, keepdims=True)
-    lon, lat = np.moveaxis(xyz_to_lonlat(xyz), -1, 0)
-    lon = np.where(np.hypot(xyz[..., 0], xyz[..., 1]) < 1e-9, 0.0, lon)
+    x, y = xyz[..., 0], xyz[..., 1]
+    lon = np.where(np.hypot(x, y) < 1e-9, 0.0, np.arctan2(y, x))
     east = np.stack([-np.sin(lon), np.cos(lon), np.zeros_like(lon)], axis=-1)
-    north = np.stack([-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)], axis=-1)
-    return np.stack([east, north, xyz], axis=-2)
+    return np.stack([east, np.cross(xyz, east), xyz], axis=-2)
 
 
 def gnomonic_points_xyz(

@@ -266,7 +266,7 @@ def test_coverage_agrees_with_random_directions(seed: int) -> None:
         (
             ((0, 4), (90, 1), (-90, 1)),
             (89, 89),
-            r"6 views that miss longitude -?\d+°, latitude -?\d\d°",
+            r"6 views that miss longitude -?\d+°, latitude -?\d+°",
         ),
     ],
 )
