@@ -314,7 +314,7 @@ class PixelTask(Task):
 
         Args:
             images: Images ``(n, C, h, w)`` of one or several spheres.
-            rays: Viewing rays ``(spheres, N, 3, 3)``, see `Views.rays`, for networks that take them.
+            rays: Viewing rays ``(spheres, N, 3, 3)`` for networks that take them, see `Views.rays`.
 
         Raises:
             SettingError: The shape of the output does not fit the images or the labels.

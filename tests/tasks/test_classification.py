@@ -2,10 +2,24 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tests.tasks.shapes import Shapes, quiet_trainer, shape_task
+from tests.tasks.shapes import Shapes, gradients_of, quiet_trainer, shape_task
+
+
+@pytest.mark.parametrize(("size", "chunks"), [(1, [1] * 4), (15, [2, 2]), (1000, [4])])
+def test_chunks_of_whole_shapes_give_the_gradient_of_the_batch(
+    size: int, chunks: list[int]
+) -> None:
+    seen: list[int] = []
+    task = shape_task(view_batch_size=size, label_smoothing=0.1)
+    task.network.register_forward_pre_hook(lambda _, images: seen.append(len(images[0])))
+    found = gradients_of(task, Shapes(4, 4)).found
+    assert seen == chunks
+    expected = gradients_of(shape_task(label_smoothing=0.1), Shapes(4, 4)).found
+    torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-6)
 
 
 class Oracle(nn.Module):
