@@ -179,7 +179,7 @@ class RenderSettings(ImageSettings):
     """indices of the images to write, e.g. [0,5]; null = all"""
     rotation: tuple[float, float, float] | None = None
     """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
-    format: str = "png"
+    format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
     """bilinear | nearest (for labels and depth)"""
@@ -251,7 +251,7 @@ class ImportSettings(Settings):
     """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
     relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
     or it predicts classes"""
-    image_size: OneOrMore[int] | None = None
+    image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed size of the images: [rows,columns] or the side; null = from the model"""
     views: Views = None
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |

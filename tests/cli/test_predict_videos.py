@@ -92,27 +92,6 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
 
 
-def test_every_third_frame(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
-    """With the numbers and times that they have in the video."""
-    video = _write_video(tmp_path / "in" / "walk.mp4")
-    cv2.imwrite(str(tmp_path / "in" / "a.png"), sphere(32))
-    predict(output="all")
-    predict(every=3)
-    assert "4 images, 0 done already" in capsys.readouterr().out
-    whole, third = (_labels(tmp_path / name / "labels" / "walk") for name in ("all", "out"))
-    assert list(third) == ["000000", "000003", "000006"]
-    assert all((third[name] == whole[name]).all() for name in third)
-    for kind in ("color", "overlay"):
-        made, times = _decoded(tmp_path / "out" / kind / "walk.mp4")
-        assert times == pytest.approx(_decoded(video)[1][::3])
-        expected = _decoded(tmp_path / "all" / kind / "walk.mp4")[0][::3]
-        assert np.abs(made.astype(int) - expected).mean() < 8
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert set(re.findall(r"walk/\d{6}", page)) == {f"walk/{n}" for n in third}
-    with pytest.raises(SystemExit, match="every: found 2; expected 3, with which"):
-        predict(every=2)
-
-
 def test_hidden_frames_are_neither_counted_nor_shown(
     tmp_path: Path, predict: Predict, capsys: Capture
 ) -> None:

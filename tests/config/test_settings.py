@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
 from tangent_train.config.help import annotate, command_settings, description, read_settings
-from tangent_train.config.settings import SETTINGS, validate
+from tangent_train.config.settings import SETTINGS
 from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
 from tests.running import command_of, composed, composed_settings, run_python
@@ -155,8 +154,3 @@ def test_answers_before_anything_heavy_is_imported(
     done = run_python(tmp_path, "-c", code)
     assert message in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
-
-
-def test_plain_mappings_are_validated_too() -> None:
-    values: dict[str, Any] = {"checkpoint": str(CONFIGS), "output": "x.onnx", "image_size": [4, 8]}
-    assert validate("export", values).image_size == (4, 8)
