@@ -27,9 +27,8 @@ def _errors_as_messages(command: str) -> Iterator[None]:
     try:
         yield
     except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
-        cause: Any = error.__cause__
-        known = getattr(cause, "parent_node", None)  # of an override without a setting
-        remedy = "" if known is None else nearest(str(cause.key), map(str, known))
+        known = getattr(error.__cause__, "parent_node", None)  # of an override without a setting
+        remedy = nearest(str(getattr(error.__cause__, "key", "")), map(str, known or ()))
         sys.exit(printable(f"tangent-{command}: {error}\n{remedy}".rstrip()))
     except KeyboardInterrupt:
         sys.exit(130)
