@@ -127,12 +127,9 @@ def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
 
 
 def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
-    """Write the figure of a single panorama."""
-    names = inputs.names
-    if len(names) > 1:
-        raise SettingError("figure", found=f"{len(names)} panoramas", expected="one panorama")
+    """Write the figure of the first panorama."""
     check_new(path, overwrite=settings.overwrite)
-    (job,) = inputs.jobs(names)
+    job = next(iter(inputs.jobs(inputs.names)))
     image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
     grid: Any = _views(settings, image.shape[0])[0]
     write_pixels(path, tangent_figure(image, grid))

@@ -186,7 +186,7 @@ class RenderSettings(ImageSettings):
     mask_classes: OneOrMore[str] | None = None
     """classes to ignore, e.g. [person]; mask is then a folder with labels/ and classes.json"""
     figure: Path | None = None
-    """PNG file of one panorama and its tangent images; output is then optional"""
+    """PNG file of the first panorama and its tangent images; output is then optional"""
     back: ExistingPath | None = None
     """folder of results on the tangent images of one panorama, or a folder of such folders"""
     poses: ExistingPath | None = None

@@ -228,8 +228,6 @@ def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused
     assert _read(figure).shape[1] == 1600
     message = refused(input=room, figure=figure, output=tmp_path / "tan")
     assert "figure.png, which exists" in message
-    write_pixels(room.with_name("second.png"), smooth(32))
-    assert "figure: found 2 panoramas" in refused(input=room.parent, figure=tmp_path / "b.png")
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
