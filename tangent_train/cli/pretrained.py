@@ -52,7 +52,7 @@ def with_pretrained_network(
         if description.score_kind != "logits":
             found = f"a network that returns {description.score_kind}"
             raise DataError(path, found=found, expected="logits, which the losses need")
-        changes["network"] = section = description.trainable_settings()
+        changes["network"] = section = description.trainable_settings() or {}
         _print(f"Network of {path}: {section['_target_']} (another: network=…)")
     head, kind = settings.task["head"], description.depth_kind
     if kind is not None and head.get("depth_kind", "") is None:

@@ -24,8 +24,8 @@ def report(arguments: Sequence[str]) -> None:
         epilog="Runs that differ only in fold and seed share a row. Example: tangent-report "
         "runs/paper/semseg_s7_b0_rgbd --output report_s7",
     )
-    of_folders = {"nargs": "+", "help": "folders of runs, or folders with runs below them"}
-    parser.add_argument("folders", type=Path, **of_folders)
+    of_folders = "folders of runs, or folders with runs below them"
+    parser.add_argument("folders", nargs="+", type=Path, help=of_folders)
     of_output = "folder for report.md, report.csv and report.png (default: report)"
     parser.add_argument("--output", type=Path, default=Path("report"), help=of_output)
     options = parser.parse_args(arguments)

@@ -18,17 +18,16 @@ import tangent_train as tt
 from models import UNet
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import DataError
-from tangent_train.geometry import TangentGrid, camera_matrix_from_fov
+from tangent_train.geometry import TangentGrid
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import (
     PanoramaViews,
-    PhotoViews,
 )
 from tests.cli.tiny_runs import Predict, Run
 from tests.models.onnx_files import write_linear
-from tests.running import Capture, Patch
+from tests.running import Capture
 from tests.tasks.small_networks import with_statistics
 
 NAMES = ["background", "dark", "green", "bright"]
@@ -94,26 +93,6 @@ def test_a_file_for_images_that_are_not_square(
     expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
     middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks
     np.testing.assert_array_equal(labels[16:48][:, middle], expected[16:48][:, middle])
-
-
-def test_published_weights_without_internet(here: Path, run: Run, monkeypatch: Patch) -> None:
-    """The remedy works: the file, fetched elsewhere, where torch looks for it."""
-    name = "lraspp_mobilenet_v3_large"
-    monkeypatch.setenv("TORCH_HOME", str(here / "torch"))
-    monkeypatch.setattr(torch.hub, "download_url_to_file", _no_internet)
-    given = ("library=torchvision", f"model={name}", "weights=DEFAULT", "output=net.ckpt")
-    with pytest.raises(SystemExit, match="Fetch it on another machine and save it as") as message:
-        run("import", *given)
-    file = Path(str(message.value).rpartition("save it as ")[2].removesuffix("."))
-    network = torchvision_models.get_model(name, weights=None, weights_backbone=None)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    torch.save(network.state_dict(), file)
-    run("import", *given)
-    assert load_network(here / "net.ckpt").class_names[1] == "__background__"
-
-
-def _no_internet(*_: object, **__: object) -> None:
-    raise OSError("no route to host")
 
 
 def test_a_network_of_a_config_and_its_export_compute_the_same(here: Path, run: Run) -> None:
@@ -312,27 +291,6 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
     twice = PanoramaViews(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
     assert twice.description().startswith("36 views of 32 × 32 (110° wide")
-
-
-@pytest.mark.parametrize(
-    ("size", "fov", "level", "photo_deg"),
-    [(512, 60, 10, 58), (384, 60, 10, 45), (128, 60, 8, 58)],
-)
-def test_photos_keep_their_angular_resolution(
-    size: int, fov: float, level: int, photo_deg: float, here: Path, run: Run
-) -> None:
-    """Crops of photos do not have the angle of the views of panoramas."""
-    write_linear(here / "net.onnx", WEIGHT, BIAS, shape=(1, 3, size, size))
-    run("import", *OF_ONNX, f"fov={fov}", "output=ours.onnx")
-    trained = load_network(here / "ours.onnx")
-    assert trained.photo_level == level
-    camera = camera_matrix_from_fov(fov, (size, size))
-    (views,) = PhotoViews(trained)(
-        InputImage(np.zeros((size, size, 3), np.uint8), camera_matrix=camera)
-    )
-    left, _, right, _ = views.sets[0].boxes[0]  # type: ignore[attr-defined]
-    half = (right - left) / views.shape[1] * math.tan(math.radians(fov / 2))
-    assert round(math.degrees(2 * math.atan(half))) == photo_deg
 
 
 @pytest.mark.parametrize(

@@ -60,32 +60,6 @@ def test_colors_come_back(
     np.testing.assert_array_equal(again, tangent_to_equirect(expected, grid, (64, 128), blend))
 
 
-@pytest.mark.parametrize(
-    "dtype", ["i1", "u4", "i8", "u8", ">u2", ">i4", ">f4", "f2", "f8", "?", "fortran"]
-)
-def test_arrays_of_any_type_keep_their_values(tmp_path: Path, dtype: str) -> None:
-    """Nearest pixels, there and back: squares of large numbers, such as ids of 62 bits."""
-    rng = np.random.default_rng(0)
-    ids = np.kron(rng.integers(2**40, 2**62, (8, 16)), np.ones((8, 8), np.int64))
-    values = ids.astype(np.int32, order="F") if dtype == "fortran" else (ids % 1000).astype(dtype)
-    values = ids.astype(dtype) if dtype in ("u4", "i8", "u8", ">u2", ">i4", "f8") else values
-    np.save(tmp_path / "ids.npy", values)
-    settings = {"base_level": 0, "level": 7, "interpolation": "nearest", "format": "npy"}
-    render_with(input=tmp_path / "ids.npy", output=tmp_path / "tan", **settings)
-    images = [np.load(path) for path in (tmp_path / "tan" / "ids").glob("*.npy")]
-    assert set(np.unique(images).tolist()) <= set(values.ravel().tolist())
-    kind = {} if values.dtype.kind == "f" else {"kind": "labels"}
-    folder = tmp_path / "tan" / "ids"
-    render_with(back=folder, output=tmp_path / "back.npy", blend="nearest", **kind)
-    back = np.load(tmp_path / "back.npy")
-    assert back.dtype.newbyteorder("=") == values.dtype.newbyteorder("=")
-    inside = np.kron(np.ones((8, 16)), np.pad(np.ones((4, 4)), 2)) == 1
-    inside[:8], inside[-8:] = False, False  # near the poles squares are slim
-    # Floats are features, which are interpolated.
-    rtol = {"f2": 2e-3, ">f4": 2e-7, "f8": 4e-16}.get(dtype, 0)
-    np.testing.assert_allclose(back[inside], values[inside], rtol=rtol, atol=0)
-
-
 def test_a_folder_of_panoramas_and_back_is_continued(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "deeper/b.jpg", "deeper/c.v2.tif"):
         write_pixels(tmp_path / "in" / name, smooth(32))

@@ -135,7 +135,6 @@ def test_settings_of_one_name_are_explained_apart() -> None:
     [
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Did you mean level?"),
-        ("train", "experiment=demmo", "Available options in 'experiment'"),
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
         ("export", "output=x.onnx", "checkpoint: found nothing; expected network"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),

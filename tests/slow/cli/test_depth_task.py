@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import torch
 from tangent_train.checkpoints.loaded import load_network
 from tests.cli.tiny_runs import SMALL_ROOMS, Run, results, run_in
 from tests.inference.trained import write_depth_checkpoint
-from tests.slow.cli.test_sweeps import OLD_SQLALCHEMY
 
 SETTINGS = (
     "experiment=rooms/depth",
@@ -128,18 +126,6 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
     trained = load_network(Path("relative/checkpoints/best.ckpt"))
     assert trained.depth_kind == "relative_disparity"
     assert results(Path("relative"))["protocol"]["alignment"] == "affine in disparity"
-
-
-@OLD_SQLALCHEMY
-def test_a_sweep_searches_for_the_smallest_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
-    once = (*SETTINGS, "panels=0", "trainer.max_epochs=1")
-    study = ("sweep=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=study")
-    with pytest.raises(SystemExit, match="expected minimize, for val/absrel"):
-        run("train", "-m", *study, *once)
-    run("train", "-m", *study, *once, "hydra.sweeper.direction=minimize")
-    scores = [json.loads((Path("study") / n / "validation.json").read_text())["best"] for n in "01"]
-    assert f"{min(scores)}" in (Path("study") / "optimization_results.yaml").read_text()
 
 
 @pytest.mark.usefixtures("stages")
