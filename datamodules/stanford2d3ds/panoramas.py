@@ -194,9 +194,7 @@ class StanfordImages(ImageDataModule):
             )
         ]
         training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
-        rooms: set[tuple[str, str, int]] = set()
-        if self.val_fraction:
-            rooms = draw_groups((p.room for p in training), self.val_fraction, self.seed)
+        rooms = draw_groups((p.room for p in training), self.val_fraction, self.seed)
         return {
             "train": [picture.image for picture in training if picture.room not in rooms],
             "val": [picture.image for picture in training if picture.room in rooms],
