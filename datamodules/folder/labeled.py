@@ -65,9 +65,9 @@ class LabeledFolder(ImageDataModule):
         images = self._list_images()
         self._note_ignored(images)
         splits = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
-        with self.problems.noted():
+        with self.problems.noted():  # all images are checked even without splits
             return splits.divide(images, self.problems)
-        return {"train": images}  # checked even without splits
+        return {"train": images}  # type: ignore[unreachable]  # the error was noted
 
     def _list_images(self) -> list[ImageFiles]:
         """Return all images, in the order of their names: paths below ``images/`` without suffix.
