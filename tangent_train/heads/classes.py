@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
-from pydantic import validate_call
+from pydantic import Field, validate_call
 from torch import Tensor
 from torch.nn.functional import cross_entropy, pad
 
@@ -79,7 +79,7 @@ class ClassesHead(Head):
         class_weights: ClassWeights | Sequence[float] = "none",
         label_smoothing: float = 0.0,
         absent_class: AbsentClass = "skip",
-        min_confidence: float = 0.0,
+        min_confidence: Annotated[float, Field(ge=0, le=1)] = 0.0,
         min_share: float = 0.0,
     ) -> None:
         super().__init__(class_names)
