@@ -18,14 +18,8 @@ from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
+from tangent_train.inference import images
 from tangent_train.inference.engine import Predictor
-from tangent_train.inference.images import (
-    DepthFolder,
-    InputImage,
-    read_panorama,
-    read_photo,
-    with_up,
-)
 from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.inference.views import PanoramaViews, PhotoViews
@@ -146,7 +140,7 @@ class _Prediction:
             if settings.depth is None:
                 expected = "a folder of depth images, which the network takes"
                 raise SettingError("depth", found="null", expected=expected)
-            self._depth = DepthFolder(settings.depth, settings.depth_scale)
+            self._depth = images.DepthFolder(settings.depth, settings.depth_scale)
         if settings.upright == "auto" and loaded.depth_kind is not None:
             expected = "pose or null: depth networks do not estimate the up direction"
             raise SettingError("upright", found="auto", expected=expected)
@@ -165,19 +159,19 @@ class _Prediction:
         if line := self._head.count(mosaics()):
             print_text(line)
 
-    def read(self, job: Job) -> InputImage:
+    def read(self, job: Job) -> images.InputImage:
         """Read one image."""
         settings, image = self._settings, job.path if job.value is None else job.value()
         stem = job.name.removesuffix(job.path.suffix)
         depth = None if self._depth is None else partial(self._depth.read, stem)
         if settings.projection == "perspective":
-            return read_photo(image, settings.fov, depth)
-        return read_panorama(image, settings.area, settings.upright, depth)
+            return images.read_photo(image, settings.fov, depth)
+        return images.read_panorama(image, settings.area, settings.upright, depth)
 
-    def _upright(self, image: InputImage) -> InputImage:
+    def _upright(self, image: images.InputImage) -> images.InputImage:
         if self._settings.upright != "auto":
             return image
-        return with_up(image, self._settings.max_tilt_deg, self._up_likelihood)
+        return images.with_up(image, self._settings.max_tilt_deg, self._up_likelihood)
 
     def predict(self, job: Job, progress: Callable[[float], object]) -> PredictedImage:
         """Predict one image, and write the files that need more than the pixels."""
