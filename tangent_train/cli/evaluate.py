@@ -21,7 +21,7 @@ from tangent_train.cli.run import (
 )
 from tangent_train.config.settings import EvaluateSettings
 from tangent_train.errors import SettingError
-from tangent_train.inference.label_maps import load_label_map, map_classes
+from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
 
 
@@ -47,7 +47,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.label_map is not None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
-        loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped}."]
+        loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped.description}."]
     check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)

@@ -116,7 +116,7 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
 
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
-    from tangent_train.inference.views import PanoramaViews
+    from tangent_train.inference.views import ViewSelector
 
     names = trained.class_names[1:]
     mean, std = trained.normalization.mean, trained.normalization.std
@@ -130,7 +130,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
         f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
         f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
         f"image size: {size}{multiple}",
-        f"panoramas: {PanoramaViews(trained).description()}",
+        f"panoramas: {ViewSelector(trained).description()}",
     ]
     if trained.trust:
         trust = ",".join(trained.trust)

@@ -24,8 +24,7 @@ from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import (
-    PanoramaViews,
-    PhotoViews,
+    ViewSelector,
     images_of_side,
     wide_levels,
 )
@@ -64,7 +63,7 @@ def test_an_onnx_file_labels_panoramas(wins: bool, here: Path, run: Run, capsys:
     assert (trained.fixed_size, trained.level) == ((32, 32), 5)
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255], [110, 90, 110]], np.uint8)
     rgb = colors[np.arange(8) % 4].repeat(16, axis=0)[None].repeat(64, axis=0)
-    scores = Predictor(trained, head_of(trained), PanoramaViews(trained, levels=(7,))).predict(
+    scores = Predictor(trained, head_of(trained), ViewSelector(trained, levels=(7,))).predict(
         InputImage(rgb)
     )
     labels = trained.labels(scores.labels())
@@ -92,7 +91,7 @@ def test_a_file_for_images_that_are_not_square(
         run("import", *OF_ONNX, "output=other.onnx", "image_size=[64,65]")
     colors = np.array([[0, 0, 0], [0, 255, 0], [255, 255, 255]], np.uint8)
     rgb = colors[[0, 1, 2, 1]].repeat(32, axis=0)[None].repeat(64, axis=0)
-    mosaic = Predictor(trained, head_of(trained), PanoramaViews(trained)).predict(InputImage(rgb))
+    mosaic = Predictor(trained, head_of(trained), ViewSelector(trained)).predict(InputImage(rgb))
     labels = trained.labels(mosaic.labels())
     expected = (rgb / 255 @ WEIGHT.T + BIAS).argmax(axis=-1) + 1
     middle = np.arange(128).reshape(4, 32)[:, 10:22].ravel()  # away from the edges of the blocks
@@ -341,9 +340,12 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
         "tangent_economy_16": (40, (32, 32)),
     }
     for option, (count, size) in sizes.items():
-        views = PanoramaViews(load_network(here / "plain.onnx"), views=option)
-        assert (sum(map(len, views.representation.view_sets())), views.image_size) == (count, size)
-    twice = PanoramaViews(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
+        views = ViewSelector(load_network(here / "plain.onnx"), views=option)
+        assert (
+            sum(map(len, views.representation.view_sets())),
+            views.representation.image_size,
+        ) == (count, size)
+    twice = ViewSelector(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
     assert twice.description().startswith("36 views of 32 × 32 (110° wide")
 
 
@@ -377,7 +379,7 @@ def test_photos_keep_their_angular_resolution(
     trained = load_network(here / "ours.onnx")
     assert trained.photo_level == level
     camera = camera_matrix_from_fov(fov, (size, size))
-    (views,) = PhotoViews(trained)(
+    (views,) = ViewSelector(trained)(
         InputImage(np.zeros((size, size, 3), np.uint8), camera_matrix=camera)
     )
     left, _, right, _ = views.sets[0].boxes[0]  # type: ignore[attr-defined]

@@ -18,7 +18,7 @@ from tangent_train.config.build import build_from_config
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
@@ -147,9 +147,8 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         valid=valid_mask(batch.valid[0]),
     )
     trained = trained_network(KINDS[of], module=network, fill="reflect")
-    views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"))
-    if "rotations" in KINDS[of]:
-        views = PanoramaViews(trained, None, None, views.blend, 2)
+    same: dict[str, Any] = {n: KINDS[of][n] for n in ("blend", "rotations") if n in KINDS[of]}
+    views = ViewSelector(trained, **same)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)
     labels = Predictor(trained, head_of(trained), views).predict(image).labels()

@@ -18,10 +18,10 @@ from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.heads import head_of
+from tangent_train.inference.api import map_classes
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.label_maps import map_classes
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.photo_networks import import_network
 from tangent_train.photo_networks.own_files import load_onnx
 from tests.models.onnx_files import write_linear
@@ -122,7 +122,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
     merged = LabelMap.of({f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network in (loaded, map_classes(loaded, merged).loaded):
-        predictor = Predictor(network, head_of(network, min_confidence=0.5), PanoramaViews(network))
+        predictor = Predictor(network, head_of(network, min_confidence=0.5), ViewSelector(network))
         mosaic = predictor.predict(InputImage(rgb))
         assert set(np.unique(network.labels(mosaic.labels()))) == {18}
 
