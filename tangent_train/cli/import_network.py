@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,10 +18,6 @@ from tangent_train.files import check_new
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.photo_networks import PhotoNetwork
-
-
-_OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
-"""Settings that only some of the functions `load` take."""
 
 
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
@@ -96,19 +89,15 @@ def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
 
 def _load(settings: ImportSettings) -> PhotoNetwork:
     """Return the network, from the library or the option that the settings name."""
-    from tangent_train.photo_networks import own_files
+    from tangent_train.photo_networks.libraries import LOADERS
 
-    load: Callable[..., PhotoNetwork]
-    if settings.library == "onnx":
-        load = own_files.load_onnx
-    elif settings.library is not None:
-        load = import_module(f"tangent_train.photo_networks.{settings.library}").load
-    elif settings.network is not None:
-        load = partial(own_files.load_config, settings.network)
-    else:
-        raise SettingError("library", found="null", expected="a library, or network=<option>")
-    given = {n: getattr(settings, n) for n in signature(load).parameters if n in _OF_LIBRARIES}
-    network = load(**given, normalization=settings.normalization)
+    load = LOADERS[settings.library]
+    given = {name: getattr(settings, name) for name in signature(load).parameters}
+    needed = next(iter(given))
+    if given[needed] is None:
+        expected = f"a value, for library={settings.library or 'null'}"
+        raise SettingError(needed, found="null", expected=expected)
+    network = load(**given)
     read = _READ | given.keys()
     check_read(settings, (read | _OF_CLASSES) if network.depth_kind is None else read - {"classes"})
     return network

@@ -241,7 +241,7 @@ def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
         SettingError: There is no such option.
     """
     changes = {"option": views} if isinstance(views, str) else dict(views)
-    option = changes.pop("option", None)
+    option = str(changes.pop("option", None))
     files = sorted((config_folder() / "representation").glob("*.yaml"))
     known = {file.stem: file for file in files if not file.stem.startswith(_NOT_VIEWS)}
     check_choice("views", option, tuple(known))

@@ -182,7 +182,7 @@ def test_a_label_map_of_a_run(rooms: str, run_folder: Path, tmp_path: Path, run:
         ({"label_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*label_map="),
         (
             {"label_map": {"classes": {"floor": ["pink"]}}},
-            "expected a map from dark, green, bright to beam",
+            "a map from dark, green, bright to beam",
         ),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected 'unknown' or 'never'"),
         ({"task": "task=depth"}, "checkpoint: found a network that predicts pixel_classes"),

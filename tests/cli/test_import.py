@@ -341,10 +341,8 @@ def test_level_views_of_an_import(here: Path, run: Run, predict: Predict, capsys
     }
     for option, (count, size) in sizes.items():
         views = ViewSelector(load_network(here / "plain.onnx"), views=option)
-        assert (
-            sum(map(len, views.representation.view_sets())),
-            views.representation.image_size,
-        ) == (count, size)
+        seen = views.representation
+        assert (sum(map(len, seen.view_sets())), seen.image_size) == (count, size)
     twice = ViewSelector(trained, rotations=2, views={"option": "horizontal", "fov": [110, 100]})
     assert twice.description().startswith("36 views of 32 × 32 (110° wide")
 

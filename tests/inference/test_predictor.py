@@ -60,7 +60,7 @@ def _blocks(height: int, width: int) -> NDArray[np.uint8]:
     return blocks.repeat(6, axis=0).repeat(6, axis=1)[:height, :width]
 
 
-def test_images_share_memory_only_one_after_the_other() -> None:
+def test_a_second_image_does_not_change_the_first() -> None:
     trained = trained_network(TANGENT)
     bright, dark = _blocks(32, 64), _blocks(32, 64)[::-1].copy()
     predictor = Predictor(trained, head_of(trained), ViewSelector(trained, blend="feather"))
@@ -69,11 +69,6 @@ def test_images_share_memory_only_one_after_the_other() -> None:
     second = predictor.predict(InputImage(dark))
     np.testing.assert_array_equal(first.probabilities(slice(None)), expected)
     assert (second.probabilities(slice(None)).numpy() != expected).any()
-    address = second.sums.ctypes.data
-    del second
-    third = predictor.predict(InputImage(bright))
-    assert third.sums.ctypes.data == address
-    np.testing.assert_array_equal(third.probabilities(slice(None)), expected)
 
 
 # Panoramas.
