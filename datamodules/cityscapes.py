@@ -33,7 +33,6 @@ from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.pixel_files import read_image_size
@@ -115,19 +114,6 @@ class Cityscapes(PhotoDataModule):
             self.problems.note_strays(every, found)
         self.problems.compare_counts(published, {"train": 2975, "val": 500})
         return published
-
-    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """See `ImageDataModule`; the dummies of the test images are refused."""
-        labels = super().decode_labels(files)
-        if not labels.any():
-            raise DataError(
-                files.labels,
-                found="no pixel with a class",
-                expected="labels of the training or validation images",
-                remedy="Those of the test images are dummies (ids 0 to 3): scores on them come "
-                "from the benchmark's server only.",
-            )
-        return labels
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`; u0 and v0 count from the center of the first pixel."""

@@ -26,6 +26,7 @@ Y. Zhang: "Matterport3D: Learning from RGB-D Data in Indoor Environments", 3DV 2
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import chain
 from typing import ClassVar, Literal
 
 from datamodules.core.data_module import data_set
@@ -109,13 +110,11 @@ class Matterport360(PanoramaDataModule):
     def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
-        for split in SPLITS:
+        for split, found in splits.items():
             scenes = [row["scene"] for row in _SCENES if row[self.release] == split]
-            missing = []
-            for scene in scenes:
-                images = self._list_images(scene)
-                splits[split] += images
-                missing += [] if images else [scene]
+            of_scenes = [self._list_images(scene) for scene in scenes]
+            missing = [scene for scene, images in zip(scenes, of_scenes, strict=True) if not images]
+            found.extend(chain.from_iterable(of_scenes))
             if missing:
                 self.problems.warnings.append(
                     f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "

@@ -40,7 +40,6 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds.files import EIGHT
-from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_image_size
 
 CLASSES: tuple[str, ...] = (
@@ -167,11 +166,7 @@ class Structured3DPerspective(Structured3DImages, PhotoDataModule):
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`; the center is in the middle of the photo."""
         path: Any = files.camera
-        try:
-            half_x, half_y = map(float, path.read_text("utf-8").split()[9:11])
-        except (OSError, ValueError) as error:
-            expected = "12 numbers, the 10th and 11th of them half angles of view in radians"
-            raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error
+        half_x, half_y = map(float, path.read_text("utf-8").split()[9:11])
         height, width = read_image_size(files.rgb)
         x, y = width / 2, height / 2
         fx, fy = x / math.tan(half_x), y / math.tan(half_y)

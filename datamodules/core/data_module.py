@@ -27,11 +27,12 @@ from datamodules.core.cache import Cache
 from datamodules.core.dataset import SplitDataset
 from datamodules.core.files import SPLITS, Problems, Split, draw_groups
 from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights, class_weights, label_doubts
-from datamodules.core.loading import EpochSampler, ResumedOrder, share_of_process, this_process
+from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, wrong_setting
 from tangent_train.manifest import Shard
 from tangent_train.progress import show_progress
+from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_threads
 
 _Class = TypeVar("_Class", bound=type[Any])
@@ -60,13 +61,10 @@ def data_set(kind: _Class) -> _Class:
         try:
             init(self, *values, **settings)
         except ValidationError as error:
-            first, *_ = errors = error.errors(include_url=False)
-            cause = first.get("ctx", {}).get("error")
-            name = first["loc"][0] if first["loc"] else "data"
-            texts = [e["msg"].removeprefix("Input should be ") for e in errors if name in e["loc"]]
-            expected = " or ".join(dict.fromkeys(texts))
+            cause = error.errors()[0].get("ctx", {}).get("error")
             if not isinstance(cause, DataError | SettingError):
-                cause = SettingError(f"data.{name}", found=first["input"], expected=expected)
+                known = dict.fromkeys(made.__dataclass_fields__, "a value")
+                cause = wrong_setting(error, known, "data.")
             raise cause from error
 
     made.__init__ = checked
@@ -102,6 +100,8 @@ class DataModule(LightningDataModule, ABC):
         noun: Name of the images or shapes, in the plural.
         kind: Named tuple of the arrays of an image or shape.
         samples: Class of the samples of a split.
+        default_representation: Function that returns the representation of a level.
+        default_level: Its level without a setting.
         suitable: Attribute that a representation must have, and the name of one that has it.
         get_it: Where to get the data set, for messages.
         class_names: Name of every label; for pixel labels the first is unknown, not a class. Empty
@@ -121,6 +121,8 @@ class DataModule(LightningDataModule, ABC):
     kind: ClassVar[type[Any]]
     samples: ClassVar[type[SplitDataset]]
     suitable: ClassVar[tuple[str, str]] = ("erp_height", "tangent")
+    default_representation: ClassVar[Any] = staticmethod(partial(TangentRepresentation, 0))
+    default_level: ClassVar[int] = 7
     get_it: ClassVar[str] = ""
     labels: ClassVar[str] = PIXEL_CLASSES
     class_names: ClassVar[tuple[str, ...]] = ()
@@ -146,7 +148,8 @@ class DataModule(LightningDataModule, ABC):
         is_given = self.representation is not None
         self.refuse("level", is_given and self.level is not None, "null: the representation has it")
         if not is_given:
-            self.representation = self.default_representation()
+            level = self.default_level if self.level is None else self.level
+            self.representation = self.default_representation(level)
         if not hasattr(self.representation, self.suitable[0]):
             raise SettingError(
                 "representation",
@@ -175,10 +178,6 @@ class DataModule(LightningDataModule, ABC):
             raise SettingError(f"data.{setting}", found=found, expected=expected)
 
     # --- defined by subclasses ---------------------------------------------------------------
-
-    @abstractmethod
-    def default_representation(self) -> Any:
-        """Return the representation used without a setting for it, at `level`."""
 
     @abstractmethod
     def files(self) -> Mapping[Split, Sequence[Any]]:
@@ -210,7 +209,6 @@ class DataModule(LightningDataModule, ABC):
 
     def finish(self, item: Any, split: Split, index: int) -> Any:
         """Return an item that was read or cached as samples are rendered from it."""
-        del split, index
         return item
 
     def check_files(self, files: Any) -> None:
@@ -227,7 +225,6 @@ class DataModule(LightningDataModule, ABC):
 
     def groups(self, files: Any) -> Sequence[str]:
         """Return the groups of an image that get rows in the results, such as its weather."""
-        del files
         return ()
 
     def make_files(self) -> None:
@@ -241,15 +238,9 @@ class DataModule(LightningDataModule, ABC):
         """Yield results of a function for all items as they come."""
         return in_threads(work, items)
 
-    def count_labels(self, item: Any) -> NDArray[np.int64] | None:
-        """Return the number of pixels of each of the `label_names`; None for shapes."""
-        del item
-        return None
-
-    def warning(self, files: Any, item: Any) -> str:
-        """Return a warning about usable files for `check`, or an empty string."""
-        del files, item
-        return ""
+    def inspect(self, files: Any, item: Any) -> tuple[NDArray[np.int64] | None, str]:
+        """Return the pixels of each label name, None for shapes, and perhaps a warning."""
+        return None, ""
 
     # --- finding, checking and reading ---------------------------------------------------------
 
@@ -294,7 +285,7 @@ class DataModule(LightningDataModule, ABC):
         found = self._find_files()
         size = len(self.label_names)
         self.label_counts = {split: np.zeros(size, np.int64) for split in SPLITS}
-        self._read_all(self._usable(found), "Checking", is_check=True)
+        self._read_all(found, "Checking", is_check=True)
         names = {files.name for files in chain.from_iterable(found.values())}
         return self.problems, len(names | self.problems.items)
 
@@ -327,8 +318,7 @@ class DataModule(LightningDataModule, ABC):
             with self.problems.noted(files.name):
                 self.check_files(files)
 
-        for _ in in_threads(check, chain.from_iterable(self._usable(found).values())):
-            pass
+        list(in_threads(check, chain.from_iterable(self._usable(found).values())))
         return found
 
     def _usable(self, found: Mapping[Split, Sequence[Any]]) -> dict[Split, list[Any]]:
@@ -359,7 +349,7 @@ class DataModule(LightningDataModule, ABC):
     @cached_property
     def _cache(self) -> Cache:
         folder: Any = self.cache
-        return Cache.of(folder, self.decode_settings(), self.kind)
+        return Cache(folder, self.decode_settings(), self.kind)
 
     def prepare_data(self) -> None:
         """Generate the files and complete the cache."""
@@ -457,13 +447,10 @@ class DataModule(LightningDataModule, ABC):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return the training batches; with ``overfit_batches``, the same views in every epoch."""
-        dataset = self.dataset("train")
-        if getattr(self.trainer, "overfit_batches", 0):
-            dataset = share_of_process(dataset)
-            order = ResumedOrder(dataset, self._start[1])
-            return self._loader(dataset, self.batch_size, order)
-        seed = self.seed, self.sampling_seed
-        sampler = EpochSampler(len(dataset), seed, *this_process(), self._start)
+        dataset, seed = self.dataset("train"), (self.seed, self.sampling_seed)
+        is_fixed = bool(getattr(self.trainer, "overfit_batches", 0))
+        order = (*this_process(), self._start)
+        sampler = EpochSampler(len(dataset), seed, *order, is_fixed=is_fixed)
         return self._loader(dataset, self.batch_size, sampler)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
@@ -547,9 +534,9 @@ def _try_read(
     (split, files), problems = item, Problems()
     with problems.noted(files.name, files.paths[0]):
         if is_check:
-            found = data.read(files)
-            problems.warnings += filter(None, [data.warning(files, found)])
-            return split, problems, data.count_labels(found)
+            counts, warning = data.inspect(files, data.read(files))
+            problems.warnings += [warning] if warning else []
+            return split, problems, counts
         data.read_cached(files)
     return split, problems, None
 

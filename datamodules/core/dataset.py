@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Generic, NamedTuple, TypeVar
 
@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision.transforms.v2 import functional
 
-from datamodules.core.depth import STEPS_PER_M, steps_to_meters
-from datamodules.core.files import Problems, Split
+from datamodules.core.depth import STEPS_PER_M
+from datamodules.core.files import Split
 from datamodules.core.inputs import MAX_DEPTH_M, Input
 from tangent_train.geometry import equirect_elevations
 from tangent_train.orientation.gravity import upright_rotation
@@ -57,12 +57,6 @@ class Image(NamedTuple):
     up: NDArray[np.float64] | None = None
     valid: NDArray[np.bool_] | None = None
     camera_matrix: NDArray[np.float64] | None = None
-
-    @property
-    def distance_m(self) -> NDArray[np.float32] | None:
-        """``(H, W)`` distance from the center in meters, NaN where missing; None if not read."""
-        steps: Any = self.labels if self.labels.dtype == np.uint16 else self.depth
-        return None if steps is None else steps_to_meters(steps)
 
     def sampler(self, representation: Any) -> Sampler:
         """Return the sampler of its views: of a panorama aligned with gravity, of a photo crops."""
@@ -136,7 +130,8 @@ class SplitDataset(Dataset[Any]):
         self.files: Sequence[Any] = data.splits()[split]
         self._kept: list[Any] = []
         if data.in_memory:
-            self._keep()
+            # Where loaders fork their workers, these share the memory.
+            self._kept = list(in_threads(self._copied, range(len(self))))
 
     def __len__(self) -> int:
         return len(self.files)
@@ -147,10 +142,6 @@ class SplitDataset(Dataset[Any]):
         index = range(len(self))[index]  # also negative
         data = self.data
         return self.sample(index, sample_rng((data.seed, data.sampling_seed), epoch, index))
-
-    def __iter__(self) -> Iterator[Any]:
-        """Iterate over the samples of epoch 0."""
-        return map(self.__getitem__, range(len(self)))
 
     @abstractmethod
     def sample(self, index: int, rng: np.random.Generator) -> Any:
@@ -171,22 +162,10 @@ class SplitDataset(Dataset[Any]):
             return self._kept[index]
         return self.data.finish(self.data.read_cached(self.files[index]), self.split, index)
 
-    def _keep(self) -> None:
-        """Read everything now: where loaders fork their workers, these share the memory.
-
-        Every process of a distributed run keeps a copy.
-        """
-        problems = Problems()
-
-        def keep(index: int) -> Any:
-            with problems.noted(self.name(index)):
-                image = self.read(index)
-                # Copies, because arrays that are views of a file keep it open.
-                return image._make(np.array(a) if isinstance(a, np.ndarray) else a for a in image)
-
-        kept = list(in_threads(keep, range(len(self))))
-        problems.refuse(self.data.root)
-        self._kept = kept
+    def _copied(self, index: int) -> Any:
+        image = self.read(index)
+        # Arrays that are views of a file keep it open.
+        return image._make(np.array(a) if isinstance(a, np.ndarray) else a for a in image)
 
 
 class ImageDataset(SplitDataset):

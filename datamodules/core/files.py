@@ -138,11 +138,9 @@ class Problems:
         """
         found = {str(split): len(images) for split, images in splits.items()}
         if found not in published:
-            counts, *others = (
-                ", ".join(f"{count} {split}" for split, count in numbers.items())
-                for numbers in (found, *published)
-            )
-            self.warnings.append(f"found {counts}; published are {' or '.join(others)}")
+            every = (found, *published)
+            texts = [", ".join(f"{n} {split}" for split, n in counts.items()) for counts in every]
+            self.warnings.append(f"found {texts[0]}; published are {' or '.join(texts[1:])}")
         for split, count in found.items():
             allowed = [numbers[split] for numbers in published]
             if count not in allowed:

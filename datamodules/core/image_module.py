@@ -36,7 +36,7 @@ from datamodules.core.inputs import (
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about, shift_range
-from tangent_train.geometry.equirect import check_area
+from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
     PanoramaArea,
@@ -53,7 +53,6 @@ from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
 from tangent_train.rendering import (
     PerspectiveRepresentation,
-    TangentRepresentation,
     rotate_equirect,
 )
 from tangent_train.rendering.resampling import resize
@@ -186,7 +185,6 @@ class ImageDataModule(DataModule):
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64] | None:
         """Return ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama."""
-        del files
         return None
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
@@ -194,7 +192,6 @@ class ImageDataModule(DataModule):
 
         In a photo's axes, x is the optical axis, y points to the right and z up in the image.
         """
-        del files
         return None
 
     # --- reading -------------------------------------------------------------------------------
@@ -253,21 +250,20 @@ class ImageDataModule(DataModule):
         settings = {"shape": self.read_shape, "unknown": self.unknown, "labels": self.labels}
         return {**super().decode_settings(), **settings, "label map": repr(self.label_map)}
 
-    def count_labels(self, item: Image) -> NDArray[np.int64]:
-        """See `DataModule`: classes, or pixels without and with a distance."""
-        labels = item.labels > 0 if self.has_distances else item.labels
-        return np.bincount(labels.ravel(), minlength=len(self.label_names))
-
-    def warning(self, files: ImageFiles, item: Image) -> str:
-        """See `DataModule`: of distances that are probably in other units."""
-        if not self.has_distances:
-            return ""
-        known = item.labels[item.labels > 0]
-        median_m = np.median(known) / STEPS_PER_M if known.size else 0
-        if _USUAL_M[0] <= median_m <= _USUAL_M[1]:
-            return ""
-        found = f"median distance {median_m:.3g} m" if median_m else "no distance below 128 m"
-        return f"{files.depth}: {found}; check the units and the missing value."
+    def inspect(self, files: ImageFiles, item: Image) -> tuple[NDArray[np.int64], str]:
+        """See `DataModule`; of distances that are probably in other units is warned."""
+        labels: Any = item.labels
+        warning = ""
+        if self.has_distances:
+            known = labels[labels > 0]
+            median_m = np.median(known) / STEPS_PER_M if known.size else 0
+            if not _USUAL_M[0] <= median_m <= _USUAL_M[1]:
+                found = (
+                    f"median distance {median_m:.3g} m" if known.size else "no distance below 128 m"
+                )
+                warning = f"{files.depth}: {found}; check the units and the missing value."
+            labels = labels > 0
+        return np.bincount(labels.ravel(), minlength=len(self.label_names)), warning
 
     # --- samples -------------------------------------------------------------------------------
 
@@ -294,6 +290,7 @@ class PhotoDataModule(ImageDataModule):
 
     noun: ClassVar[str] = "photos"
     suitable = ("of_camera", "perspective")
+    default_representation = staticmethod(PerspectiveRepresentation)  # crops of 45°
     fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     batch_size: PositiveInt = 16
@@ -309,25 +306,20 @@ class PhotoDataModule(ImageDataModule):
         height, width = self.representation.image_size
         return f"crops of {self.representation.fov_deg:g}° in {width} × {height}"
 
-    def default_representation(self) -> PerspectiveRepresentation:
-        """Crops of 45° at the resolution of level 7."""
-        return PerspectiveRepresentation(7 if self.level is None else self.level)
-
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: the crops fit into the photo."""
         camera: Any = self.decode_camera(files)
         fov_deg, (_, columns) = self.representation.fov_deg, self.representation.image_size
+        rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
         try:
             shift_range(camera, size, fov_deg, self.representation.image_size)
         except SettingError as error:
-            rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
             # A setting: if it fits none of the photos, it is refused once.
             raise SettingError(
                 "representation.fov_deg",
                 found=f"{error.found}, {files.rgb}",
                 expected=f"all of a crop of {fov_deg:g}°",
-                remedy="Lower it, make the crops less high with "
-                f"representation.dim=[{rows},{columns}] or fewer rows, or remove the photo.",
+                remedy=f"Lower it, or crop fewer rows: representation.dim=[{rows},{columns}].",
             ) from error
 
 
@@ -392,10 +384,6 @@ class PanoramaDataModule(ImageDataModule):
         """Rows and columns of the area in panoramas of `erp_height` rows."""
         return self.canvas.image_shape
 
-    def default_representation(self) -> TangentRepresentation:
-        """Tangent images of base level 0, at level 7."""
-        return TangentRepresentation(0, 7 if self.level is None else self.level)
-
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: enough pixels, in the shape of the area, and a mask."""
         if self.canvas.is_whole:
@@ -410,25 +398,22 @@ class PanoramaDataModule(ImageDataModule):
         files: ImageFiles = self.splits()[split][index]
         image, canvas, rotation = item, self.canvas, None
         if not canvas.is_whole:
-            image = image._replace(
-                rgb=canvas.filled(canvas.place(image.rgb), self.fill),
-                depth=None if image.depth is None else canvas.place(image.depth),
-                labels=canvas.place(image.labels),
-                valid=canvas.valid,
-            )
+            colors = canvas.filled(canvas.place(image.rgb), self.fill)
+            image = _changed(image, colors, canvas.place)._replace(valid=canvas.valid)
         if self.mask is not None:
             counts, labels = self._masks.read(files.name, canvas), image.labels
             image = image._replace(labels=np.where(counts, labels, labels.dtype.type(0)))
-        if self.upright is not None:
-            image = image._replace(up=read_up(files.rgb))
+        up = None if self.upright is None else read_up(files.rgb)
         if split == "test" and self.test_rotation is not None:
             rotation = draw_rotation(self.test_rotation, self.seed, index)
-            image = _rotated(image, rotation, is_known=self.upright == "pose")
-        if self.upright == "auto" and image.up is None:
+            colors = rotate_equirect(image.rgb, rotation, "bilinear")
+            image = _changed(image, colors, partial(_rotated, rotation=rotation))
+            up = None if self.upright != "pose" else rotation @ ([0, 0, 1] if up is None else up)
+        if self.upright == "auto" and up is None:
             if (split, index) not in self._ups:
                 self._ups[split, index] = self._estimated_up(image, files, rotation, split)
-            image = image._replace(up=self._ups[split, index])
-        return image
+            up = self._ups[split, index]
+        return image._replace(up=up)
 
     def _estimated_up(
         self, image: Image, files: ImageFiles, rotation: NDArray[np.float64] | None, split: Split
@@ -505,16 +490,16 @@ def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> ND
     return tilt @ rotation_about((0, 0, 1), yaw)
 
 
-def _rotated(image: Image, rotation: NDArray[np.float64], *, is_known: bool) -> Image:
-    """Return a rotated panorama: RGB bilinear, the rest nearest; perhaps its up is then known."""
-    up = rotation[:, 2] if image.up is None else rotation @ image.up
-    valid, depth = image.valid, image.depth
-    if valid is not None:
-        valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
-    return image._replace(
-        rgb=rotate_equirect(image.rgb, rotation, "bilinear"),
-        depth=None if depth is None else rotate_equirect(depth, rotation, "nearest"),
-        labels=rotate_equirect(image.labels, rotation, "nearest"),
-        up=up if is_known else None,
-        valid=valid,
-    )
+def _changed(
+    image: Image, rgb: NDArray[np.uint8], change: Callable[[NDArray[Any]], NDArray[Any]]
+) -> Image:
+    """Return a panorama of other colors, with its other pixels changed."""
+    others = {name: getattr(image, name) for name in ("depth", "labels", "valid")}
+    changed = {name: change(array) for name, array in others.items() if array is not None}
+    return image._replace(rgb=rgb, **changed)
+
+
+def _rotated(pixels: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+    if pixels.dtype == np.bool_:
+        return rotate_equirect(pixels.view(np.uint8), rotation, "nearest") > 0
+    return rotate_equirect(pixels, rotation, "nearest")

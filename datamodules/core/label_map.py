@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import DataError, counted
-from tangent_train.files import is_text, read_json
+from tangent_train.files import read_json
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import read_pixels, read_rgb
 
@@ -91,7 +91,7 @@ class LabelMap:
         labels = dict.fromkeys(unknown, 0)
         for label, given in enumerate(classes.values(), start=1):
             keys = [given] if isinstance(given, Key) else given
-            labels |= dict.fromkeys(map(_plain_key, keys), label)
+            labels |= dict.fromkeys(keys, label)
         return cls(tuple(classes), labels)
 
     def regrouped(self, names: Sequence[str], groups: Mapping[str, str] | None = None) -> LabelMap:
@@ -192,21 +192,22 @@ def read_label_map(path: Path) -> LabelMap:
     content = read_json(path, _EXPECTED)
     if isinstance(content, dict) and isinstance(content.get("classes"), dict):
         content = content["classes"]
-    is_list = isinstance(content, list)
+    is_list, labels, named = isinstance(content, list), dict[Key, int](), list[tuple[Any, Any]]()
     if is_list:
-        named = [(name, [value]) for value, name in enumerate(content) if name is not None]
-    else:
-        items = content.items() if isinstance(content, dict) else ()
-        named = [(name, keys if isinstance(keys, list) else [keys]) for name, keys in items]
-    labels: dict[Any, int] = {}
-    wrong = [json.dumps(name) for name, _ in named if not is_text(name) or name == UNKNOWN_NAME]
-    for label, (name, keys) in enumerate(named, start=1):
-        for key in keys:
-            is_value = type(key) is int and 0 <= key <= _MOST_VALUE
-            if not (is_value or isinstance(key, str)) or _plain_key(key) in labels:
+        named = [(name, value) for value, name in enumerate(content) if name is not None]
+    elif isinstance(content, dict):
+        named = list(content.items())
+    names = [name for name, _ in named if name != UNKNOWN_NAME]
+    usable = [name for name in names if isinstance(name, str) and name.isprintable()]
+    wrong = [json.dumps(name) for name, _ in named if name not in usable]
+    for label, (name, given) in enumerate(named, start=1):
+        for key in given if isinstance(given, list) else [given]:
+            plain = plain_name(key) if isinstance(key, str) else key
+            is_key = type(key) is str or (type(key) is int and 0 <= key <= _MOST_VALUE)
+            if not is_key or plain in labels:
                 wrong.append(f"{json.dumps(key)} for {json.dumps(name)}")
             else:
-                labels[_plain_key(key)] = label
+                labels[plain] = label
     names = tuple(composed(str(name)) for name, _ in named)
     kinds = {str if isinstance(key, str) and _COLOR.fullmatch(key) else type(key) for key in labels}
     if wrong or len(kinds) > 1 or not 1 <= len(set(names)) == len(names) <= _MOST_CLASSES:
@@ -214,12 +215,8 @@ def read_label_map(path: Path) -> LabelMap:
         raise DataError(path, found=found, expected=_EXPECTED)
     if is_list:
         others = [value for value, name in enumerate(content) if name is None]
-        labels = dict.fromkeys([*others, 255, _MOST_VALUE], 0) | labels
+        labels = {**dict.fromkeys([*others, 255, _MOST_VALUE], 0), **labels}
     return LabelMap(names, labels, refuses_others=is_list)
-
-
-def _plain_key(key: Key) -> Key:
-    return plain_name(key) if isinstance(key, str) else key
 
 
 def plain_name(name: str) -> str:

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sized
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import torch
-from torch.utils.data import Sampler, SequentialSampler, Subset
+from torch.utils.data import SequentialSampler, Subset
 
 from tangent_train.errors import SettingError
 
 
-class EpochSampler(Sampler[tuple[int, int]]):
+class EpochSampler(SequentialSampler):
     """Yield (epoch, index) in a new random order every epoch.
 
     Every process gets the same number of samples, because gradients are exchanged at every step.
@@ -20,7 +20,8 @@ class EpochSampler(Sampler[tuple[int, int]]):
     every epoch.
 
     Lightning calls `set_epoch` by itself. It must not replace or wrap this sampler: create
-    the trainer with ``use_distributed_sampler=False``.
+    the trainer with ``use_distributed_sampler=False``. With ``overfit_batches``, it only keeps
+    samplers of this base class.
 
     Args:
         length: Number of samples in the data set.
@@ -29,6 +30,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
         world_size: Number of processes.
         start: An epoch and the number of its samples that this process has consumed: a resumed run
             continues after them. The length stays that of a whole epoch.
+        is_fixed: True to repeat epoch 0 in the order of the data set.
 
     Raises:
         SettingError: Fewer samples than processes.
@@ -41,9 +43,12 @@ class EpochSampler(Sampler[tuple[int, int]]):
         rank: int = 0,
         world_size: int = 1,
         start: tuple[int, int] = (0, 0),
+        *,
+        is_fixed: bool = False,
     ) -> None:
         _check_length(length, world_size)
-        self._length, self._seed = length, seed
+        super().__init__(range(length))
+        self._length, self._seed, self._is_fixed = length, seed, is_fixed
         self._rank, self._world_size = rank, world_size
         self._start = start
         # Workers of a resumed run start fetching before Lightning sets the epoch.
@@ -56,33 +61,16 @@ class EpochSampler(Sampler[tuple[int, int]]):
     def __len__(self) -> int:
         return self._length // self._world_size
 
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        epoch = self._epoch
-        seed = np.random.SeedSequence(self._seed, spawn_key=(epoch,))
-        order = np.random.default_rng(seed).permutation(self._length)
+    def __iter__(self) -> Iterator[Any]:
+        order = np.arange(self._length)
+        if not self._is_fixed:
+            seed = np.random.SeedSequence(self._seed, spawn_key=(self._epoch,))
+            order = np.random.default_rng(seed).permutation(self._length)
         share = order[self._rank :: self._world_size][: len(self)]
         start_epoch, consumed = self._start
-        for index in share[consumed if epoch == start_epoch else 0 :]:
+        epoch = 0 if self._is_fixed else self._epoch
+        for index in share[consumed if self._epoch == start_epoch else 0 :]:
             yield epoch, int(index)
-
-
-class ResumedOrder(SequentialSampler):
-    """Order of the data set; the first epoch skips samples that a resumed run has consumed.
-
-    Lightning keeps it with ``overfit_batches``.
-
-    Args:
-        dataset: The data set.
-        consumed: Number of samples to skip.
-    """
-
-    def __init__(self, dataset: Sized, consumed: int) -> None:
-        super().__init__(dataset)
-        self._consumed = consumed
-
-    def __iter__(self) -> Iterator[int]:
-        first, self._consumed = self._consumed, 0
-        yield from range(first, len(self))
 
 
 def share_of_process(dataset: Any) -> Subset[Any]:

@@ -33,10 +33,9 @@ from datamodules.core.dataset import SplitDataset, sample_rng
 from datamodules.core.files import Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
+from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
 from tangent_train.errors import DataError
 from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_processes
 
 MODELNET40 = (
@@ -96,15 +95,18 @@ def find_shapes(root: Path) -> list[ShapeFile]:
     Raises:
         DataError: The folder is missing or has another layout.
     """
-    shapes: list[ShapeFile] = []
     parts: tuple[Literal["train", "test"], ...] = ("train", "test")
-    for part in parts:
-        for path in (*root.glob(f"*/{part}/*.off"), *root.glob(f"modelnet40_{part}/*.off")):
-            by_class = path.parent.name == part
-            label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
-            name = path.relative_to(root).with_suffix("").as_posix()
-            if not path.name.startswith("."):
-                shapes.append(ShapeFile(path, name, label, part))
+    shapes = [
+        ShapeFile(
+            path,
+            path.relative_to(root).with_suffix("").as_posix(),
+            path.parents[1].name if path.parent.name == part else path.stem.rpartition("_")[0],
+            part,
+        )
+        for part in parts
+        for pattern in (f"*/{part}/[!.]*.off", f"modelnet40_{part}/[!.]*.off")
+        for path in root.glob(pattern)
+    ]
     if not shapes:
         expected = "<class>/{train,test}/*.off or modelnet40_{train,test}/<class>_<number>.off"
         raise DataError(root, found="no meshes", expected=expected, remedy=_GET_IT)
@@ -152,9 +154,9 @@ class ShapeDataset(SplitDataset):
 
     def _views(self, index: int, rng: np.random.Generator) -> list[Any]:
         data = self.data
-        if self.split == "train":
-            return [data.representation.sample(rng)]
         representation = data.representation
+        if self.split == "train":
+            return [representation.sample(rng)]
         if self.split == "test" and data.test_rotation is not None:
             # Rotated back, it sees what a rotated shape shows.
             representation = representation.with_rotation(self.shape_rotation(index).T)
@@ -190,6 +192,7 @@ class ModelNet40(DataModule):
     noun: ClassVar[str] = "shapes"
     kind = Spheres
     samples = ShapeDataset
+    default_level = 5
     get_it = _GET_IT
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
@@ -204,10 +207,6 @@ class ModelNet40(DataModule):
         self.class_names = self.find_classes()  # type: ignore[misc]
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
-
-    def default_representation(self) -> TangentRepresentation:
-        """Tangent images of base level 0, at level 5."""
-        return TangentRepresentation(0, 5 if self.level is None else self.level)
 
     def find_classes(self) -> tuple[str, ...]:
         """Return the names of the classes, even before the files exist."""
@@ -230,7 +229,7 @@ class ModelNet40(DataModule):
     def read(self, files: ShapeFile) -> Spheres:
         """See `DataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        values = mesh_spheres(clean_mesh(read_off(files.path)), shape)
+        values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
     def decode_settings(self) -> dict[str, Any]:

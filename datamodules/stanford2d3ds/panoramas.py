@@ -44,13 +44,15 @@ from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, P
 from datamodules.core.label_map import LabelMap
 from datamodules.stanford2d3ds.files import (
     AREAS,
+    CAMERA_FROM_SPHERE,
     CLASSES,
     EIGHT,
     FOLDS,
     MISSING_DEPTH,
     UNKNOWN_CLASS,
+    Area,
+    euler_rotation,
 )
-from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
@@ -174,7 +176,7 @@ class StanfordImages(ImageDataModule):
     folds: ClassVar[tuple[int, ...]] = tuple(FOLDS)
 
     fold: Literal[1, 2, 3] = 1
-    areas: Sequence[Literal["1", "2", "3", "4", "5a", "5b", "6"]] = AREAS  # type: ignore[assignment]
+    areas: Sequence[Area] = AREAS
     label_table: Path | None = None
 
     def __post_init__(self) -> None:

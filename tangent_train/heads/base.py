@@ -15,8 +15,7 @@ from torchmetrics import Metric
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
-from tangent_train.metrics.score_columns import ScoreColumn
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.metrics.scores import Interval, ScoreColumn
 from tangent_train.rendering import Blend
 from tangent_train.rendering.representations.views import Views
 

@@ -6,6 +6,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, ClassVar, get_args
@@ -34,13 +35,17 @@ from tangent_train.heads.pictures import (
     prediction_panel,
 )
 from tangent_train.io.pixel_files import array_file, read_pixels, write_pixels
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
+from tangent_train.metrics.scores import (
+    Interval,
+    ScoreColumn,
+    bootstrap,
+    by_solid_angle,
+    with_solid_angle,
+)
 from tangent_train.metrics.segmentation import (
     AbsentClass,
-    Interval,
     SegmentationCounts,
     SegmentationMetric,
-    bootstrap_intervals,
     count_image,
     mean_scores,
     segmentation_scores,
@@ -166,8 +171,10 @@ class ClassesHead(Head):
     def intervals(self, result: SegmentationCounts) -> dict[str, Interval]:
         """Return intervals of the means."""
         pixels, angles = result.of_images.swapaxes(0, 1)
-        of_angles = bootstrap_intervals(angles, self._absent_by_angle(result)[1])
-        return bootstrap_intervals(pixels, self.absent_class) | by_solid_angle(of_angles)
+        score_angles = partial(mean_scores, absent_class=self._absent_by_angle(result)[1])
+        of_angles = bootstrap(angles, score_angles)
+        of_pixels = bootstrap(pixels, partial(mean_scores, absent_class=self.absent_class))
+        return of_pixels | by_solid_angle(of_angles)
 
     def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
         """Return mIoU and mAcc, of panoramas also by solid angle."""
@@ -232,7 +239,7 @@ class ClassesHead(Head):
         if not truth.any():
             return ""
         counts = count_image(prediction.cpu(), truth.cpu(), len(self.class_names)).pixels
-        return f"mIoU {100 * segmentation_scores(counts).miou:.1f}\u00a0%"
+        return f"mIoU {100 * segmentation_scores(counts).means['miou']:.1f}\u00a0%"
 
     def count(self, mosaics: Iterable[Any]) -> str:
         """Find the confidence that pixels of each class need for `min_share`.

@@ -55,8 +55,7 @@ from tangent_train.metrics.depth import (
     mean_depth_scores,
     scaled_and_shifted,
 )
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering import Blend
 from tangent_train.rendering.checks import check_choice
 

@@ -11,8 +11,8 @@ from torch.nn import functional
 
 from datamodules.core.label_map import IMAGE_CLASS
 from tangent_train.heads.base import Head, Scores
-from tangent_train.metrics.classification import ClassificationMetric, classification_scores
-from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.scores import ScoreColumn
+from tangent_train.metrics.segmentation import ClassificationMetric, classification_scores
 
 
 class ImageClassHead(Head):

@@ -203,7 +203,7 @@ def read_cameras(path: Path) -> CameraFile:
         with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
             grid = content.grid()
         grid.face_indices(faces)
-    except (OSError, ValueError, OverflowError) as error:  # pydantic's are ValueErrors
+    except (OSError, ValueError, OverflowError, IndexError) as error:  # pydantic's are ValueErrors
         found = error if isinstance(error, OSError) else str(error).replace("\n", " ")
         raise DataError(path, found=found, expected=_EXPECTED) from error
     source = content.source

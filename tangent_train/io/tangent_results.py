@@ -12,7 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile
@@ -104,11 +104,10 @@ class TangentResults:
         arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
         first = arrays[0]
         size = first.shape[0], first.shape[1]
-        try:
-            grid = grid if size == grid.size else grid.resized(size)
-        except SettingError as error:
-            found, expected = error.found, error.expected
-            raise DataError(files[0], found=found, expected=expected) from error
+        if size[0] * grid.size[1] != size[1] * grid.size[0]:
+            expected = f"images in the ratio of {width_height(grid.size)}"
+            raise DataError(files[0], found=width_height(size), expected=expected)
+        grid = grid if size == grid.size else grid.resized(size)
         for file, array in zip(files, arrays, strict=True):
             if (array.shape, array.dtype) != (first.shape, first.dtype):
                 raise DataError(

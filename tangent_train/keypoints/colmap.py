@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError
 from tangent_train.geometry import PanoramaPose, to_right_handed
 from tangent_train.io.camera_files import RigFile
-from tangent_train.keypoints.spherical import SphericalKeypoints
+from tangent_train.keypoints.features import SphericalKeypoints
 from tangent_train.keypoints.two_view import TwoView, colmap, rigid_matrix
 
 

@@ -75,7 +75,7 @@ def test_pixels_are_at_the_positions_in_the_file(grid: PinholeGrid, tmp_path: Pa
         ({"camera": CAMERA | {"matrix": (-9 * np.eye(3)).tolist()}}, "length of -9"),
         ({"camera": CAMERA | {"matrix": [[]]}}, "camera.matrix"),
         ({"images": [{"file": "a.png"}]}, "images.0.face"),
-        ({"images": [{"file": "a.png", "face": 20}]}, "0 to 19"),
+        ({"images": [{"file": "a.png", "face": 20}]}, "index 20 is out of bounds"),
         ({"images": [{"file": "a.png", "face": 1}, {"file": "a.jpg", "face": 2}]}, "twice"),
     ],
 )

@@ -173,15 +173,7 @@ def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> No
     assert near.facts == {"alignment": "none", "range": "0.1 to 10 m, predictions clipped"}
 
 
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        ({"alignment": "mean"}, "task.head.alignment"),
-        ({"alignment_in": "log"}, "task.head.alignment_in"),
-        ({"min_distance": -1}, "task.head.min_distance"),
-        ({"min_distance": 2, "max_distance": 2}, "task.head.max_distance"),
-    ],
-)
-def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
-    with pytest.raises(SettingError, match=named):
-        DepthProtocol(**settings)
+@pytest.mark.parametrize("setting", ["alignment", "alignment_in"])
+def test_invalid_settings_are_named(setting: str) -> None:
+    with pytest.raises(SettingError, match=f"task.head.{setting}: found 'log'"):
+        DepthProtocol(**{setting: "log"})  # type: ignore[arg-type]

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from datamodules.core.dataset import Image
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.heads.pictures import (
     colorize,
     mixed_picture,

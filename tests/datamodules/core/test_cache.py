@@ -38,7 +38,7 @@ def test_cached_arrays_are_memory_mapped(tmp_path: Path) -> None:
     source.write_bytes(b"abc")
     files = ImageFiles("room/küche 1", source)
     item = _Item(np.arange(105, dtype=np.uint8).reshape(5, 7, 3), None, np.eye(3))
-    cache = Cache.of(tmp_path / "cache", {"level": 5}, _Item)
+    cache = Cache(tmp_path / "cache", {"level": 5}, _Item)
     for _ in range(2):
         found = cache.read(files, lambda: item)
         assert found.depth is None
@@ -49,7 +49,7 @@ def test_cached_arrays_are_memory_mapped(tmp_path: Path) -> None:
             np.testing.assert_array_equal(array, getattr(item, name))
     record = np.load(cache.path(files), allow_pickle=False)
     np.testing.assert_array_equal(record["rgb"], item.rgb, err_msg="NumPy reads it alone")
-    assert Cache.of(tmp_path / "cache", {"level": 6}, _Item).path(files) != cache.path(files)
+    assert Cache(tmp_path / "cache", {"level": 6}, _Item).path(files) != cache.path(files)
 
 
 @pytest.mark.parametrize(("size", "seconds"), [(3, -1), (4, 0)])
@@ -61,7 +61,7 @@ def test_a_changed_source_is_read_again(
     source = tmp_path / "a.png"
     source.write_bytes(b"abc")
     time = source.stat().st_mtime_ns
-    cache, files = Cache.of(tmp_path / "cache", {}, _Item), ImageFiles("a", source)
+    cache, files = Cache(tmp_path / "cache", {}, _Item), ImageFiles("a", source)
 
     def change() -> None:
         source.write_bytes(b"x" * size)

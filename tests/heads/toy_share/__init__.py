@@ -11,7 +11,7 @@ from torch import Tensor
 from torchmetrics import MeanAbsoluteError
 
 from tangent_train.heads import Head, Scores
-from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.rendering.mosaic import MeanMosaic
 
 
