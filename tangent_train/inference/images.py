@@ -16,10 +16,9 @@ from datamodules.core.depth import meters_to_steps, resize_depth
 from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.io.gpano import PanoramaArea, read_up, whole_area
+from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, read_up, whole_area
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
-from tangent_train.io.tangent_folders import panorama_area
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.rendering.resampling import resize
 
@@ -151,10 +150,10 @@ def read_panorama(
     if upright == "pose" and path is None:
         expected = "the path of a file: images in memory and videos have no GPano tags"
         raise SettingError("upright", found="pose", expected=expected)
-    if path is not None or angles is not None:
-        area = panorama_area(path or _IN_MEMORY, size, angles)
+    if angles is not None:
+        area = area_of_angles(size, angles)
     else:
-        area = whole_area(_IN_MEMORY, size)
+        area = whole_area(_IN_MEMORY, size) if path is None else read_area(path, size)
     steps = None if depth is None else area.place(depth(size))
     up = None if upright is None or path is None else read_up(path)
     return InputImage(area.place(rgb), steps, up, area=area)
