@@ -12,6 +12,7 @@ from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from pydantic import ValidationError
 
 from tangent_train.errors import SettingError
 
@@ -42,7 +43,8 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
     except Exception as error:
         cause = (error.__cause__ or error) if isinstance(error, InstantiationException) else error
         is_call = isinstance(cause, TypeError) and "argument" in str(cause)
-        if not is_call and not isinstance(cause, ImportError | InstantiationException):
+        unfit = ImportError, InstantiationException, ValidationError
+        if not is_call and not isinstance(cause, unfit):
             raise cause from None
         found = f"{section['_target_']}, which cannot be built ({' '.join(str(cause).split())})"
         raise SettingError(place, found=found, expected="settings that it accepts") from error

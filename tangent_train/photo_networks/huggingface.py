@@ -49,6 +49,11 @@ _FAMILIES: dict[str, Sequence[DepthKind]] = {
 }
 """Possible kinds of networks in transformers, the usual one first; none for other quantities."""
 
+_DEPTH_NAMES = (
+    "Set depth=, e.g. relative_disparity for MiDaS and its DPT (Intel/dpt-large), metric_z for "
+    "networks trained on the meters of NYU or KITTI."
+)
+
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
 _SIDE = 32
 """Rows and columns of the images with which an image processor is tested."""

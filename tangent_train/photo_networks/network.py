@@ -83,7 +83,7 @@ def names_of(content: Any, source: object, expected: str) -> tuple[str, ...]:
         names = [content.get(str(index)) for index in range(len(content))]
     if not names or not all(isinstance(name, str) and name for name in names):
         kinds = f"For a depth network, set depth= to one of {', '.join(get_args(DepthKind))}."
-        raise DataError(source, found=str(content)[:80], expected=expected, remedy=kinds)
+        raise DataError(source, found=str(content or "none")[:80], expected=expected, remedy=kinds)
     return tuple(names)
 
 

