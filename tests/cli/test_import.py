@@ -419,7 +419,7 @@ def test_labels_without_settings_are_those_of_wide_rings(
         (("classes=null",), "classes: found none; .*For a depth network, set depth= to one of log"),
         (
             ("classes=three.json",),
-            "^tangent-import: class names .*: found 3, .*expected names of 4 scores",
+            "class names .*: found 3, .*expected names of 4 scores",
         ),
         (("classes=holes.json",), r"holes\.json: found .*; expected a JSON list"),
         (("normalization=null",), "normalization: found none; expected imagenet, unit, symmetric"),

@@ -277,8 +277,6 @@ def test_networks_name_the_method_that_suits_them(
             method(panorama)
     with pytest.raises(SettingError, match=r"predicts pixel_classes; .*Use labels\(\) or prob"):
         classes.depth(panorama)
-    with pytest.raises(TypeError, match="min_confidence"):
-        loaded(depth_network(), monkeypatch, min_confidence=0.5)
 
 
 # Functions.
