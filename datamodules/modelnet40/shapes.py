@@ -30,11 +30,10 @@ from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
 from datamodules.core.dataset import SplitDataset, sample_rng
-from datamodules.core.files import Split, draw_groups
+from datamodules.core.files import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
 from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
-from tangent_train.errors import DataError
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.threads import in_processes
 
@@ -81,7 +80,7 @@ class ShapeFile(NamedTuple):
     path: Path
     name: str
     label: str
-    part: Literal["train", "test"]
+    part: Split
 
     @property
     def paths(self) -> tuple[Path]:
@@ -90,26 +89,14 @@ class ShapeFile(NamedTuple):
 
 
 def find_shapes(root: Path) -> list[ShapeFile]:
-    """List all meshes of a data set, ordered by name within each part.
-
-    Raises:
-        DataError: The folder is missing or has another layout.
-    """
-    parts: tuple[Literal["train", "test"], ...] = ("train", "test")
-    shapes = [
-        ShapeFile(
-            path,
-            path.relative_to(root).with_suffix("").as_posix(),
-            path.parents[1].name if path.parent.name == part else path.stem.rpartition("_")[0],
-            part,
-        )
-        for part in parts
-        for pattern in (f"*/{part}/[!.]*.off", f"modelnet40_{part}/[!.]*.off")
-        for path in root.glob(pattern)
-    ]
-    if not shapes:
-        expected = "<class>/{train,test}/*.off or modelnet40_{train,test}/<class>_<number>.off"
-        raise DataError(root, found="no meshes", expected=expected, remedy=_GET_IT)
+    """List all meshes of a data set, ordered by name within each part."""
+    shapes = []
+    for part in SPLITS[::2]:
+        for path in (*root.glob(f"*/{part}/[!.]*.off"), *root.glob(f"modelnet40_{part}/[!.]*.off")):
+            by_class = path.parent.name == part
+            label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
+            name = path.relative_to(root).with_suffix("").as_posix()
+            shapes.append(ShapeFile(path, name, label, part))
     return sorted(shapes, key=lambda shape: (shape.part, shape.name))
 
 

@@ -24,41 +24,21 @@ from pydantic import BeforeValidator, ConfigDict, Field, NonNegativeInt, Positiv
 from pydantic.dataclasses import dataclass
 
 from datamodules.core.data_module import data_set
-from datamodules.stanford2d3ds.files import (
-    AREAS,
-    BLENDER,
-    CLASSES,
-    MISSING_DEPTH,
-    MISSING_LABEL,
-    UNKNOWN_CLASS,
-    Area,
-    euler_angles,
-)
+from datamodules.stanford2d3ds import files as stanford
 from datamodules.stanford2d3ds.pairs import StanfordPairs
 from datamodules.stanford2d3ds.panoramas import (
     Stanford2D3DS,
     Stanford2D3DSPerspective,
     StanfordImages,
 )
+from datamodules.synthrooms import render
 from datamodules.synthrooms.furniture import build_room, draw_room_type
-from datamodules.synthrooms.render import (
-    MISSING,
-    Camera,
-    Picture,
-    RayScene,
-    View,
-    ViewKind,
-    draw_camera,
-    draw_holes,
-    draw_view,
-    render_picture,
-)
 from tangent_train.files import write_bytes, write_text
 from tangent_train.manifest import Manifest
 from tangent_train.progress import show_progress
 from tangent_train.threads import in_processes
 
-INSTANCES = dict(zip(CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
+INSTANCES = dict(zip(stanford.CLASSES, (8, 4, 4, 1, 24, 40, 4, 4, 1, 4, 8, 8, 4), strict=True))
 """Number of entries per room and class in the label table, used or not.
 
 So the indices of a room do not depend on other rooms. Further instances share the last entry.
@@ -71,10 +51,10 @@ _VERSION = 1  # other versions render other pictures from the same settings
 _CAMERA_SHARES = (0.75, 0.15, 0.1)  # shares of rooms with one, two and three cameras
 _DEPTH_UNITS = 512  # per meter
 _NAMESPACE = uuid.UUID("8f2b5b54-6d1f-4a3e-9a44-2d6d0c3f7a10")
-_AreaName = Annotated[Area, BeforeValidator(lambda name: str(name).removeprefix("area_"))]
+_AreaName = Annotated[stanford.Area, BeforeValidator(lambda name: str(name).removeprefix("area_"))]
 
 
-@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+@dataclass(frozen=True, kw_only=True, config=ConfigDict(extra="forbid"))
 class RoomSettings:
     """Settings of a data set; the same settings give the same bytes.
 
@@ -92,20 +72,18 @@ class RoomSettings:
     """
 
     seed: NonNegativeInt = 0
-    rooms: Mapping[_AreaName, NonNegativeInt] = field(
-        default_factory=lambda: {a: 16 if a[0] == "5" else 40 for a in AREAS}
-    )
+    rooms: Mapping[_AreaName, NonNegativeInt]
     height: Annotated[int, Field(ge=8)] = 512
-    views: ViewKind = "stanford"
+    views: render.ViewKind = "stanford"
     views_per_camera: NonNegativeInt = 0
     view_size: Annotated[int, Field(ge=8)] = 540
     supersample: PositiveInt = 2
     least_cameras: PositiveInt = 1
 
     @property
-    def areas(self) -> list[Area]:
+    def areas(self) -> list[stanford.Area]:
         """The areas that have rooms."""
-        return [area for area in AREAS if self.rooms.get(area)]
+        return [area for area in stanford.AREAS if self.rooms.get(area)]
 
 
 class RoomPlan(NamedTuple):
@@ -130,10 +108,10 @@ class RoomPlan(NamedTuple):
 def plan_rooms(settings: RoomSettings) -> list[RoomPlan]:
     """Return all rooms of a data set, in the order of the label table."""
     plans: list[RoomPlan] = []
-    numbers = {area[0]: 0 for area in AREAS}
+    numbers = {area[0]: 0 for area in stanford.AREAS}
     for area in chain.from_iterable([area] * settings.rooms[area] for area in settings.areas):
         number = numbers[area[0]] = numbers[area[0]] + 1
-        rng = np.random.default_rng((settings.seed, AREAS.index(area), number))
+        rng = np.random.default_rng((settings.seed, stanford.AREAS.index(area), number))
         name = f"{draw_room_type(rng)}_{number}"
         drawn = 1 + int(rng.choice(len(_CAMERA_SHARES), p=_CAMERA_SHARES))
         cameras = [
@@ -180,19 +158,21 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan, name: str) -> 
     """
     rng = plan.rng
     room = build_room(rng, plan.name.partition("_")[0])
-    scene = RayScene(room)
-    holes = draw_holes(scene)
+    scene = render.RayScene(room)
+    holes = render.draw_holes(scene)
     labels = label_indices(plan, room.items)
-    cameras: list[Camera] = []
+    cameras: list[render.Camera] = []
     for identifier in plan.cameras:
-        camera = draw_camera(scene, cameras)
+        camera = render.draw_camera(scene, cameras)
         cameras.append(camera)
-        panorama = View.looking(camera.location, settings.height, heading=camera.heading)
+        panorama = render.View.looking(camera.location, settings.height, heading=camera.heading)
         views = {PANORAMA: panorama}
         for k in range(settings.views_per_camera):
-            views[str(k)] = draw_view(rng, settings.views, camera.location, settings.view_size)
+            views[str(k)] = render.draw_view(
+                rng, settings.views, camera.location, settings.view_size
+            )
         for frame, view in views.items():
-            picture = render_picture(scene, view, camera, holes, settings.supersample)
+            picture = render.render_picture(scene, view, camera, holes, settings.supersample)
             files = encode_picture(picture, labels)
             pose = pose_record(plan, identifier, frame, view, panorama)
             files["pose.json"] = json.dumps(pose).encode() + b"\n"
@@ -205,7 +185,7 @@ def make_room(root: Path, settings: RoomSettings, plan: RoomPlan, name: str) -> 
 
 def label_strings(rooms: Sequence[RoomPlan]) -> list[str]:
     """Return the label table: ``class_instance_roomtype_roomnumber_area``, unknown first."""
-    return [f"{UNKNOWN_CLASS}_0_{UNKNOWN_CLASS}_0_0"] + [
+    return [f"{stanford.UNKNOWN_CLASS}_0_{stanford.UNKNOWN_CLASS}_0_0"] + [
         f"{name}_{instance}_{room.name}_{room.area[0]}"
         for room in rooms
         for name, count in INSTANCES.items()
@@ -220,13 +200,13 @@ def label_indices(room: RoomPlan, items: Sequence[str]) -> NDArray[np.uint32]:
     seen = dict.fromkeys(INSTANCES, 0)
     indices = np.zeros(len(items), np.uint32)
     for k, name in enumerate(items):
-        if name != UNKNOWN_CLASS:
+        if name != stanford.UNKNOWN_CLASS:
             indices[k] = starts[name] + min(seen[name], INSTANCES[name] - 1)
             seen[name] += 1
     return indices
 
 
-def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, bytes]:
+def encode_picture(picture: render.Picture, labels: NDArray[np.uint32]) -> dict[str, bytes]:
     """Encode a picture as PNG files.
 
     Args:
@@ -237,12 +217,12 @@ def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, by
         File content of ``rgb.png`` (8 bit), ``depth.png`` (16 bit, 1/512 m, 65535 missing) and
         ``semantic.png`` (24-bit index R·65536 + G·256 + B, #0D0D0D missing).
     """
-    index = np.where(picture.items == MISSING, MISSING_LABEL, labels[picture.items])
+    index = np.where(picture.items == render.MISSING, stanford.MISSING_LABEL, labels[picture.items])
     blue_first = np.stack([index, index >> 8, index >> 16], axis=-1) & 0xFF
-    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=MISSING_DEPTH)
+    depth = np.nan_to_num(picture.depth_m * _DEPTH_UNITS, nan=stanford.MISSING_DEPTH)
     images: dict[str, NDArray[Any]] = {
         "rgb.png": np.ascontiguousarray(picture.rgb[..., ::-1]),
-        "depth.png": np.clip(depth + 0.5, 0, MISSING_DEPTH).astype(np.uint16),
+        "depth.png": np.clip(depth + 0.5, 0, stanford.MISSING_DEPTH).astype(np.uint16),
         "semantic.png": blue_first.astype(np.uint8),
     }
     fast = [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -250,7 +230,7 @@ def encode_picture(picture: Picture, labels: NDArray[np.uint32]) -> dict[str, by
 
 
 def pose_record(
-    room: RoomPlan, camera: str, frame: str, view: View, panorama: View
+    room: RoomPlan, camera: str, frame: str, view: render.View, panorama: render.View
 ) -> dict[str, Any]:
     """Return the pose file of a picture, with all keys of the real set.
 
@@ -262,7 +242,7 @@ def pose_record(
         room: Plan of the room.
         camera: Identifier of one of its cameras.
         frame: `PANORAMA`, or the number of a perspective view.
-        view: Picture.
+        view: render.Picture.
         panorama: Panorama of the same camera.
     """
     fov_rad = view.fov_rad or math.pi / 2
@@ -272,13 +252,13 @@ def pose_record(
     return {
         "camera_k_matrix": [[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]],
         "field_of_view_rads": fov_rad,
-        "camera_original_rotation": euler_angles(original @ BLENDER).tolist(),
-        "rotation_from_original_to_point": euler_angles(rotation @ original.T).tolist(),
+        "camera_original_rotation": stanford.euler_angles(original @ stanford.BLENDER).tolist(),
+        "rotation_from_original_to_point": stanford.euler_angles(rotation @ original.T).tolist(),
         "point_uuid": camera,
         "camera_location": view.location.tolist(),
         "frame_num": frame,
         "camera_rt_matrix": room_to_camera.tolist(),
-        "final_camera_rotation": euler_angles(rotation @ BLENDER).tolist(),
+        "final_camera_rotation": stanford.euler_angles(rotation @ stanford.BLENDER).tolist(),
         "camera_uuid": camera,
         "room": f"{room.name}_{room.area[0]}",
     }

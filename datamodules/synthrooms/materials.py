@@ -47,14 +47,8 @@ class Material(NamedTuple):
         return self._replace(color=np.clip(self.color * factor, 0.02, 0.98), pattern=0)
 
 
-SURFACE = np.dtype(
-    [
-        *(("color", np.float32, 3), ("second", np.float32, 3), ("pattern", np.int64)),
-        *(("frequency", np.float32), ("contrast", np.float32), ("offset", np.float32, 2)),
-        *(("emission", np.float32), ("unscanned", np.bool_)),
-    ],
-    align=True,
-)
+SURFACE = np.dtype("3f4, 3f4, i8, f4, f4, 2f4, f4, ?", align=True)
+SURFACE.names = Material._fields
 """A `Material` as an element of an array."""
 
 

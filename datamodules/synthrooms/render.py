@@ -20,14 +20,7 @@ from numpy.typing import NDArray
 from datamodules.stanford2d3ds.files import BLENDER, CAMERA_FROM_SPHERE
 from datamodules.synthrooms.materials import SURFACE, Floats, albedo
 from datamodules.synthrooms.room import Light, Room
-from tangent_train.geometry import (
-    camera_matrix_from_fov,
-    equirect_latitudes,
-    equirect_longitudes,
-    lonlat_to_xyz,
-    perspective_directions,
-    rotation_about,
-)
+from tangent_train import geometry
 
 ViewKind = Literal["stanford", "wide", "uniform"]
 """Viewing directions of photos, see `RoomSettings.views`."""
@@ -86,27 +79,30 @@ class View:
             roll: Clockwise as seen by the camera; the picture tilts counterclockwise.
         """
         x, _, z = np.eye(3)
-        upright = rotation_about(z, heading - math.pi / 2) @ rotation_about(x, math.pi / 2 + pitch)
-        return cls(location, upright @ rotation_about(z, -roll) @ BLENDER, size, fov_rad)
+        turns = ((z, heading - math.pi / 2), (x, math.pi / 2 + pitch), (z, -roll))
+        yaw, tilt, tip = (geometry.rotation_about(axis, angle) for axis, angle in turns)
+        return cls(location, yaw @ tilt @ tip @ BLENDER, size, fov_rad)
 
     @property
     def camera_matrix(self) -> NDArray[np.float64]:
         """``(3, 3)`` K for integer pixel centers; of one cube face for a panorama."""
         fov_deg = math.degrees(self.fov_rad or math.pi / 2)
-        return camera_matrix_from_fov(fov_deg, (self.size, self.size))
+        return geometry.camera_matrix_from_fov(fov_deg, (self.size, self.size))
 
     def rays(self, dx: float = 0.0, dy: float = 0.0) -> Floats:
         """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
         if self.fov_rad is not None:
             moved = self.camera_matrix
             moved[:2, 2] -= (dx, dy)
-            directions = perspective_directions(moved, (self.size, self.size)).astype(np.float32)
+            directions = geometry.perspective_directions(moved, (self.size, self.size)).astype(
+                np.float32
+            )
             return directions @ self.world_from_camera.T.astype(np.float32)
-        lon = equirect_longitudes(2 * self.size, dx)
-        lat = equirect_latitudes(self.size, dy)
+        lon = geometry.equirect_longitudes(2 * self.size, dx)
+        lat = geometry.equirect_latitudes(self.size, dy)
         # A direction is cos φ times its horizontal part plus the vertical: no trigonometry here.
         room_from_sphere = (self.world_from_camera @ CAMERA_FROM_SPHERE).T
-        level = lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ room_from_sphere
+        level = geometry.lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ room_from_sphere
         vertical = np.sin(lat)[:, None] * room_from_sphere[2]
         spread = np.cos(lat).astype(np.float32)[:, None, None] * level.astype(np.float32)
         return spread + vertical.astype(np.float32)[:, None, :]

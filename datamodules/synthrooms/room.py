@@ -90,13 +90,6 @@ class Wall(NamedTuple):
     length: float
     taken: list[tuple[float, float, Zone]]
 
-    def is_free(self, start: float, end: float, zone: Zone) -> bool:
-        """Return True if the wall is free between two positions along it."""
-        return not any(
-            start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
-            for a, b, other in self.taken
-        )
-
 
 class FloorPlan:
     """Rectangle, or L-shape: a rectangle without its corner of greatest x and y.
@@ -172,8 +165,12 @@ class FloorPlan:
             start, end = middle - width / 2, middle + width / 2
             frame = wall.frame.at(middle, 0)
             area = Rectangle.around(frame, (-width / 2, width / 2), (0.005, max(depth, 0.01)))
+            is_taken = any(
+                start < b + _GAP and a < end + _GAP and (zone == other or "full" in (zone, other))
+                for a, b, other in wall.taken
+            )
             fits = self.claim if depth else self.contains
-            if room > 0 and wall.is_free(start, end, zone) and fits(area):
+            if room > 0 and not is_taken and fits(area):
                 wall.taken.append((start, end, zone))
                 return frame
         raise NoPlaceError

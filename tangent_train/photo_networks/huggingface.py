@@ -92,7 +92,8 @@ def load(
         described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
         processor = _processor(folder, described["model_type"])
         settings = {"config": described, "bgr": processor["do_flip_channel_order"]}
-        kind, names = None, ()
+        kind: DepthKind | None = None
+        names: tuple[str, ...] = ()
         if _predicts_depth(config, path, depth):
             kind = declared_kind(config, path, depth)
             padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
