@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
-from tangent_train.inference.engine import Predictor
+from tangent_train.inference.api import load_label_map, map_classes
+from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.images import (
     DepthFolder,
     InputImage,
@@ -26,9 +28,7 @@ from tangent_train.inference.images import (
     read_photo,
     with_up,
 )
-from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.up_likelihood import UpLikelihood
-from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
@@ -65,17 +65,12 @@ def predict(settings: PredictSettings) -> None:
         prediction.count(inputs)
     errors: dict[str, dict[str, str]] = {}
     steps = prediction.predict, prediction.read, prediction.write
-    jobs = work_on("Predicting", inputs.jobs(missing), len(missing), *steps)
-    try:
-        with closing(jobs):
-            for job in jobs:
-                if job.error:
-                    errors[job.name] = {"file": str(job.path), "error": job.error}
-                else:
-                    manifest.finish(job.name, file=str(job.path), **job.value)
-    except KeyboardInterrupt:
-        print_text("The finished images are kept; the same command continues.")
-        raise
+    with closing(work_on("Predicting", inputs.jobs(missing), len(missing), *steps)) as jobs:
+        for job in jobs:
+            if job.error:
+                errors[job.name] = {"file": str(job.path), "error": job.error}
+            else:
+                manifest.finish(job.name, file=str(job.path), **job.value)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
     left = manifest.missing(names)
     if left and not errors.keys() >= set(left):
@@ -123,7 +118,7 @@ class _Prediction:
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
-            print_text(f"Label map {settings.label_map}: {mapped}.")
+            print_text(f"Label map {settings.label_map}: {mapped.description}.")
             loaded = mapped.loaded
         head: Any = head_of(loaded)
         kinds = head.file_kinds(settings.write)
@@ -135,30 +130,39 @@ class _Prediction:
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
         self.folder = PredictionFolder(settings.output, head, kinds)
-        views = _views(settings, loaded)
-        if isinstance(views, PanoramaViews):
+        chosen = settings.levels, settings.base_level, settings.blend, settings.rotations
+        views = ViewSelector(loaded, *chosen, settings.views, settings.fill)
+        if settings.projection == "equirectangular":
             print_text(f"A panorama is predicted in {views.description(settings.area)}.")
-        given = settings.device, settings.view_batch_size
+        else:
+            rows, columns = max(crops.image_size for crops in views.crops)
+            print_text(f"Photos are predicted in crops of {columns} × {rows}.")
+        if settings.upright == "auto":
+            loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
         self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
-        self._predictor = Predictor(loaded, head, views, *given)
+        device, batch_size = settings.device, settings.view_batch_size
+        self._predictor = Predictor(loaded, head, views, device, batch_size)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
-        self._depth = _depth_folder(settings, loaded)
-        if settings.upright == "auto" and loaded.depth_kind is not None:
-            expected = "pose or null: depth networks do not estimate the up direction"
-            raise SettingError("upright", found="auto", expected=expected)
+        self._depth = None
+        if "depth" in loaded.inputs:
+            if settings.depth is None:
+                expected = "a folder of depth images, which the network takes"
+                raise SettingError("depth", found="null", expected=expected)
+            self._depth = DepthFolder(settings.depth, settings.depth_scale)
 
     def count(self, inputs: Inputs) -> None:
         """Let the head count in some of the images, see `Head.count`."""
         names = inputs.names
         chosen = [names[k] for k in evenly_spread(_COUNTED_IMAGES, len(names))]
-        if line := self._head.count(self._mosaics(inputs, chosen)):
-            print_text(line)
 
-    def _mosaics(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
-        for job in inputs.jobs(names):
-            with suppress(DataError, SettingError):  # reported when the image is predicted
-                if not job.error:
-                    yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
+        def mosaics() -> Iterator[Any]:
+            for job in inputs.jobs(chosen):
+                with suppress(DataError, SettingError):  # reported when the image is predicted
+                    if not job.error:
+                        yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
+
+        if line := self._head.count(mosaics()):
+            print_text(line)
 
     def read(self, job: Job) -> InputImage:
         """Read one image."""
@@ -207,29 +211,11 @@ class _Prediction:
 
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
-    names = {"checkpoint", "input", "every", "output", "label_map", "depth", "projection"}
-    names |= {"levels", "base_level", "blend", "rotations", "write", "report", "shard"}
+    names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
+    names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "device", "trust"}
-    panoramas = {"area", "fill", "views", "upright", "mask"}
+    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | ({"depth_scale"} if "depth" in loaded.inputs else set())
-
-
-def _views(settings: PredictSettings, loaded: LoadedNetwork) -> PanoramaViews | PhotoViews:
-    given = settings.levels, settings.base_level, settings.blend, settings.rotations
-    if settings.projection == "perspective":
-        return PhotoViews(loaded, *given)
-    return PanoramaViews(loaded, *given, settings.views, settings.fill)
-
-
-def _depth_folder(settings: PredictSettings, loaded: LoadedNetwork) -> DepthFolder | None:
-    if ("depth" in loaded.inputs) != (settings.depth is not None):
-        raise SettingError(
-            "depth",
-            found=settings.depth or "null",
-            expected=f"a folder of depth images for a network that takes depth; this one takes "
-            f"{' and '.join(loaded.inputs)}",
-        )
-    return None if settings.depth is None else DepthFolder(settings.depth, settings.depth_scale)
+    return names | ({"depth", "depth_scale"} if "depth" in loaded.inputs else set())
