@@ -9,9 +9,8 @@ meters, which is null where unknown.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,8 +69,7 @@ class _HomeRecord(BaseModel):
     scale_meters_per_coordinate: dict[_Name, _Length | None]
 
 
-@dataclass(frozen=True, eq=False)
-class HomePanorama:
+class HomePanorama(NamedTuple):
     """A panorama of a home, as described in its file.
 
     Attributes:

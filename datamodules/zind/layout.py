@@ -37,8 +37,7 @@ _ROUNDING = 1e-9
 """Share by which walls are extended, so that a ray to a corner hits one of them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Fixture:
+class Fixture(NamedTuple):
     """A door, window or opening: an upright rectangle on a wall.
 
     Attributes:
@@ -52,20 +51,6 @@ class Fixture:
     bottom_z: float
     top_z: float
     label: int
-
-
-class _Columns(NamedTuple):
-    """Walls in the columns of a panorama.
-
-    Attributes:
-        away: ``(W,)`` horizontal distance of the wall.
-        points: ``(W, 2)`` x and y of the point on the wall.
-        along: ``(W, 2)`` unit vector along the wall.
-    """
-
-    away: NDArray[np.float64]
-    points: NDArray[np.float64]
-    along: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,13 +71,13 @@ class Layout:
 
     def labels(self, shape: tuple[int, int]) -> NDArray[np.uint8]:
         """Return the class of every pixel of a panorama of a shape ``(H, W)``."""
-        columns = self._columns(shape[1])
-        z = np.tan(equirect_latitudes(shape[0]))[:, None] * columns.away
+        away, points, along = self._columns(shape[1])
+        z = np.tan(equirect_latitudes(shape[0]))[:, None] * away
         labels = np.full(shape, _WALL, np.uint8)
         labels[z < self.floor_z] = _FLOOR
         labels[z > self.ceiling_z] = _CEILING
         for fixture in self.fixtures:
-            on = np.nonzero(_on(fixture, columns))[0]
+            on = np.nonzero(_on(fixture, points, along))[0]
             inside = (z[:, on] >= fixture.bottom_z) & (z[:, on] <= fixture.top_z)
             before = labels[:, on]
             labels[:, on] = np.where(inside & (before == _WALL), np.uint8(fixture.label), before)
@@ -106,11 +91,12 @@ class Layout:
         latitudes = equirect_latitudes(shape[0])[:, None]
         with np.errstate(divide="ignore"):  # on the horizon, which never reaches floor or ceiling
             plane = np.where(latitudes < 0, self.floor_z, self.ceiling_z) / np.tan(latitudes)
-        distances = np.minimum(np.abs(plane), self._columns(shape[1]).away) / np.cos(latitudes)
+        distances = np.minimum(np.abs(plane), self._columns(shape[1])[0]) / np.cos(latitudes)
         known = np.isin(self.labels(shape), (_CEILING, _FLOOR, _WALL))
         return np.where(known, distances, np.nan)
 
-    def _columns(self, width: int) -> _Columns:
+    def _columns(self, width: int) -> tuple[NDArray[np.float64], ...]:
+        """Return horizontal distance, x and y, and direction of the wall in each column."""
         longitudes = equirect_longitudes(width)
         ahead = np.stack([-np.sin(longitudes), np.cos(longitudes)], axis=-1)
         walls = np.roll(self.vertices, -1, axis=0) - self.vertices
@@ -122,17 +108,19 @@ class Layout:
         nearest = np.where(met, away, np.inf).argmin(axis=1)
         away = away[np.arange(width), nearest]
         along = walls / np.maximum(np.linalg.norm(walls, axis=-1, keepdims=True), 1e-300)
-        return _Columns(away, ahead * away[:, None], along[nearest])
+        return away, ahead * away[:, None], along[nearest]
 
 
-def _on(fixture: Fixture, columns: _Columns) -> NDArray[np.bool_]:
-    """Return the columns that show a fixture's part of a wall."""
+def _on(
+    fixture: Fixture, points: NDArray[np.float64], along: NDArray[np.float64]
+) -> NDArray[np.bool_]:
+    """Return the columns, at points of walls, that show a fixture's part of a wall."""
     start, end = fixture.ends
     length = np.linalg.norm(end - start)
     direction = (end - start) / length
-    place = (columns.points - start) @ direction
-    off = np.abs(_cross(columns.points - start, direction))
-    askew = np.abs(_cross(columns.along, direction))
+    place = (points - start) @ direction
+    off = np.abs(_cross(points - start, direction))
+    askew = np.abs(_cross(along, direction))
     return (place >= 0) & (place <= length) & (off <= _OFF_WALL) & (askew <= _OFF_DIRECTION)
 
 

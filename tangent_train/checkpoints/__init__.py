@@ -1,5 +1,5 @@
-"""Read untrusted files: checkpoints, exported networks, settings of runs.
+"""Read untrusted files: checkpoints and exported networks.
 
 Files are plain data: tensors and plain values. Settings are checked against those that files may
-give (`tangent_train.config.build`), and are not interpreted again.
+give (`tangent_train.config.from_file`), and are not interpreted again.
 """

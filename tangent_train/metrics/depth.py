@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
@@ -51,7 +51,7 @@ _SUMS = 2 + len(_ERRORS) + len(_SHARES)
 _THRESHOLD = 1.25
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
 class DepthProtocol:
     """Comparison of predicted distances with true ones; scores depend on all of its settings.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.synthia.reader import choose_frames, read_view_camera
+from datamodules.synthia.reader import read_view_camera
 from tangent_train.errors import DataError
 
 
@@ -39,12 +39,3 @@ def test_strange_cameras_are_refused(tmp_path: Path, text: str) -> None:
     _write_camera(tmp_path, text)
     with pytest.raises(DataError, match=r"intrinsics\.txt: found .* expected focal"):
         read_view_camera(tmp_path, (760, 1280))
-
-
-@pytest.mark.parametrize(
-    ("count", "step"),
-    [(1, 1), (749, 1), (750, 2), (1250, 3)],
-)
-def test_every_nth_frame(count: int, step: int) -> None:
-    frames = [f"{i:06d}" for i in range(count)]
-    assert choose_frames(frames) == [f"{i:06d}" for i in range(0, count, step)]
