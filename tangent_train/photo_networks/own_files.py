@@ -73,7 +73,7 @@ def load_config(
     names = class_names_in(classes, depth)
     whole = completed_settings(settings, 3, len(names) or 1, restored=True)
     network = build_from_config(whole, "network")
-    load_tensors(network, tensors_for(network, Path(weights)), weights)
+    load_tensors(network, tensors_for(network, Path(weights)))
     normalized = Normalization.of(normalization, 3)
     kind: ScoreKind | None = None if depth else "logits"
     return PhotoNetwork(network, whole, names, normalized, score_kind=kind, depth_kind=depth)

@@ -52,7 +52,7 @@ def load(*, model: str | None, classes: Path | None, normalization: Any) -> Phot
     given = None if normalization is None else Normalization.of(normalization, 3)
     tensors = tensors_in(folder)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_HEAD_OF_IMAGES)}
-    load_tensors(network, tensors, folder)
+    load_tensors(network, tensors)
     return PhotoNetwork(
         module=network,
         settings=settings,

@@ -57,7 +57,7 @@ def load(
     file = Path(weights)
     tensors = tensors_for(network, file) if is_file else fetch_tensors(chosen)
     tensors = {name: t for name, t in tensors.items() if not name.startswith(_AUXILIARY)}
-    load_tensors(network, tensors, weights)
+    load_tensors(network, tensors)
     default = Normalization(preset.mean, preset.std)
     return PhotoNetwork(
         module=network,
