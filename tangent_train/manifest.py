@@ -48,14 +48,12 @@ class Shard:
         >>> Shard.parse("3/16")
         Shard(number=3, count=16)
         """
-        if setting is None:
-            return cls()
-        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
-        number, count = map(int, match.groups()) if match else (0, 0)
-        if not 1 <= number <= count:
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting or "1/1"), re.ASCII)
+        shard = cls(*map(int, match.groups())) if match else cls(0)
+        if not 1 <= shard.number <= shard.count:
             expected = "number/count, such as 1/16 to 16/16, or null"
             raise SettingError("shard", found=setting, expected=expected)
-        return cls(number, count)
+        return shard
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
@@ -108,38 +106,29 @@ class Manifest:
         wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
         others = folder.iterdir() if folder.exists() and not path.is_file() else ()
         if any(other.name[0] != "." for other in others):
-            raise SettingError(
-                "output",
-                found=f"{folder}, which holds other files",
-                expected="a new or empty folder, or one that this command began",
-                remedy="Choose another folder.",
-            )
+            expected = "a new or empty folder, or one that this command began"
+            found = f"{folder}, which holds other files"
+            raise SettingError("output", found=found, expected=expected)
         finished: dict[str, dict[str, Any]] = {}
         for file in sorted(folder.glob("finished*.jsonl")):
-            finished |= _read_lines(file)
+            for line in file.read_text("utf-8").splitlines():
+                with suppress(ValueError):  # a line that was cut off by a kill
+                    entry = json.loads(line)
+                    finished[entry.pop("item")] = entry
         shard = shard or Shard()
         if not (finished or is_shared or shard.count > 1):
             path.unlink(missing_ok=True)
         folder.mkdir(parents=True, exist_ok=True)
-        try:
-            with path.open("x", encoding="utf-8") as new:
-                new.write(json.dumps(wanted, indent=1) + "\n")
-        except FileExistsError:
-            cls._check_same(path, wanted)
-        return cls(folder, finished, shard)
-
-    @staticmethod
-    def _check_same(path: Path, wanted: Mapping[str, Any]) -> None:
-        """Refuse a folder that was begun with other settings."""
+        with suppress(FileExistsError), path.open("x", encoding="utf-8") as new:
+            new.write(json.dumps(wanted, indent=1) + "\n")
         before = json.loads(path.read_bytes())
         for name in sorted(before.keys() | wanted.keys()):
-            if before.get(name) != wanted.get(name):
-                raise SettingError(
-                    name,
-                    found=_shown(wanted.get(name)),
-                    expected=f"{_shown(before.get(name))}, with which {path.parent} was written",
-                    remedy="Choose another output, or delete this one to write it again.",
-                )
+            found, old = ("null" if s.get(name) is None else s[name] for s in (wanted, before))
+            if found != old:
+                remedy = "Choose another output, or delete this one to write it again."
+                expected = f"{old}, with which {folder} was written"
+                raise SettingError(name, found=found, expected=expected, remedy=remedy)
+        return cls(folder, finished, shard)
 
     def missing(self, names: Iterable[str]) -> list[str]:
         """Return the names of items that are not finished, in their order."""
@@ -157,17 +146,3 @@ class Manifest:
         suffix = "" if shard.count == 1 else f"-{shard.number}-of-{shard.count}"
         with (self.folder / f"finished{suffix}.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({"item": name, **entry}) + "\n")
-
-
-def _shown(value: Any) -> str:
-    return "null" if value is None else str(value)
-
-
-def _read_lines(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the entries of a file; a line that was cut off by a kill is ignored."""
-    entries = {}
-    for line in path.read_text("utf-8").splitlines():
-        with suppress(ValueError):
-            entry = json.loads(line)
-            entries[entry.pop("item")] = entry
-    return entries

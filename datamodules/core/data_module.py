@@ -29,7 +29,7 @@ from datamodules.core.files import SPLITS, Problems, Split, draw_groups
 from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights, class_weights, label_doubts
 from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, wrong_setting
 from tangent_train.manifest import Shard
 from tangent_train.progress import show_progress
 from tangent_train.rendering import TangentRepresentation
@@ -61,13 +61,10 @@ def data_set(kind: _Class) -> _Class:
         try:
             init(self, *values, **settings)
         except ValidationError as error:
-            first, *_ = errors = error.errors(include_url=False)
-            cause = first.get("ctx", {}).get("error")
-            name = first["loc"][0] if first["loc"] else "data"
-            texts = [e["msg"].removeprefix("Input should be ") for e in errors if name in e["loc"]]
-            expected = " or ".join(dict.fromkeys(texts))
+            cause = error.errors()[0].get("ctx", {}).get("error")
             if not isinstance(cause, DataError | SettingError):
-                cause = SettingError(f"data.{name}", found=first["input"], expected=expected)
+                known = dict.fromkeys(made.__dataclass_fields__, "a value")
+                cause = wrong_setting(error, known, "data.")
             raise cause from error
 
     made.__init__ = checked
@@ -309,8 +306,7 @@ class DataModule(LightningDataModule, ABC):
         self._test_images = self.problems.incomplete.get(self.test_split, "")
         if self.test_split == "val":
             scenes = {files.name: files.name.partition("/")[0] for files in found["train"]}
-            fraction = self.val_fraction
-            drawn = draw_groups(scenes.values(), fraction, self.seed) if fraction else set()
+            drawn = draw_groups(scenes.values(), self.val_fraction, self.seed)
             found["test"] = found["val"]
             found["val"] = [files for files in found["train"] if scenes[files.name] in drawn]
             found["train"] = [files for files in found["train"] if scenes[files.name] not in drawn]

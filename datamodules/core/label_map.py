@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import DataError, counted
-from tangent_train.files import is_text, read_json
+from tangent_train.files import read_json
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import read_pixels, read_rgb
 
@@ -197,7 +197,8 @@ def read_label_map(path: Path) -> LabelMap:
         named = [(name, value) for value, name in enumerate(content) if name is not None]
     elif isinstance(content, dict):
         named = list(content.items())
-    wrong = [json.dumps(name) for name, _ in named if not is_text(name) or name == UNKNOWN_NAME]
+    texts = [name for name, _ in named if isinstance(name, str) and name.isprintable()]
+    wrong = [json.dumps(n) for n, _ in named if n not in texts or n == UNKNOWN_NAME]
     for label, (name, given) in enumerate(named, start=1):
         for key in given if isinstance(given, list) else [given]:
             plain = plain_name(key) if isinstance(key, str) else key

@@ -30,11 +30,10 @@ from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
 from datamodules.core.dataset import SplitDataset, sample_rng
-from datamodules.core.files import Split, draw_groups
+from datamodules.core.files import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
 from datamodules.core.label_map import IMAGE_CLASS
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
-from tangent_train.errors import DataError
+from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
 from tangent_train.geometry import random_rotation, rotation_about
 from tangent_train.threads import in_processes
 
@@ -81,7 +80,7 @@ class ShapeFile(NamedTuple):
     path: Path
     name: str
     label: str
-    part: Literal["train", "test"]
+    part: Split
 
     @property
     def paths(self) -> tuple[Path]:
@@ -90,23 +89,14 @@ class ShapeFile(NamedTuple):
 
 
 def find_shapes(root: Path) -> list[ShapeFile]:
-    """List all meshes of a data set, ordered by name within each part.
-
-    Raises:
-        DataError: The folder is missing or has another layout.
-    """
-    shapes: list[ShapeFile] = []
-    parts: tuple[Literal["train", "test"], ...] = ("train", "test")
-    for part in parts:
-        for path in (*root.glob(f"*/{part}/*.off"), *root.glob(f"modelnet40_{part}/*.off")):
+    """List all meshes of a data set, ordered by name within each part."""
+    shapes = []
+    for part in SPLITS[::2]:
+        for path in (*root.glob(f"*/{part}/[!.]*.off"), *root.glob(f"modelnet40_{part}/[!.]*.off")):
             by_class = path.parent.name == part
             label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
             name = path.relative_to(root).with_suffix("").as_posix()
-            if not path.name.startswith("."):
-                shapes.append(ShapeFile(path, name, label, part))
-    if not shapes:
-        expected = "<class>/{train,test}/*.off or modelnet40_{train,test}/<class>_<number>.off"
-        raise DataError(root, found="no meshes", expected=expected, remedy=_GET_IT)
+            shapes.append(ShapeFile(path, name, label, part))
     return sorted(shapes, key=lambda shape: (shape.part, shape.name))
 
 
@@ -151,9 +141,9 @@ class ShapeDataset(SplitDataset):
 
     def _views(self, index: int, rng: np.random.Generator) -> list[Any]:
         data = self.data
-        if self.split == "train":
-            return [data.representation.sample(rng)]
         representation = data.representation
+        if self.split == "train":
+            return [representation.sample(rng)]
         if self.split == "test" and data.test_rotation is not None:
             # Rotated back, it sees what a rotated shape shows.
             representation = representation.with_rotation(self.shape_rotation(index).T)
@@ -226,7 +216,7 @@ class ModelNet40(DataModule):
     def read(self, files: ShapeFile) -> Spheres:
         """See `DataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        values = mesh_spheres(clean_mesh(read_off(files.path)), shape)
+        values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
     def decode_settings(self) -> dict[str, Any]:

@@ -59,8 +59,7 @@ def keypoints(settings: KeypointSettings) -> None:
         manifest.finish(name, rows=comparison.rows)
     rows = [row for name in pairs.names for row in finished.get(name, {}).get("rows", ())]
     if rows:
-        representations = comparer.representations
-        for table in write_report(output, rows, representations, content, pairs.published):
+        for table in write_report(output, rows, content, pairs.published):
             table.print()
     print_text(f"Results are in {output}." if rows else "There are no results.")
     if settings.export:

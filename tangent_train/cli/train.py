@@ -12,20 +12,28 @@ import warnings
 from pathlib import Path
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
-from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
-from tangent_train.cli.run import Run, build, write_settings
+from tangent_train.cli.run import Run, build
 from tangent_train.config.settings import TrainSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path, write_text
+
+_EXPECTED_WARNINGS = (
+    "Checkpoint directory .* exists and is not empty",  # a resumed run has checkpoints
+    ".* your dataloader is not resumable",  # the data module stores where to continue
+    "Total length of `list` across ranks is zero",  # a run may have no validation
+    "The number of training batches",  # a small data set has few batches
+    "Found .* in eval mode at the start of training",  # network.frozen_statistics=true
+)
 
 
 def train(settings: TrainSettings) -> float | None:
@@ -48,7 +56,7 @@ def train(settings: TrainSettings) -> float | None:
     if resumed is None:
         _create_folder(folder)
         load_pretrained(run, settings.init_from)
-    rank_zero_only(write_settings)(folder, settings)
+    rank_zero_only(run.write_settings)()
     checkpoints = folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
@@ -61,7 +69,8 @@ def train(settings: TrainSettings) -> float | None:
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)
     if len(run.data.dataset("test")):
-        run.task.load_state_dict(read_checkpoint(tested, ["state_dict"])["state_dict"])
+        weights = torch.load(tested, map_location="cpu", weights_only=True, mmap=True)
+        run.task.load_state_dict(weights["state_dict"])
         run.test(trainer, tested)
     else:
         rank_zero_only(print_text)(f"No {run.data.noun} to test: no results are written.")
@@ -74,11 +83,9 @@ def _create_folder(folder: Path) -> None:
     try:
         (folder / "checkpoints").mkdir(parents=True)
     except FileExistsError as error:
+        found, remedy = f"{folder}, the folder of another run", f"To continue it: resume={folder}"
         raise SettingError(
-            "hydra.run.dir",
-            found=f"{folder}, the folder of another run",
-            expected="a new folder",
-            remedy=f"To continue that run: resume={folder}",
+            "hydra.run.dir", found=found, expected="a new folder", remedy=remedy
         ) from error
 
 
@@ -87,15 +94,8 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None) -> None:
     if "SUBMITIT_EXECUTOR" in os.environ:  # SLURM announces the end of a job by SIGUSR2
         signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with warnings.catch_warnings():
-        # A resumed run has checkpoints.
-        warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-        # The data module, not its loader, stores where to continue.
-        warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
-        # A run may have no validation; a small data set has few batches.
-        warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")
-        warnings.filterwarnings("ignore", "The number of training batches")
-        # This is what network.frozen_statistics=true does.
-        warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
+        for message in _EXPECTED_WARNINGS:
+            warnings.filterwarnings("ignore", message)
         try:
             trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
         except SIGTERMException:

@@ -44,9 +44,6 @@ Row = dict[str, Any]
 _Views = tuple[DepthView, DepthView]
 """Depth and pose of the left and of the right panorama."""
 
-_Keypoints = dict[tuple[str, int], dict[str, SphericalKeypoints]]
-"""Keypoints by representation, for a panorama's name and level."""
-
 AS_GIVEN, ROTATED = "as_given", "rotated"
 """Conditions: both panoramas unchanged; the right panorama randomly rotated."""
 
@@ -114,13 +111,7 @@ class Comparer:
     controls: bool = True
 
     def __post_init__(self) -> None:
-        self._cache: _Keypoints = {}
-
-    @property
-    def representations(self) -> list[str]:
-        """Names: ``ERP``; with controls, shrunk ERP and cube; ``L0``, ``L1`` … for base levels."""
-        controls = [SHRUNK, CUBE] if self.controls else []
-        return ["ERP", *controls, *(f"L{b}" for b in self.base_level)]
+        self._cache: dict[tuple[str, int], dict[str, SphericalKeypoints]] = {}
 
     def compare(self, pair: PanoramaPair) -> Comparison:
         """Compare all representations on one pair.
@@ -187,7 +178,7 @@ class Comparer:
     def _detect(
         self, rgb: NDArray[np.uint8], level: int, valid: NDArray[np.bool_] | None
     ) -> dict[str, SphericalKeypoints]:
-        """Return the keypoints at valid pixels, in the order of `representations`."""
+        """Return the keypoints at valid pixels by representation, in the order of the tables."""
         found = {"ERP": detect_on_equirect(rgb)}
         grids: dict[str, Any] = {f"L{b}": TangentGrid(b, level) for b in self.base_level}
         if self.controls:
@@ -206,29 +197,23 @@ class Comparer:
         return MatchedPair(left, right, matches, geometry)
 
     def _scores(self, pair: MatchedPair, rotation: Floats, views: _Views | None) -> Row:
-        keypoints = visible = len(pair.left), len(pair.right)
-        truth: Row = dict.fromkeys(_TRUTH)
+        counts = {"left": len(pair.left), "right": len(pair.right)}
+        row: Row = {f"keypoints_{side}": count for side, count in counts.items()}
+        row |= {f"visible_{side}": count for side, count in counts.items()}
+        row |= dict.fromkeys(("putative", "inliers", "pmr", "ms", "p", "geometry", *_TRUTH))
         if views is not None:
-            visible, truth = self._truth(pair, rotation, views)
-        putative, inliers = len(pair.matches), int(pair.geometry.inliers.sum())
-        share = sum(1 / n for n in visible) / 2 if all(visible) else None
-        return {
-            "keypoints_left": keypoints[0],
-            "keypoints_right": keypoints[1],
-            "visible_left": visible[0],
-            "visible_right": visible[1],
-            "putative": putative,
-            "inliers": inliers,
-            "pmr": share and putative * share,
-            "ms": share and inliers * share,
-            "p": inliers / putative if putative else None,
-            "geometry": pair.geometry.kind,
-            **truth,
-        }
+            row |= self._truth(pair, rotation, views)
+        row["putative"] = putative = len(pair.matches)
+        row["inliers"] = inliers = int(pair.geometry.inliers.sum())
+        row["geometry"] = pair.geometry.kind
+        visible = row["visible_left"], row["visible_right"]
+        if all(visible):
+            share = sum(1 / n for n in visible) / 2
+            row |= {"pmr": putative * share, "ms": inliers * share}
+        row["p"] = inliers / putative if putative else None
+        return row
 
-    def _truth(
-        self, pair: MatchedPair, rotation: Floats, views: _Views
-    ) -> tuple[tuple[int, int], Row]:
+    def _truth(self, pair: MatchedPair, rotation: Floats, views: _Views) -> Row:
         """Return the numbers of visible keypoints, and the scores that need depth and pose."""
         (left, right), left_xyz = views, pair.left.directions_xyz
         # In the unrotated right panorama, whose depth needs no resampling.
@@ -244,11 +229,10 @@ class Comparer:
         areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)
         share = correct / known if known else None
         scores = (*map(_defined, errors), *areas, known, correct, share)
-        counts = (
-            int(visible_from(left_xyz, left, right).sum()),
-            int(visible_from(right_xyz, right, left).sum()),
-        )
-        return counts, dict(zip(_TRUTH, scores, strict=True))
+        return dict(zip(_TRUTH, scores, strict=True)) | {
+            "visible_left": int(visible_from(left_xyz, left, right).sum()),
+            "visible_right": int(visible_from(right_xyz, right, left).sum()),
+        }
 
 
 def _defined(value: float) -> float | None:

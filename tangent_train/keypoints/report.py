@@ -48,7 +48,6 @@ _MOST_LINES = 150
 def write_report(
     folder: Path,
     rows: Sequence[Row],
-    representations: Sequence[str],
     settings: Mapping[str, Any],
     published: Mapping[str, PublishedPair],
 ) -> list[Table]:
@@ -57,7 +56,6 @@ def write_report(
     Args:
         folder: Output folder.
         rows: Rows of `Comparer.compare` for all pairs.
-        representations: Representations in the order of the columns.
         settings: Settings that affect the scores.
         published: The paper's pairs by name; empty for other data.
 
@@ -75,21 +73,25 @@ def write_report(
     for condition, title in _CONDITIONS.items():
         if some := [row for row in rows if row["condition"] == condition]:
             of_paper = published if condition == AS_GIVEN else {}
-            cells = list(_mean_rows(some, representations, _paper() if of_paper else {}))
-            header = ("split", "metric", *representations)
+            header = ("split", "metric", *_representations(some))
+            cells = list(_mean_rows(some, _paper() if of_paper else {}))
             means.append(Table(title, header, cells, text_columns=(0, 1)))
-            pairs.append(_per_pair(title, some, representations, of_paper))
+            pairs.append(_per_pair(title, some, of_paper))
     tables = [table.markdown() for table in (*means, *pairs)]
     head = f"# Keypoints\n\nSettings: {shown}.\n"
     write_text(folder / "keypoints.md", "\n".join([head, *visible, *tables]))
     return means
 
 
+def _representations(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["representation"] for row in rows))
+
+
 def _mean_rows(
-    rows: Sequence[Row], representations: Sequence[str], paper: Mapping[tuple[str, str], Any]
+    rows: Sequence[Row], paper: Mapping[tuple[str, str], Any]
 ) -> Iterator[Sequence[str]]:
     """Yield means over the pairs with a defined score, and the paper's means below them."""
-    splits = {row["split"] for row in rows}
+    splits, representations = {row["split"] for row in rows}, _representations(rows)
     for split in sorted(splits, key=lambda name: (name != "hard", name != "easy")):
         columns = [
             [row for row in rows if (row["split"], row["representation"]) == (split, name)]
@@ -110,13 +112,9 @@ def _mean_rows(
                 yield ("", f"{metric}, paper", *texts)
 
 
-def _per_pair(
-    title: str,
-    rows: Sequence[Row],
-    representations: Sequence[str],
-    published: Mapping[str, PublishedPair],
-) -> Table:
+def _per_pair(title: str, rows: Sequence[Row], published: Mapping[str, PublishedPair]) -> Table:
     cells: list[Sequence[str]] = []
+    representations = _representations(rows)
     for name in dict.fromkeys(row["pair"] for row in rows):
         found = {row["representation"]: row for row in rows if row["pair"] == name}
         scores = (_triple([found[n][key] for key in _SCORES]) for n in representations)

@@ -15,14 +15,15 @@ images that have it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
@@ -35,7 +36,6 @@ from tangent_train.metrics.scores import (
     bootstrap,
     defined_mean,
 )
-from tangent_train.rendering.checks import check_choice
 
 Alignment = Literal["none", "median", "scale", "affine"]
 """Alignment of a prediction with the true distances of the image: ``median`` and ``scale`` multiply
@@ -61,20 +61,13 @@ class DepthProtocol:
         min_distance: Pixels with a smaller true distance, in meters, are ignored.
         max_distance: Pixels with a larger true distance, in meters, are ignored; None for no limit.
         clip: True to clip aligned predictions to these distances.
-
-    Raises:
-        SettingError: There is no such alignment.
     """
 
     alignment: Alignment = "none"
     alignment_in: Quantity = "distance"
-    min_distance: float = 0.0
+    min_distance: Annotated[float, Field(ge=0)] = 0.0
     max_distance: float | None = None
     clip: bool = False
-
-    def __post_init__(self) -> None:
-        check_choice("task.head.alignment", self.alignment, get_args(Alignment))
-        check_choice("task.head.alignment_in", self.alignment_in, get_args(Quantity))
 
     @property
     def facts(self) -> dict[str, str]:

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthrooms.datamodule import SynthRooms
-from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.datamodule import SynthRooms, generate_rooms
 from datamodules.synthshapes import SynthShapes, generate_shapes
 from tangent_train.errors import DataError, SettingError
 from tangent_train.manifest import Manifest, Shard

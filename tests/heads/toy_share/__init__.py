@@ -31,7 +31,6 @@ class ShareHead(Head):
     labels = "pixel_classes"
     columns: ClassVar = {"mae": ScoreColumn("mean absolute error", "", better="lower")}
     main_score = "mae"
-    takes = "images (n, C, h, w) to numbers (n, 1, h, w)"
     num_outputs = 1
 
     def __init__(self, class_names: Sequence[str], class_name: str) -> None:
