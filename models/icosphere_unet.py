@@ -9,8 +9,7 @@ from typing import Literal
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.mapped import MappedConv, Table, collect
-from models.tables import vertex_means, vertex_parents
+from models.mapped import MappedConv, Table, collect, vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import IcosphereElements
@@ -60,13 +59,8 @@ def levels_of(widths: Sequence[int], level: int) -> range:
 
     Args:
         widths: Channels at each level.
-        level: Level of the finest icosphere.
-
-    Raises:
-        SettingError: There are more widths than levels.
+        level: Level of the finest icosphere, at least the number of widths less one.
     """
-    if len(widths) > level + 1:
-        raise SettingError("network.widths", found=widths, expected=f"at most {level + 1}")
     return range(level, level - len(widths), -1)
 
 
