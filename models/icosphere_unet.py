@@ -59,8 +59,13 @@ def levels_of(widths: Sequence[int], level: int) -> range:
 
     Args:
         widths: Channels at each level.
-        level: Level of the finest icosphere, at least the number of widths less one.
+        level: Level of the finest icosphere.
+
+    Raises:
+        SettingError: There are more widths than levels.
     """
+    if len(widths) > level + 1:
+        raise SettingError("network.widths", found=widths, expected=f"at most {level + 1}")
     return range(level, level - len(widths), -1)
 
 

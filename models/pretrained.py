@@ -13,7 +13,7 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torchvision.models import WeightsEnum
 
-from tangent_train.errors import DataError, printable
+from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.files import load_plain
 
 _RGB = 3
@@ -155,8 +155,13 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
 
     Returns:
         The network, changed in place.
+
+    Raises:
+        SettingError: The first convolution has other channels.
     """
     stem = next(module for module in network.modules() if isinstance(module, nn.Conv2d))
+    if (stem.in_channels, stem.groups) != (_RGB, 1):
+        raise SettingError("data.inputs", found=stem, expected="a first convolution of RGB images")
     places = [*range(_RGB), *[None] * (in_channels - _RGB)]
     stem.weight = nn.Parameter(select_channels(stem.weight.detach(), places))
     stem.in_channels = in_channels
