@@ -1,51 +1,25 @@
 """Networks. Other `nn.Module` classes that map images to scores can be named by ``_target_``."""
 
-from models.auxiliary_head import AuxiliaryHead
-from models.distortion_aware import make_distortion_aware
-from models.fcn_resnet import FCNResNet
-from models.harmonic_network import HarmonicNetwork
-from models.hexunet import HexUNet
-from models.huggingface import HuggingFaceDepthNetwork, HuggingFaceNetwork
-from models.icocnn import IcoCNN
-from models.icosphere_unet import IcosphereUNet
-from models.initialization import initialize
-from models.mapped import MappedConv, Table
-from models.shape_classifier import ShapeClassifier
-from models.sphere_attention import SphereAttention
-from models.sphere_context import SphereContext
-from models.stem import widen_stem
-from models.tables import (
-    face_neighbors,
-    gnomonic_points,
-    hexagonal_rings,
-    mapped_samples,
-    mesh_operators,
-)
-from models.unet import UNet
-from models.zonal import ZonalClassifier
-
-__all__ = [
-    "AuxiliaryHead",
-    "FCNResNet",
-    "HarmonicNetwork",
-    "HexUNet",
-    "HuggingFaceDepthNetwork",
-    "HuggingFaceNetwork",
-    "IcoCNN",
-    "IcosphereUNet",
-    "MappedConv",
-    "ShapeClassifier",
-    "SphereAttention",
-    "SphereContext",
-    "Table",
-    "UNet",
-    "ZonalClassifier",
-    "face_neighbors",
-    "gnomonic_points",
-    "hexagonal_rings",
-    "initialize",
-    "make_distortion_aware",
-    "mapped_samples",
-    "mesh_operators",
-    "widen_stem",
-]
+from models.distortion_aware import make_distortion_aware as make_distortion_aware
+from models.fcn_resnet import FCNResNet as FCNResNet
+from models.harmonic_network import HarmonicNetwork as HarmonicNetwork
+from models.hexunet import HexUNet as HexUNet
+from models.huggingface import HuggingFaceDepthNetwork as HuggingFaceDepthNetwork
+from models.huggingface import HuggingFaceNetwork as HuggingFaceNetwork
+from models.icocnn import IcoCNN as IcoCNN
+from models.icosphere_unet import IcosphereUNet as IcosphereUNet
+from models.mapped import MappedConv as MappedConv
+from models.mapped import Table as Table
+from models.mapped import face_neighbors as face_neighbors
+from models.mapped import gnomonic_points as gnomonic_points
+from models.mapped import hexagonal_rings as hexagonal_rings
+from models.mapped import mapped_samples as mapped_samples
+from models.mapped import mesh_operators as mesh_operators
+from models.pretrained import initialize as initialize
+from models.pretrained import widen_stem as widen_stem
+from models.shape_classifier import ShapeClassifier as ShapeClassifier
+from models.sphere_attention import SphereAttention as SphereAttention
+from models.stages import AuxiliaryHead as AuxiliaryHead
+from models.stages import SphereContext as SphereContext
+from models.unet import UNet as UNet
+from models.zonal import ZonalClassifier as ZonalClassifier

@@ -11,8 +11,7 @@ from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
 from torchvision.models import get_model, get_weight
 
-from models.pretrained import fetch_tensors, load_tensors, tensors_for
-from models.stem import widen_stem
+from models.pretrained import fetch_tensors, load_tensors, tensors_for, widen_stem
 
 _PUBLISHED = {
     "coco": "FCN_ResNet{}_Weights.COCO_WITH_VOC_LABELS_V1",
@@ -40,7 +39,7 @@ class FCNResNet(nn.Module):
             keeps the statistics of `weights`, and dropout is off.
 
     Raises:
-        DataError: The weights cannot be downloaded or read, or do not fit.
+        DataError: The weights cannot be read.
     """
 
     def __init__(
@@ -60,7 +59,7 @@ class FCNResNet(nn.Module):
         if weights is not None:
             tensors = _tensors(self, str(weights), depth)
             with_head = any(name.startswith(_HEAD) for name in tensors)
-            load_tensors(self, tensors, weights, fresh=_LAST if with_head else _HEAD)
+            load_tensors(self, tensors, fresh=_LAST if with_head else _HEAD)
         widen_stem(self.backbone, in_channels)
         self.train()
 

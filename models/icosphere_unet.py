@@ -9,8 +9,7 @@ from typing import Literal
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.mapped import MappedConv, Table, collect
-from models.tables import vertex_means, vertex_parents
+from models.mapped import MappedConv, Table, collect, vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
 from tangent_train.geometry.icosphere import IcosphereElements

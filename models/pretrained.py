@@ -1,12 +1,11 @@
-"""Tensors of trained networks: reading, fetching and strict loading."""
+"""Tensors of trained networks: reading, loading, and initialization of other networks from them."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
-from http.client import HTTPException
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from safetensors import SafetensorError
@@ -14,8 +13,10 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 from torchvision.models import WeightsEnum
 
-from tangent_train.errors import DataError
+from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.files import load_plain
+
+_RGB = 3
 
 _PREFIX = "network."
 """Prefix of the network's tensors in checkpoints of this package."""
@@ -68,18 +69,16 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
     Raises:
         DataError: The file is missing, or has another content.
     """
-    expected = "a state dict of tensors, or a checkpoint with one"
-    if path.suffix == ".safetensors":
-        try:
-            content: Any = load_file(path)
-        except (SafetensorError, OSError) as error:
-            found = f"an unreadable file ({error})" if path.is_file() else "no such file"
-            raise DataError(path, found=found, expected=expected) from error
-    else:
-        content = load_plain(path, expected)
+    expected, found = "a state dict of tensors, or a checkpoint with one", "no named tensors"
+    content: Any = None
+    try:
+        is_safe = path.suffix == ".safetensors"
+        content = load_file(path) if is_safe else load_plain(path, expected)
+    except (SafetensorError, OSError) as error:
+        found = f"an unreadable file ({error})" if path.is_file() else "no such file"
     mappings = _mappings(content) if isinstance(content, Mapping) else {}
     if not mappings:
-        raise DataError(path, found="no named tensors", expected=expected)
+        raise DataError(path, found=found, expected=expected)
     whole = mappings.get("state_dict", {})
     prefixed = {name: tensor for name, tensor in whole.items() if name.startswith(_PREFIX)}
     return mappings | ({"state_dict": prefixed} if prefixed else {})
@@ -118,51 +117,176 @@ def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> list[tuple[st
 
 
 def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
-    """Return tensors published by torchvision, from the local cache or the internet.
-
-    Raises:
-        DataError: The tensors are not in the cache and cannot be fetched.
-    """
-    try:
-        tensors = weights.get_state_dict(
+    """Return tensors published by torchvision, from the local cache or the internet."""
+    return dict(
+        weights.get_state_dict(
             progress=True, check_hash=True, map_location="cpu", weights_only=True
         )
-    except (OSError, HTTPException, RuntimeError) as error:
-        cached = Path(torch.hub.get_dir(), "checkpoints", weights.url.rpartition("/")[2])
-        raise DataError(
-            weights.url,
-            found=f"no way to fetch it ({error})",
-            expected="an internet connection the first time these weights are used",
-            remedy=f"Fetch it on another machine and save it as {cached}.",
-        ) from error
-    return dict(tensors)
+    )
 
 
 def load_tensors(
-    network: nn.Module, tensors: Mapping[str, Tensor], source: object, fresh: str | None = None
+    network: nn.Module, tensors: Mapping[str, Tensor], fresh: str | None = None
 ) -> None:
-    """Load all tensors of a network; a missing or unfitting tensor is an error.
+    """Load all tensors of a network; torch refuses missing, unexpected and unfitting ones.
 
     Args:
         network: Network, changed in place.
         tensors: Tensors by name.
-        source: Source of the tensors, for error messages.
         fresh: Prefix of the names of tensors that are not loaded; None to load all.
-
-    Raises:
-        DataError: Tensors are missing, unexpected or of another shape.
     """
     kept = {
         name: tensor
         for name, tensor in network.state_dict().items()
         if _COUNTER in name or (fresh is not None and name.startswith(fresh))
     }
-    try:
-        network.load_state_dict({**kept, **tensors})
-    except RuntimeError as error:
+    network.load_state_dict({**kept, **tensors})
+
+
+def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
+    """Extend a network of RGB images to additional channels, such as depth.
+
+    The filters of additional channels start at zero (paper, supplement, "Level 10 parameters"), so
+    that the network first returns the same for RGB-D as for RGB.
+
+    Args:
+        network: Network whose first convolution processes the image, of three channels.
+        in_channels: Number of channels, 3 or more; the first three are red, green and blue.
+
+    Returns:
+        The network, changed in place.
+
+    Raises:
+        SettingError: The first convolution has other channels.
+    """
+    stem = next(module for module in network.modules() if isinstance(module, nn.Conv2d))
+    if (stem.in_channels, stem.groups) != (_RGB, 1):
+        raise SettingError("data.inputs", found=stem, expected="a first convolution of RGB images")
+    places = [*range(_RGB), *[None] * (in_channels - _RGB)]
+    stem.weight = nn.Parameter(select_channels(stem.weight.detach(), places))
+    stem.in_channels = in_channels
+    return network
+
+
+def select_channels(weight: Tensor, places: Sequence[int | None]) -> Tensor:
+    """Return filters for a selection of input channels.
+
+    Args:
+        weight: ``(out, in, h, w)`` filters.
+        places: Index in `weight` of each new channel; None for zeros.
+
+    Returns:
+        ``(out, len(places), h, w)``.
+    """
+    zeros = torch.zeros_like(weight[:, 0])
+    return torch.stack([zeros if k is None else weight[:, k] for k in places], dim=1)
+
+
+class Origins(NamedTuple):
+    """Origin of each tensor of a network.
+
+    Attributes:
+        loaded: Names of tensors loaded unchanged.
+        adapted: Changes of the tensors that were adapted, by name.
+        fresh: Reasons why tensors kept their values, by name.
+        unused: Names in the file that the network does not have.
+        share: Fraction of the network's parameters that come from the file.
+    """
+
+    loaded: tuple[str, ...]
+    adapted: dict[str, str]
+    fresh: dict[str, str]
+    unused: tuple[str, ...]
+    share: float
+
+    def __str__(self) -> str:
+        """Return lines for the terminal."""
+        lines = [f"loaded: {len(self.loaded)} tensors, {self.share:.1%} of the network's numbers"]
+        for kind, reasons in (
+            ("adapted", self.adapted),
+            ("untrained", self.fresh),
+            ("not used", dict.fromkeys(self.unused, "not in the network")),
+        ):
+            lines += [f"{kind}: {len(reasons)}"] * bool(reasons)
+            for reason in dict.fromkeys(reasons.values()):
+                names = [name for name, given in reasons.items() if given == reason]
+                lines.append(f"  {reason}: {', '.join(names)}")
+        return printable("\n".join(lines))
+
+
+def initialize(
+    network: nn.Module,
+    path: Path | str,
+    channels: tuple[Sequence[str], Sequence[str]] | None = None,
+    of_other_classes: Collection[str] = (),
+) -> Origins:
+    """Load matching tensors from a checkpoint, state dict or safetensors file, in place.
+
+    Names are matched by `tensors_for`, even if one of the networks is wrapped in another module
+    (`SphereContext`, `AuxiliaryHead`). Filters of the first convolution for input channels that the
+    file lacks start at zero (paper, supplement, "Level 10 parameters"), so RGB-D starts as RGB.
+    Other tensors with another shape keep their values, e.g. the last layer for other classes.
+
+    Args:
+        network: Network, changed in place.
+        path: File; only tensors and plain values are read.
+        channels: Names of the input channels of the file's network and of this network, by which
+            filters of the first convolution are matched; by default by position.
+        of_other_classes: Names of tensors that keep their values although they have the shape of
+            those in the file, because their scores belong to other classes.
+
+    Raises:
+        DataError: The file cannot be read, or none of its tensors fits.
+    """
+    path = Path(path)
+    current = network.state_dict()
+    found = tensors_for(network, path)
+    convolutions = (name for name, m in network.named_modules() if isinstance(m, nn.Conv2d))
+    stem = f"{next(convolutions, None)}.weight".removeprefix(".")
+    loaded: dict[str, Tensor] = {}
+    adapted: dict[str, str] = {}
+    fresh: dict[str, str] = {}
+    for name, tensor in current.items():
+        given = found.get(name)
+        if given is None:
+            fresh[name] = "not in the file"
+        elif name in of_other_classes and given.shape == tensor.shape:
+            fresh[name] = "of other classes in the file"
+        elif name == stem and given.ndim == 4 and given[:, 0].shape == tensor[:, 0].shape:
+            loaded[name], changes = _by_channel(given, tensor, channels)
+            if changes:
+                adapted[name] = changes
+        elif given.shape == tensor.shape:
+            loaded[name] = given
+        else:
+            fresh[name] = f"{tuple(given.shape)} in the file, {tuple(tensor.shape)} here"
+    if not any(name in loaded for name, _ in network.named_parameters()):
         raise DataError(
-            source,
-            found=error,
-            expected=f"the tensors of {type(network).__name__}",
-            remedy="Are they of the same network with the same settings, its depth for example?",
-        ) from error
+            path,
+            found="no tensor that fits" + (f", but {next(iter(found))}" if found else ""),
+            expected=f"tensors of {type(network).__name__}, {next(iter(current))} for one",
+            remedy="Is it a checkpoint of the same network, with the same settings?",
+        )
+    network.load_state_dict({**current, **loaded})
+    return Origins(
+        loaded=tuple(name for name in loaded if name not in adapted),
+        adapted=adapted,
+        fresh=fresh,
+        unused=tuple(name for name in found if name not in current),
+        share=sum(min(found[name].numel(), t.numel()) for name, t in loaded.items())
+        / sum(t.numel() for t in current.values()),
+    )
+
+
+def _by_channel(
+    given: Tensor, wanted: Tensor, channels: tuple[Sequence[str], Sequence[str]] | None
+) -> tuple[Tensor, str]:
+    """Return filters for the wanted channels, and a description of the change."""
+    before, now = channels or ((), ())
+    if (len(before), len(now)) != (given.shape[1], wanted.shape[1]):
+        before, now = ([f"channel {k}" for k in range(t.shape[1])] for t in (given, wanted))
+    new = ", ".join(name for name in now if name not in before)
+    lost = ", ".join(name for name in before if name not in now)
+    notes = [f"starts at zero: {new}"] * bool(new) + [f"left out: {lost}"] * bool(lost)
+    places = [before.index(name) if name in before else None for name in now]
+    return select_channels(given, places), "; ".join(notes)

@@ -25,10 +25,10 @@ _VIEWS = "tangent_train.rendering.representations"
 """Package whose classes a file may name."""
 
 _FUNCTIONS = (
-    *("models.stem.widen_stem", "timm.models._factory.create_model"),
-    *("models.tables.face_neighbors", "models.tables.gnomonic_points"),
-    *("models.tables.hexagonal_rings", "models.tables.mapped_samples"),
-    *("models.tables.mesh_operators", "models.distortion_aware.make_distortion_aware"),
+    *("models.pretrained.widen_stem", "timm.models._factory.create_model"),
+    *("models.mapped.face_neighbors", "models.mapped.gnomonic_points"),
+    *("models.mapped.hexagonal_rings", "models.mapped.mapped_samples"),
+    *("models.mapped.mesh_operators", "models.distortion_aware.make_distortion_aware"),
 )
 """Functions that a file may name, besides torchvision's functions that build networks."""
 

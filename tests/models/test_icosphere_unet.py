@@ -21,7 +21,7 @@ from models import (
     mesh_operators,
 )
 from models.icosphere_unet import Pooling
-from models.tables import vertex_means, vertex_parents
+from models.mapped import vertex_means, vertex_parents
 from models.unet import Residual
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, rotation_about
@@ -119,8 +119,6 @@ def test_pooled_vertices_are_the_mean_with_their_neighbors() -> None:
 
 
 def test_settings_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(SettingError, match=r"widths: found \(4, 4, 4\); expected at most 2"):
-        IcosphereUNet(3, 4, 1, mesh_operators, (4, 4, 4))
     with pytest.raises(SettingError, match=r"pooling: found max; expected first or mean .* vert"):
         IcosphereUNet(3, 4, 1, mesh_operators, (4, 4), "max")
     with pytest.raises(SettingError, match=r"unpooling: found zeros; expected repeat .* faces"):

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from torch import Tensor, nn
 
-from models.mapped import MappedConv, Table
-from models.tables import mesh_operators
+from models.mapped import MappedConv, Table, mesh_operators
 from tangent_train.geometry import icosphere, vertex_resolution
 from tangent_train.geometry.icosphere import icosphere_directions
 

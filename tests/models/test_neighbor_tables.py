@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from models.mapped import Table
-from models.tables import face_neighbors, gnomonic_points, hexagonal_rings, mapped_samples
+from models.mapped import Table, face_neighbors, gnomonic_points, hexagonal_rings, mapped_samples
 from tangent_train.geometry import icosphere, vertex_resolution
 from tangent_train.geometry.icosphere import icosphere_directions
 from tangent_train.geometry.sphere import gnomonic_points_xyz, tangent_axes

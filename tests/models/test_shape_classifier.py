@@ -29,14 +29,7 @@ def test_scores_are_of_the_mean_over_views_and_positions() -> None:
     torch.testing.assert_close(scores[1], expected, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    ("network", "message"),
-    [
-        (nn.Conv2d(1, 2, 1), r"first convolution of Conv2d: found Conv2d\(1, 2"),
-        (nn.Conv2d(3, 3, 1, groups=3), "first convolution of Conv2d"),
-        (nn.Linear(3, 2), "first convolution of Linear: found none"),
-    ],
-)
-def test_other_first_convolutions_are_refused(network: nn.Module, message: str) -> None:
-    with pytest.raises(SettingError, match=message):
+@pytest.mark.parametrize("network", [nn.Conv2d(4, 2, 1), nn.Conv2d(3, 3, 1, groups=3)])
+def test_other_first_convolutions_are_refused(network: nn.Module) -> None:
+    with pytest.raises(SettingError, match=r"data\.inputs: found Conv2d.* of RGB images"):
         widen_stem(network, 6)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from models import SphereAttention
 from models.sphere_attention import angular_attention
-from models.sphere_context import token_directions
+from models.stages import token_directions
 from tangent_train.geometry import random_rotation
 from tests.models.sphere_networks import awake, sphere_rays
 

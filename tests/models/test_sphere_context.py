@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models import AuxiliaryHead, SphereContext
-from models.sphere_context import token_directions
+from models.stages import token_directions
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, random_rotation
 from tests.models.sphere_networks import (

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from models import AuxiliaryHead, UNet
-from models.auxiliary_head import stage_channels
+from models.stages import stage_channels
 from tests.models.sphere_networks import STAGE, small_unet
 from tests.tasks.odd_networks import Looking
 

@@ -128,7 +128,6 @@ def _pixels() -> torch.Tensor:
     [
         ({"_model_class": "encoders"}, "segmentation_models_pytorch.encoders, which would be"),
         ({"encoder_name": "tu-hf-hub:someone/net"}, "encoder_name='tu-hf-hub"),
-        ({"decoder_channels": [8, 8, 16]}, "expected the tensors of Unet"),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(

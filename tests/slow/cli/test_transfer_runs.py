@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from omegaconf import OmegaConf
 
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
 from tests.cli.tiny_runs import Run
@@ -28,7 +29,7 @@ def test_real_runs_from_photos_to_panoramas(
         torch.load(OF_SEED_0 / name / "checkpoints" / "last.ckpt", weights_only=True)
         for name in ("P", "S-FT-1")
     )
-    assert found["S-FT-1"]["settings"]["optimizer.lr"] == 3e-4
+    assert OmegaConf.load(OF_SEED_0 / "S-FT-1" / "config.yaml").optimizer.lr == 3e-4
     assert tuned["epoch"] == 0
     (optimizer,) = tuned["optimizer_states"]
     assert int(optimizer["state"][0]["step"]) == tuned["global_step"] > 0, "a new optimizer"
