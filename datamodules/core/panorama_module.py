@@ -22,20 +22,17 @@ from tangent_train.geometry.equirect import check_area
 from tangent_train.io.gpano import (
     Fill,
     PanoramaArea,
-    area_of_angles,
     black_outside,
-    check_area_size,
+    check_resolution,
+    read_area,
     read_up,
 )
 from tangent_train.io.masks import Masks
-from tangent_train.io.png import check_panorama_size
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
 from tangent_train.rendering import TangentRepresentation, rotate_equirect
 from tangent_train.rendering.resampling import resize
-
-_PARTIAL = "If all images show the same part, give data.area=[west,east,south,north] in degrees."
 
 Upright = Literal["pose", "auto"] | None
 """Source of the up direction of a panorama."""
@@ -121,10 +118,7 @@ class PanoramaDataModule(ImageDataModule):
 
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: the panorama has enough pixels, in the shape of the area."""
-        if self.canvas.is_whole:
-            check_panorama_size(files.rgb, size, self.erp_height, _PARTIAL)
-        else:
-            check_area_size(files.rgb, size, check_area(self.area), self.canvas)
+        check_resolution(files.rgb, size, self.canvas, self.area)
 
     def finish(self, item: Image, split: Split, index: int) -> Image:
         """See `DataModule`: placed on the sphere, masked, rotated, then aligned with gravity."""
@@ -154,7 +148,8 @@ class PanoramaDataModule(ImageDataModule):
         evidence = judge and partial(judge, image._replace(rgb=rgb))
         if len(rgb) < MOST_ROWS:
             rgb = self.decode(files).rgb
-            whole = area_of_angles((rgb.shape[0], rgb.shape[1]), check_area(self.area)).full_shape
+            size = rgb.shape[0], rgb.shape[1]
+            whole = read_area(files.rgb, size, check_area(self.area)).full_shape
             canvas = PanoramaArea.on_canvas(self.area, min(whole[0], MOST_ROWS))
             rgb = canvas.place(resize(rgb, canvas.image_shape, "bilinear"))
             rgb = rgb if rotation is None else rotate_equirect(rgb, rotation, "bilinear")

@@ -40,7 +40,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.data_module import data_set
 from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles
+from datamodules.core.images import STEPS_PER_M, ImageFiles, meters_to_steps
 from datamodules.core.label_map import LabelMap
 from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.problems import Problems
@@ -50,15 +50,13 @@ from datamodules.stanford2d3ds.files import (
     CLASSES,
     EIGHT,
     FOLDS,
-    MISSING_DEPTH,
     UNKNOWN_CLASS,
 )
 from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
 from tangent_train.errors import DataError, SettingError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
-from tangent_train.io.pixel_files import read_pixels
-from tangent_train.io.png import check_png
+from tangent_train.io.pixel_files import read_depth_m
 
 GET_IT = (
     "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
@@ -271,12 +269,9 @@ def read_depth(path: Path) -> NDArray[np.uint16]:
     """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
-        DataError: The file is broken, or not 16-bit gray.
+        DataError: The file is broken, or holds no depth.
     """
-    check_png(path, 16, ["gray"])
-    steps: NDArray[np.uint16] = read_pixels(path, indices=True)
-    steps[steps == MISSING_DEPTH] = 0
-    return steps
+    return meters_to_steps(read_depth_m(path, STEPS_PER_M))
 
 
 class _PoseRecord(BaseModel):

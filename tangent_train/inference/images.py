@@ -15,10 +15,9 @@ from torch import Tensor
 from datamodules.core.images import meters_to_steps, resize_depth
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.io.gpano import PanoramaArea, read_up, whole_area
+from tangent_train.io.gpano import PanoramaArea, read_area, read_up
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
-from tangent_train.io.tangent_folders import panorama_area
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.rendering.resampling import resize
 
@@ -127,7 +126,7 @@ def read_panorama(
 
     Args:
         image: The panorama; only files have GPano tags.
-        angles: Part of the sphere that it covers, see `area_of_angles`; None to use its GPano tags.
+        angles: Part of the sphere that it covers, see `read_area`; None to use its GPano tags.
         upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
             `with_up` estimates it for ``auto``); None for z.
         depth: Function that returns its depth.
@@ -145,10 +144,7 @@ def read_panorama(
     if upright == "pose" and path is None:
         expected = "the path of a file: images in memory and videos have no GPano tags"
         raise SettingError("upright", found="pose", expected=expected)
-    if path is not None or angles is not None:
-        area = panorama_area(path or _IN_MEMORY, size, angles)
-    else:
-        area = whole_area(_IN_MEMORY, size)
+    area = read_area(path or _IN_MEMORY, size, angles)
     steps = None if depth is None else depth(size)
     up = None if upright is None or path is None else read_up(path)
     placed = None if steps is None else area.place(steps)

@@ -235,7 +235,7 @@ def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refuse
     pycolmap.Reconstruction().write(tmp_path / "empty")
     assert "found none of the panoramas" in refused(poses=tmp_path / "empty", **settings)
     settings["cameras"] = tmp_path
-    assert "rig_config.json: found FileNotFound" in refused(poses=tmp_path / "empty", **settings)
+    assert "rig_config.json: found No such file" in refused(poses=tmp_path / "empty", **settings)
     assert not (tmp_path / "poses.json").exists()
 
 
@@ -247,6 +247,4 @@ def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused:
     write_pixels(tmp_path / "mask.jpg", smooth(16))
     message = refused(mask=tmp_path / "mask.jpg", **settings)
     assert "mask.jpg: found JPEG or WebP, which blur masks" in message
-    write_pixels(panoramas / "hall__room.png", smooth(16))
-    assert "hall/room, which is called hall__room too" in refused(**settings)
     assert not (tmp_path / "out").exists()
