@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from benchmarks.measuring import Alternative, Goal, Table, measure
 from datamodules.core.inputs import Normalization
-from datamodules.core.labels import DISTANCE
+from datamodules.core.label_map import DISTANCE
 from models import HuggingFaceDepthNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import equirect_directions

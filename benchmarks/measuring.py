@@ -132,6 +132,21 @@ def measure(alternatives: Sequence[Alternative], rounds: int) -> list[Row]:
     return rows
 
 
+def expect_agreement(name: str, share: float, least: float) -> None:
+    """Refuse a comparison of different results.
+
+    Args:
+        name: Name of the alternative.
+        share: Share of its results that agree with this project's.
+        least: Least share of a fair comparison.
+
+    Raises:
+        RuntimeError: The share is smaller.
+    """
+    if not share >= least:
+        raise RuntimeError(f"{name}: {share:.2%} of the results agree; expected {least:.2%}")
+
+
 def peak_mib(call: Callable[[], object], device: torch.device = DEVICE) -> float:
     """Return the peak memory in MiB that a call adds on a device; for the CPU, in this process."""
     if device.type == "cuda":

@@ -21,8 +21,7 @@ B. Schiele: "The Cityscapes Dataset for Semantic Urban Scene Understanding", CVP
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 import numpy as np
@@ -30,12 +29,10 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, PositiveFloat
 
 from datamodules.core.data_module import data_set
+from datamodules.core.files import ImageFiles, Split
 from datamodules.core.image_module import PhotoDataModule
-from datamodules.core.images import ImageFiles
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.splits import Split, published_splits
-from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.pixel_files import read_image_size
@@ -68,7 +65,7 @@ def class_maps(label_map: LabelMap) -> dict[str, LabelMap]:
     Args:
         label_map: Label map of the 19 classes.
     """
-    return {"19": label_map, "13": label_map.regrouped(LabelMap.grouped(THIRTEEN, _GROUPS))}
+    return {"19": label_map, "13": label_map.regrouped(THIRTEEN, _GROUPS)}
 
 
 class _Intrinsic(BaseModel):
@@ -95,53 +92,28 @@ class Cityscapes(PhotoDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, _IDS, strict=True)), _UNKNOWN))
     no_depth = "disparities are not read"
+    get_it = _GET_IT
+    test_split = "val"
 
     inputs: Sequence[Input] = ("rgb",)
     fov: Annotated[float, Field(gt=0, lt=180)] | None = None
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
-        published: dict[Split, list[ImageFiles]] = {
-            "train": self._list_images("train"),
-            "val": self._list_images("val"),
-        }
+        published: dict[Split, list[ImageFiles]] = {"train": [], "val": []}
+        for split, found in published.items():
+            for rgb in sorted(self.root.glob(f"leftImg8bit/{split}/*/[!.]*_leftImg8bit.png")):
+                city, stem = rgb.parent.name, rgb.name.removesuffix("_leftImg8bit.png")
+                labels, camera = (
+                    self.root / kind / split / city / f"{stem}_{end}"
+                    for kind, end in (("gtFine", "gtFine_labelIds.png"), ("camera", "camera.json"))
+                )
+                name = f"{city}/{stem.removeprefix(f'{city}_')}"
+                found.append(ImageFiles(name, rgb, labels, None, None if self.fov else camera))
+            every = self.root.glob(f"gtFine/{split}/*/[!.]*_labelIds.png")
+            self.problems.note_strays(every, found)
         self.problems.compare_counts(published, {"train": 2975, "val": 500})
-        return published_splits(published, "val", self.val_fraction, self.seed)
-
-    def _list_images(self, split: Split) -> list[ImageFiles]:
-        """Return the images of a published split, in the order of their names."""
-        found = []
-        for rgb in sorted(self.root.glob(f"leftImg8bit/{split}/*/[!.]*_leftImg8bit.png")):
-            city, stem = rgb.parent.name, rgb.name.removesuffix("_leftImg8bit.png")
-            labels, camera = (
-                self.root / kind / split / city / f"{stem}_{end}"
-                for kind, end in (("gtFine", "gtFine_labelIds.png"), ("camera", "camera.json"))
-            )
-            name = f"{city}/{stem.removeprefix(f'{city}_')}"
-            found.append(ImageFiles(name, rgb, labels, None, None if self.fov else camera))
-        if not found:
-            folder, expected = self.root / "leftImg8bit" / split, "the files of the release"
-            raise DataError(folder, found="no photos", expected=expected, remedy=_GET_IT)
-        every = self.root.glob(f"gtFine/{split}/*/[!.]*_labelIds.png")
-        self.problems.note_strays(every, found)
-        return found
-
-    def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
-        """See `ImageDataModule`; the dummies of the test images are refused."""
-        labels = super().decode_labels(files)
-        if not labels.any():
-            raise DataError(
-                files.labels,
-                found="no pixel with a class",
-                expected="labels of the training or validation images",
-                remedy="Those of the test images are dummies (ids 0 to 3): scores on them come "
-                "from the benchmark's server only.",
-            )
-        return labels
+        return published
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`; u0 and v0 count from the center of the first pixel."""

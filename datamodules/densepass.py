@@ -21,19 +21,17 @@ ITSC 2021.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Annotated
 
 from pydantic import Field
 
 from datamodules.cityscapes import CLASSES, class_maps
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles, Split
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import Split
-from tangent_train.errors import DataError, SettingError
 
 _GET_IT = (
     "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
@@ -55,31 +53,23 @@ class DensePASS(PanoramaDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
+    get_it = _GET_IT
 
     inputs: Sequence[Input] = ("rgb",)
     horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2
 
     def __post_init__(self) -> None:
-        if self.area is not None:
-            expected = "null: horizon_row defines it"
-            raise SettingError("data.area", found=list(self.area), expected=expected)
+        self.refuse("area", self.area is not None, "null: horizon_row defines it")
         south, north = self.horizon_row - _HEIGHT, self.horizon_row
         self.area = (-180, 180, south * 360 / _WIDTH, north * 360 / _WIDTH)
         super().__post_init__()
 
-    def files(self, split: Split) -> list[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        if split != "test":
-            return []
         images, labels = (self.root / kind / "val" / "cs" for kind in ("leftImg8bit", "gtFine"))
         # Two spellings are in circulation: 1_.png and 1.png.
-        found = list(images.glob("[!.]*.png"))
-        paths = {path.stem.removesuffix("_"): path for path in found}
-        if not paths or len(paths) < len(found):
-            text = "panoramas in both spellings" if found else "no panoramas"
-            expected = "1_.png or 1.png, and others"
-            raise DataError(images, found=text, expected=expected, remedy=_GET_IT)
+        paths = {path.stem.removesuffix("_"): path for path in images.glob("[!.]*.png")}
         test = [ImageFiles(n, paths[n], labels / f"{n}{_LABELS}") for n in sorted(paths)]
         self.problems.compare_counts({"test": test}, {"test": 100})
         self.problems.note_strays(labels.glob(f"[!.]*{_LABELS}"), test)
-        return test
+        return {"test": test}

@@ -26,17 +26,15 @@ Y. Zhang: "Matterport3D: Learning from RGB-D Data in Indoor Environments", 3DV 2
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cached_property
+from itertools import chain
 from typing import ClassVar, Literal
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import SPLITS, ImageFiles, Split
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
 from datamodules.tables import read_table
-from tangent_train.errors import DataError, SettingError
 
 _CATEGORIES = read_table("matterport360_classes")
 _SCENES = read_table("matterport360_scenes")
@@ -95,47 +93,36 @@ class Matterport360(PanoramaDataModule):
         "41": LabelMap.of(CATEGORIES[:-1], [0]),
     }
     units_per_m = 4000
+    get_it = _GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
     release: Literal["360fv", "sfss"] = "360fv"
-    test_split: Literal["test", "val"] = "test"
+    test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
 
     def find_label_map(self) -> LabelMap:
         """See `ImageDataModule`; each release has other numbers."""
         possible = ("41",) if self.release == "sfss" else ("20", "360bev")
-        name = str(self.classes or possible[0])
-        if name not in possible:
-            raise SettingError("data.classes", found=name, expected=" or ".join(possible))
-        self.classes = name
-        return self.label_maps[name]
+        self.classes = str(self.classes or possible[0])
+        self.refuse("classes", self.classes not in possible, " or ".join(possible))
+        return self.label_maps[self.classes]
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
-        for split in SPLITS:
+        for split, found in splits.items():
             scenes = [row["scene"] for row in _SCENES if row[self.release] == split]
-            missing = []
-            for scene in scenes:
-                images = self._list_images(scene)
-                splits[split] += images
-                missing += [] if images else [scene]
+            of_scenes = [self._list_images(scene) for scene in scenes]
+            missing = [scene for scene, images in zip(scenes, of_scenes, strict=True) if not images]
+            found.extend(chain.from_iterable(of_scenes))
             if missing:
                 self.problems.warnings.append(
                     f"{len(missing)} of {len(scenes)} scenes of {split} are missing, such as "
                     f"{', '.join(missing[:3])}"
                 )
-        if not any(splits.values()):
-            expected = f"{'/<uuid>.png, <scene>/'.join(_FOLDERS[self.release])}/<uuid>.png"
-            found = f"no panoramas of release={self.release}"
-            raise DataError(self.root, found=found, expected=f"<scene>/{expected}", remedy=_GET_IT)
         if self.release == "360fv":
             self.problems.compare_counts(splits, _PUBLISHED)
-        return published_splits(splits, self.test_split, self.val_fraction, self.seed)
+        return splits
 
     def _list_images(self, scene: str) -> list[ImageFiles]:
         rgb, *folders = (self.root / scene / folder for folder in _FOLDERS[self.release])

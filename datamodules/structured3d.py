@@ -29,21 +29,17 @@ from __future__ import annotations
 import math
 from bisect import bisect
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import SPLITS, ImageFiles, Split
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
 from datamodules.stanford2d3ds.files import EIGHT
-from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_image_size
 
 CLASSES: tuple[str, ...] = (
@@ -86,7 +82,7 @@ class PublishedS3D8(LabelMap):
 
 
 _FORTY = LabelMap.of(CLASSES, [0])
-_EIGHT = _FORTY.regrouped(LabelMap.grouped(EIGHT))
+_EIGHT = _FORTY.regrouped(EIGHT)
 
 
 @data_set
@@ -110,6 +106,7 @@ class Structured3DImages(ImageDataModule):
         "published_s3d8": PublishedS3D8(_EIGHT.names, _EIGHT.labels),
     }
     units_per_m = 1000
+    get_it = _GET_IT
     place: ClassVar[str]
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),
@@ -119,14 +116,10 @@ class Structured3DImages(ImageDataModule):
     configuration: Literal["full", "simple", "empty"] = "full"
     lighting: Literal["rawlight", "warmlight", "coldlight"] = "rawlight"
     invalid_scenes: Literal["keep", "leave_out"] = "keep"
-    test_split: Literal["test", "val"] = "test"
+    test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
         scenes = f"scene_{'[0-9]' * 5}/2D_rendering/*"
         pattern = f"{scenes}/{self.place.format(self.configuration)}/rgb_{self.lighting}.png"
         splits: dict[Split, list[ImageFiles]] = {split: [] for split in SPLITS}
@@ -145,9 +138,6 @@ class Structured3DImages(ImageDataModule):
                 rgb.with_name("camera_pose.txt") if number else None,
             )
             splits[SPLITS[bisect(_FIRST, int(scene)) - 1]].append(files)
-        if not any(splits.values()):
-            found = f"no {self.noun} of {pattern}"
-            raise DataError(self.root, found=found, expected="scene_00000 …", remedy=_GET_IT)
         if invalid:
             self.problems.warnings.append(
                 f"{len(invalid)} {self.noun} of scenes that the errata call invalid: "
@@ -155,7 +145,7 @@ class Structured3DImages(ImageDataModule):
             )
         if isinstance(self, PanoramaDataModule) and self.invalid_scenes == "keep":
             self.problems.compare_counts(splits, _PUBLISHED)
-        return published_splits(splits, self.test_split, self.val_fraction, self.seed)
+        return splits
 
 
 @data_set
@@ -176,11 +166,7 @@ class Structured3DPerspective(Structured3DImages, PhotoDataModule):
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`; the center is in the middle of the photo."""
         path: Any = files.camera
-        try:
-            half_x, half_y = map(float, path.read_text("utf-8").split()[9:11])
-        except (OSError, ValueError) as error:
-            expected = "12 numbers, the 10th and 11th of them half angles of view in radians"
-            raise DataError(path, found=error, expected=expected, remedy=_GET_IT) from error
+        half_x, half_y = map(float, path.read_text("utf-8").split()[9:11])
         height, width = read_image_size(files.rgb)
         x, y = width / 2, height / 2
         fx, fy = x / math.tan(half_x), y / math.tan(half_y)

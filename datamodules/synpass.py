@@ -31,12 +31,10 @@ from pydantic import Field
 
 from datamodules.cityscapes import THIRTEEN
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import SPLITS, ImageFiles, Split
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import SPLITS, Split, published_splits
-from tangent_train.errors import DataError
 
 CLASSES: tuple[str, ...] = (
     *("building", "fence", "other", "pedestrian", "pole", "road line", "road", "sidewalk"),
@@ -68,48 +66,34 @@ class SynPASS(PanoramaDataModule):
 
     Args:
         weather: One or several weathers, or `all`.
-        time: `all`; `day` or `night` keeps the test panoramas that a list of the release names.
+        time: `all`; `day` or `night` keeps the test panoramas that a list of the release names:
+            the lists of the release name points of `val`.
         test_split: Folder of the test panoramas. With `val`, validation uses points drawn from
             the training folder, so that nothing is selected on the test panoramas.
     """
 
     label_maps: ClassVar[Mapping[str, LabelMap]] = {
         "22": _TWENTY_TWO,
-        "13": _TWENTY_TWO.regrouped(LabelMap.grouped(THIRTEEN, _MERGED)),
+        "13": _TWENTY_TWO.regrouped(THIRTEEN, _MERGED),
     }
     no_depth = "SynPASS has no depth images"
+    get_it = _GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)
     weather: Literal["all"] | Weather | Annotated[Sequence[Weather], Field(min_length=1)] = "all"
     time: Literal["all", "day", "night"] = "all"
-    test_split: Literal["val", "test"] = "test"
+    test_split: Literal["test", "val"] = "test"  # type: ignore[misc]
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, Sequence[ImageFiles]]:
-        splits: dict[Split, Sequence[ImageFiles]] = {
-            split: self._list_images(split) for split in SPLITS
-        }
-        if not any(splits.values()):
-            expected = "img/<weather>/<split>/MAP_…_point…/*.jpg"
-            raise DataError(self.root, found="no panoramas", expected=expected, remedy=_GET_IT)
+        splits = {split: self._list_images(split) for split in SPLITS}
         if self.weather == "all":
             self.problems.compare_counts(splits, *_PUBLISHED)
-        splits = published_splits(splits, self.test_split, self.val_fraction, self.seed)
         if self.time != "all":
             named = self._points_of_times.get(self.time, set())
-            splits["test"] = [files for files in splits["test"] if _point(files) in named]
-            if not splits["test"]:
-                raise DataError(
-                    self.root / f"all_map_{self.time}_val.txt",
-                    found=f"no point of {self.test_split}",
-                    expected="names of test points, e.g. MAP_6_point10",
-                    remedy="The lists of the release name points of val: data.test_split=val.",
-                )
+            tested = [files for files in splits[self.test_split] if _point(files) in named]
+            splits[self.test_split] = tested
         return splits
 
     def groups(self, files: ImageFiles) -> list[str]:

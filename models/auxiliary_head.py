@@ -9,8 +9,6 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from tangent_train.errors import SettingError
-
 _SIDE = 256
 """Side of the empty image that is used to find the number of channels."""
 
@@ -24,22 +22,13 @@ def stage_channels(network: nn.Module, stage: str, in_channels: int) -> int:
         network: Network of images ``(B, C, h, w)``.
         stage: Name of a submodule that is run once per image.
         in_channels: Channels C of the images.
-
-    Raises:
-        SettingError: The submodule does not return one feature map.
     """
-    found: list[object] = []
+    found: list[Tensor] = []
     probe = copy.deepcopy(network).eval()
     probe.get_submodule(stage).register_forward_hook(lambda *given: found.append(given[2]))
     with torch.no_grad():
         probe(torch.zeros(1, in_channels, _SIDE, _SIDE))
-    features = found[0] if len(found) == 1 else None
-    if not isinstance(features, Tensor) or features.ndim != 4:
-        raise SettingError(
-            "network.stage",
-            found=f"{stage!r} of {type(network).__name__}",
-            expected="a submodule that is run once and returns one feature map (B, C, h, w)",
-        )
+    (features,) = found
     return features.shape[1]
 
 
@@ -55,9 +44,6 @@ class AuxiliaryHead(nn.Module):
         stage: Name of a submodule, whose result is features ``(B, C', h', w')``.
         in_channels: Channels C of the images.
         num_classes: Classes K.
-
-    Raises:
-        SettingError: The stage does not return one feature map.
     """
 
     def __init__(self, network: nn.Module, stage: str, in_channels: int, num_classes: int) -> None:

@@ -28,7 +28,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
-from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz
+from tangent_train.geometry.sphere import gnomonic_points_xyz
 
 _SAMPLES = 2**24
 """Most samples in memory at a time: taps of output pixels, times channels and images."""

@@ -13,7 +13,6 @@ from torchvision.models import get_model, get_weight
 
 from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from models.stem import widen_stem
-from tangent_train.errors import SettingError
 
 _PUBLISHED = {
     "coco": "FCN_ResNet{}_Weights.COCO_WITH_VOC_LABELS_V1",
@@ -41,7 +40,6 @@ class FCNResNet(nn.Module):
             keeps the statistics of `weights`, and dropout is off.
 
     Raises:
-        SettingError: Other depth, fewer than three channels, or unknown `weights`.
         DataError: The weights cannot be downloaded or read, or do not fit.
     """
 
@@ -54,8 +52,6 @@ class FCNResNet(nn.Module):
         frozen_statistics: bool = False,
     ) -> None:
         super().__init__()
-        if depth not in (50, 101):
-            raise SettingError("network.depth", found=depth, expected="50 or 101")
         untrained = {"weights": None, "weights_backbone": None, "aux_loss": False}
         fcn: Any = get_model(f"fcn_resnet{depth}", num_classes=num_classes, **untrained)
         self.backbone: nn.Module = fcn.backbone
@@ -88,12 +84,8 @@ def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
     """Return the tensors named by `weights`, under their names in the FCN."""
     if weights in _PUBLISHED:
         tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
-    elif Path(weights).is_file():
-        tensors = tensors_for(network, Path(weights))
     else:
-        raise SettingError(
-            "network.weights", found=weights, expected="null, coco, imagenet or an existing file"
-        )
+        tensors = tensors_for(network, Path(weights))
     if "conv1.weight" in tensors:  # state dict of a ResNet classifier
         tensors = {f"backbone.{name}": tensor for name, tensor in tensors.items()}
     return {name: t for name, t in tensors.items() if not name.startswith(_DROPPED)}

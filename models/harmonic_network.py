@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from tangent_train.errors import SettingError, of_extra, width_height
+from models.unet import check_size
+from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
 _Value = bool | int | float | str | None
@@ -79,7 +80,7 @@ class HarmonicNetwork(nn.Module):
         Raises:
             SettingError: The images are not whole equirectangular images of the level.
         """
-        check_shape(images, self.fixed_size)
+        check_size(images, self, size=self.fixed_size)
         with torch.autocast(images.device.type, enabled=False):  # transforms need float32
             scores: Tensor = self.network(images.float())
         return scores
@@ -92,21 +93,6 @@ def _plain_function(operator: Callable[..., Tensor]) -> Callable[..., Tensor]:
         return operator(*arguments)
 
     return call
-
-
-def check_shape(images: Tensor, shape: tuple[int, int]) -> None:
-    """Refuse images that are not whole equirectangular images of a shape ``(H, W)``.
-
-    Raises:
-        SettingError: The images ``(…, h, w)`` have another shape.
-    """
-    if images.shape[-2:] != shape:
-        raise SettingError(
-            "representation",
-            found=f"images of {width_height(images.shape[-2:])}",
-            expected=f"whole equirectangular images of {width_height(shape)}",
-            remedy="Set representation=erp, and network.level to the level of the images.",
-        )
 
 
 def use_pixel_rows(transform: nn.Module) -> None:

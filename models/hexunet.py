@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.unet import check_sides
+from models.unet import check_size
 
 _ENCODERS = (32, 64, 128, 256)
 _DECODERS = ((512, 256), (256, 128), (128, 64), (64, 32))
@@ -79,7 +79,7 @@ class HexUNet(nn.Module):
         Raises:
             SettingError: A side is not a multiple of the network's stride, 16.
         """
-        check_sides(images, self.size_multiple, "HexUNet")
+        check_size(images, self, multiple=self.size_multiple)
         skips = []
         x = images
         for encoder in self.encoders:

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.unet import check_sides
+from models.unet import check_size
 from tangent_train.errors import SettingError, of_extra
 
 _Value = bool | int | float | str | None
@@ -46,17 +46,13 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
         kind: Class of the settings; None or `AutoConfig` to choose it by ``model_type``.
 
     Raises:
-        SettingError: transformers lacks the class, or is missing.
+        SettingError: transformers is missing.
     """
     with of_extra("huggingface", "network"):
         import transformers
 
     if kind in (None, transformers.AutoConfig):
-        name = config.get("model_type")
-        if not isinstance(name, str) or name not in transformers.CONFIG_MAPPING:
-            found, expected = name or "none", "a kind of network that transformers has"
-            raise SettingError("network.config.model_type", found=found, expected=expected)
-        kind = transformers.CONFIG_MAPPING[name]
+        kind = transformers.CONFIG_MAPPING[config["model_type"]]
     # Settings that all networks share are about labels, results, and how a file was written.
     of_all = signature(transformers.PreTrainedConfig).parameters.keys()
     declared = signature(kind).parameters.keys() - of_all
@@ -145,7 +141,7 @@ class _TransformersNetwork(nn.Module):
         """
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
-        check_sides(images, self.size_multiple, type(self.network).__name__)
+        check_size(images, self.network, multiple=self.size_multiple)
         return images
 
 

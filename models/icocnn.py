@@ -14,9 +14,8 @@ from torch import Tensor, nn
 from torch.nn.functional import conv2d, linear
 
 from models.icosphere_unet import levels_of
-from models.unet import Convolution, ResidualUNet
-from tangent_train.geometry.icosphere import icosphere
-from tangent_train.geometry.icosphere_signals import check_signal, icosphere_count
+from models.unet import Convolution, ResidualUNet, check_size
+from tangent_train.geometry.icosphere import icosphere, icosphere_count
 
 _CORNERS = 12
 """The vertices with five neighbors: those of the icosahedron, the first ones at every level."""
@@ -300,5 +299,5 @@ class IcoCNN(ResidualUNet):
         Raises:
             SettingError: The images are not signals on the vertices of the network's level.
         """
-        check_signal(images.shape, self.fixed_size[1])
+        check_size(images, self, size=self.fixed_size)
         return super().forward(images)

@@ -13,7 +13,7 @@ from models.mapped import MappedConv, Table, collect
 from models.tables import vertex_means, vertex_parents
 from models.unet import ResidualUNet
 from tangent_train.errors import SettingError
-from tangent_train.geometry.icosphere_signals import IcosphereElements
+from tangent_train.geometry.icosphere import IcosphereElements
 
 Pooling = Literal["first", "mean", "max"]
 Unpooling = Literal["zeros", "ones", "mean", "repeat"]
@@ -63,14 +63,10 @@ def levels_of(widths: Sequence[int], level: int) -> range:
         level: Level of the finest icosphere.
 
     Raises:
-        SettingError: There are no widths, or more of them than levels.
+        SettingError: There are more widths than levels.
     """
-    if not 0 < len(widths) <= level + 1:
-        raise SettingError(
-            "network.widths",
-            found=f"{len(widths)} widths at level {level}",
-            expected=f"1 to {level + 1}, one per level down to 0",
-        )
+    if len(widths) > level + 1:
+        raise SettingError("network.widths", found=widths, expected=f"at most {level + 1}")
     return range(level, level - len(widths), -1)
 
 
@@ -96,8 +92,8 @@ class IcosphereUNet(ResidualUNet):
         normalized_ups: True to normalize and rectify after that convolution.
 
     Raises:
-        SettingError: The number of widths does not fit the level, or a kind of pooling does not fit
-            the positions of the table.
+        SettingError: There are more widths than levels, or a kind of pooling does not fit the
+            positions of the table.
 
     Example:
         >>> from models import mesh_operators

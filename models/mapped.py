@@ -14,7 +14,7 @@ from scipy import sparse
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.geometry.icosphere_signals import check_signal
+from models.unet import check_size
 
 
 class _Bags(NamedTuple):
@@ -149,11 +149,7 @@ def collect(
 
     Returns:
         ``(batch, V_out, K · channels)``; value k of channel c is number k · channels + c.
-
-    Raises:
-        SettingError: The signals are images, or have another number of positions.
     """
-    check_signal(signals.shape, table.inputs)
     rows = signals[:, :, 0].transpose(1, 2)
     rows = rows.to(torch.promote_types(rows.dtype, torch.float32))
     if torch.compiler.is_exporting():  # no format of networks has a sparse product
@@ -195,6 +191,7 @@ class MappedConv(nn.Module):
         Raises:
             SettingError: The signals are images, or have another number of positions.
         """
+        check_size(signals, self, size=self.fixed_size)
         weight = self.weight.transpose(1, 2).flatten(1)
         values = functional.linear(collect(signals, self.table), weight, self.bias)
         return values.transpose(1, 2).unsqueeze(2)

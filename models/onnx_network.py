@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -38,17 +36,14 @@ class OnnxNetwork(nn.Module):
         fixed_size: Fixed rows and columns of images; None for a side of any length.
 
     Raises:
-        DataError: The file is missing, has other inputs or outputs, or needs other files.
+        DataError: The file is missing, or has other inputs or outputs.
         SettingError: onnxruntime is missing.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__()
         self.path = path
-        if not path.is_file():
-            raise DataError(path, found="no such file", expected="an ONNX file")
         with of_extra("export", path):
-            import onnx
             import onnxruntime
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = torch.get_num_threads()
@@ -58,31 +53,17 @@ class OnnxNetwork(nn.Module):
         usable = ["CPUExecutionProvider", *["CUDAExecutionProvider"] * torch.cuda.is_available()]
         providers = [name for name in onnxruntime.get_available_providers() if name in usable]
         try:
-            # Both read the file equally, regardless of its name and first bytes.
-            graph = onnx.load(path, format="protobuf", load_external_data=False)
             options.add_session_config_entry("session.load_model_format", "ONNX")
-            if not any(tensor.data_location for tensor in _tensors(graph)):
-                self._session = onnxruntime.InferenceSession(path, options, providers=providers)
+            self._session = onnxruntime.InferenceSession(path, options, providers=providers)
         except Exception as error:  # the parser of protocol buffers raises many kinds of errors
             found = f"an unreadable file ({str(error).partition(chr(10))[0]})"
             raise DataError(path, found=found, expected="an ONNX file") from error
-        if not hasattr(self, "_session"):
-            raise DataError(
-                path,
-                found="tensors in other files",
-                expected="a self-contained network",
-                remedy="Save it with its weights in the file.",
-            )
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
-        if [len(i.shape) for i in inputs] != [4] or len(outputs) != 1:
-            raise DataError(
-                path,
-                found=f"inputs {[i.name for i in inputs]}, outputs {[o.name for o in outputs]}",
-                expected="images (B, C, h, w) as the only input, scores as the only output",
-            )
+        if [(len(i.shape), i.type in _TYPES) for i in inputs] != [(4, True)] or len(outputs) != 1:
+            found = ", ".join(f"{one.name} {one.type} {one.shape}" for one in [*inputs, *outputs])
+            expected = f"one input (B, C, h, w) of {' or '.join(_TYPES)}, and one output"
+            raise DataError(path, found=found, expected=expected)
         self._input = inputs[0]
-        if (kind := self._input.type) not in _TYPES:
-            raise DataError(path, found=f"images as {kind}", expected=" or ".join(_TYPES))
         shape = self._input.shape
         self._channels_last = shape[3] == _COLORS and shape[1] != _COLORS
         self._batch = shape[0] if isinstance(shape[0], int) else None
@@ -95,7 +76,7 @@ class OnnxNetwork(nn.Module):
         """Return scores ``(B, K, h, w)`` of every pixel as float32, label maps with K = 1.
 
         Raises:
-            SettingError: The file takes images of another shape, or returns another output.
+            SettingError: The file returns another output.
         """
         array = images.movedim(1, -1) if self._channels_last else images
         array = array.detach().to("cpu", _TYPES[self._input.type])
@@ -109,15 +90,7 @@ class OnnxNetwork(nn.Module):
         if missing:
             part = torch.cat([part, part[-1:].expand(missing, -1, -1, -1)])
         whole = part.contiguous().numpy()
-        try:
-            (returned,) = self._session.run(None, {self._input.name: whole})
-        except Exception as error:
-            raise SettingError(
-                f"images for {self.path.name}",
-                found="×".join(map(str, images.shape)),
-                expected="×".join(map(str, self._input.shape)),
-                remedy=f"Message of onnxruntime: {str(error).partition(chr(10))[0]}",
-            ) from error
+        (returned,) = self._session.run(None, {self._input.name: whole})
         size = (images.shape[2], images.shape[3])
         count = len(whole) - missing
         output = torch.from_numpy(returned)
@@ -162,14 +135,3 @@ def _channels_first(returned: Tensor, size: tuple[int, int], last: bool) -> Tens
         return None
     axis = (-1 if last else 1) if len(fitting) > 1 else fitting[0]
     return returned.movedim(axis, 1)
-
-
-def _tensors(message: Any) -> Iterator[Any]:
-    """Return all tensors in a message, including nested messages."""
-    for field, value in message.ListFields():
-        if field.message_type is not None:
-            for inner in value if hasattr(value, "__len__") else [value]:
-                if field.message_type.name == "TensorProto":
-                    yield inner
-                else:
-                    yield from _tensors(inner)

@@ -20,9 +20,6 @@ from tangent_train.files import load_plain
 _PREFIX = "network."
 """Prefix of the network's tensors in checkpoints of this package."""
 
-_DEEPEST = 8
-"""Depth to which nested mappings in a file are searched."""
-
 _COUNTER = "num_batches_tracked"
 """Buffer of batch normalization that older files lack and this package does not use."""
 
@@ -80,7 +77,7 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
             raise DataError(path, found=found, expected=expected) from error
     else:
         content = load_plain(path, expected)
-    mappings = _mappings(content, set()) if isinstance(content, Mapping) else {}
+    mappings = _mappings(content) if isinstance(content, Mapping) else {}
     if not mappings:
         raise DataError(path, found="no named tensors", expected=expected)
     whole = mappings.get("state_dict", {})
@@ -88,11 +85,8 @@ def read_tensors(path: Path) -> dict[str, dict[str, Tensor]]:
     return mappings | ({"state_dict": prefixed} if prefixed else {})
 
 
-def _mappings(
-    content: Mapping[Any, Any], seen: set[int], depth: int = 0
-) -> dict[str, dict[str, Tensor]]:
-    """Return the mappings with tensors in a mapping, without duplicates; "" is itself."""
-    seen.add(id(content))
+def _mappings(content: Mapping[Any, Any]) -> dict[str, dict[str, Tensor]]:
+    """Return the mappings with tensors in a mapping; "" is itself."""
     tensors: dict[str, Tensor] = {}
     inside: dict[str, dict[str, Tensor]] = {}
     for name, value in content.items():
@@ -100,8 +94,8 @@ def _mappings(
             continue
         if isinstance(value, Tensor):
             tensors[name] = value
-        elif isinstance(value, Mapping) and id(value) not in seen and depth < _DEEPEST:
-            found = _mappings(value, seen, depth + 1)
+        elif isinstance(value, Mapping):
+            found = _mappings(value)
             inside |= {f"{name}.{place}".rstrip("."): within for place, within in found.items()}
             tensors |= {f"{name}.{inner}": tensor for inner, tensor in found.get("", {}).items()}
     return ({"": tensors} if tensors else {}) | inside

@@ -9,8 +9,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tangent_train.errors import SettingError
-
 _KAPPAS = (0.1, 30.0)
 """Initial concentrations, from heads that see the whole sphere to heads that see about 15°."""
 
@@ -33,10 +31,7 @@ class SphereAttention(nn.Module):
     Args:
         channels: Channels C of the tokens.
         heads: Number of attention heads.
-        width: Channels of queries, keys and values, summed over the heads.
-
-    Raises:
-        SettingError: `width` is not a positive multiple of `heads`.
+        width: Channels of queries, keys and values, summed over the heads; a multiple of `heads`.
 
     Example:
         >>> mixer = SphereAttention(channels=16, heads=2)
@@ -46,12 +41,6 @@ class SphereAttention(nn.Module):
 
     def __init__(self, channels: int, heads: int = 8, width: int = 128) -> None:
         super().__init__()
-        if heads < 1 or width < 1 or width % heads:
-            raise SettingError(
-                "heads and width of SphereAttention",
-                found=f"{heads} and {width}",
-                expected="a positive number and a multiple of it",
-            )
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
         self.queries_keys_values = nn.Linear(channels, 3 * width)

@@ -14,7 +14,6 @@ from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
 
 from models.auxiliary_head import stage_channels
-from tangent_train.errors import SettingError, at_least
 
 
 class _ReachedError(Exception):
@@ -38,9 +37,6 @@ class SphereContext(nn.Module):
             n images on each of S spheres to the residual of the tokens.
         in_channels: Channels C of the images.
         tokens: Maximum rows and columns of tokens per image.
-
-    Raises:
-        SettingError: `tokens` is 0, or the stage is unknown (the message lists the stages).
     """
 
     def __init__(
@@ -52,7 +48,6 @@ class SphereContext(nn.Module):
         tokens: int = 4,
     ) -> None:
         super().__init__()
-        at_least("network.tokens", tokens, 1)
         self.network = network
         self.mixer = mixer(channels=stage_channels(network, stage, in_channels))
         self.tokens = tokens
@@ -78,18 +73,9 @@ class SphereContext(nn.Module):
                 context and the gradients are the same. Each chunk runs up to the stage, then as a
                 whole, and both again in the backward pass, which takes about twice the time. Batch
                 normalization sees one chunk at a time. None for all images at once.
-
-        Raises:
-            SettingError: The numbers of rays and images differ.
         """
         if rays is None:
             return self.network(images)
-        if rays.shape[0] * rays.shape[1] != images.shape[0]:
-            raise SettingError(
-                "rays",
-                found=f"{rays.shape[0]} spheres of {rays.shape[1]} images",
-                expected=f"spheres of {images.shape[0]} images together",
-            )
         if view_batch_size is None or view_batch_size >= images.shape[0]:
             return self._run(images, lambda x: _add(x, self.mix(rays, self._pooled(x))))
         return self._in_chunks(images, rays, view_batch_size)
@@ -101,10 +87,8 @@ class SphereContext(nn.Module):
         try:
             self._run(images, _stop)
         except _ReachedError as reached:
-            return self._pooled(reached.args[0])
-        raise SettingError(
-            "network.stage", found="one that was not run", expected="one that every image passes"
-        )
+            tokens = self._pooled(reached.args[0])
+        return tokens
 
     def mix(
         self,

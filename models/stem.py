@@ -26,10 +26,8 @@ def widen_stem(network: nn.Module, in_channels: int) -> nn.Module:
         The network, changed in place.
 
     Raises:
-        SettingError: Fewer than three channels, or the first convolution takes another number.
+        SettingError: The first convolution does not take three channels.
     """
-    if in_channels < _RGB:
-        raise SettingError("network.in_channels", found=in_channels, expected="3 or more")
     convolutions = (module for module in network.modules() if isinstance(module, nn.Conv2d))
     stem = next(convolutions, None)
     if stem is None or stem.in_channels != _RGB or stem.groups != 1:

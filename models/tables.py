@@ -10,8 +10,8 @@ from scipy import sparse
 
 from models.mapped import Table
 from tangent_train.geometry import icosphere, vertex_resolution
-from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz, tangent_axes
-from tangent_train.geometry.icosphere_signals import icosphere_directions, locate
+from tangent_train.geometry.icosphere import icosphere_directions, locate
+from tangent_train.geometry.sphere import gnomonic_points_xyz, tangent_axes
 
 
 @cache

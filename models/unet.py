@@ -182,35 +182,40 @@ class UNet(ResidualUNet):
         Raises:
             SettingError: A side is not a multiple of the network's stride (32 by default).
         """
-        check_sides(images, self.size_multiple, "UNet")
+        check_size(images, self, multiple=self.size_multiple)
         return super().forward(images)
 
 
-def check_sides(images: Tensor, stride: int, network: str) -> None:
-    """Refuse images whose sides are not multiples of the network's stride.
+def check_size(
+    images: Tensor,
+    network: nn.Module,
+    *,
+    multiple: int = 1,
+    size: tuple[int, int] | None = None,
+) -> None:
+    """Refuse images of a size that a network cannot take.
 
     Args:
-        images: ``(B, C, h, w)``.
-        stride: Pixels of the image per pixel of the coarsest features.
-        network: Name of the network.
+        images: ``(…, h, w)``.
+        network: Network, for the message.
+        multiple: Number of which both sides have to be multiples: the network's stride.
+        size: Rows and columns that the images must have; None for any.
 
     Raises:
-        SettingError: A side is not a multiple.
+        SettingError: The images have another size.
     """
-    height, width = images.shape[-2:]
-    if height % stride or width % stride:
+    found = images.shape[-2], images.shape[-1]
+    if found == size or (size is None and not any(side % multiple for side in found)):
+        return
+    if size is None:
+        expected = f"sides that are multiples of {multiple}"
         remedy = (
-            f"Set representation.crop_multiple={stride}, or choose another representation.dim, "
-            "level or network."
+            f"Set representation.crop_multiple={multiple}, or choose another representation.dim, "
+            "level or network. Signals on an icosphere need a network such as network=ugscnn."
         )
-        if height == 1:  # a signal on an icosphere
-            remedy = (
-                "Choose a network for signals on an icosphere, such as network=ugscnn, or a "
-                "representation of images, such as representation=tangent."
-            )
-        raise SettingError(
-            f"image size for the {network}",
-            found=width_height((height, width)),
-            expected=f"sides that are multiples of {stride}",
-            remedy=remedy,
-        )
+    else:
+        expected = width_height(size)
+        kind = "icosphere, with its elements" if size[0] == 1 else "erp"
+        remedy = f"Set representation={kind}, and network.level to the level of the images."
+    subject = f"image size for the {type(network).__name__}"
+    raise SettingError(subject, found=width_height(found), expected=expected, remedy=remedy)

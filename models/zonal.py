@@ -11,7 +11,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from models.harmonic_network import check_shape, pixel_row_weights, use_pixel_rows
+from models.harmonic_network import pixel_row_weights, use_pixel_rows
+from models.unet import check_size
 from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
@@ -124,7 +125,7 @@ class ZonalClassifier(nn.Module):
         Raises:
             SettingError: The images are not whole equirectangular images of the level.
         """
-        check_shape(images, self.shape)
+        check_size(images, self, size=self.shape)
         flat = images.flatten(0, 1)
         features = [flat[:, branch] for branch in self.branches]
         layers: Any = self.layers

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.generate import RoomSettings, generate_rooms
+from datamodules.synthrooms.datamodule import RoomSettings, generate_rooms
 from studies.output import Row, save
 from tangent_train.geometry import TangentGrid, lonlat_to_equirect
 from tangent_train.inference.views import images_of_side, wide_levels

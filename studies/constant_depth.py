@@ -13,7 +13,7 @@ import torch
 from hydra import compose, initialize_config_dir
 from numpy.typing import NDArray
 
-from datamodules.core.images import STEPS_PER_M
+from datamodules.core.depth import STEPS_PER_M
 from tangent_train.cli.run import build_data, build_head
 from tangent_train.config.settings import config_name, validate
 from tangent_train.files import config_folder
@@ -41,13 +41,13 @@ def main() -> None:
     settings = validate("train", config)
     data = build_data(settings)
     data.make_files()
-    train, test, view = data.dataset("train"), data.dataset("test"), data.representation
-    targets = [train.read(index).target(view).astype(np.int32) for index in range(len(train))]
+    train, test = data.dataset("train"), data.dataset("test")
+    targets = [train.read(index).labels.astype(np.int32) for index in range(len(train))]
     head = build_head(settings, data)
     for name, meters in constants(np.stack(targets)).items():
         metric = head.build_metric()
         for index in range(len(test)):
-            truth = head.truth(torch.from_numpy(test.read(index).target(view).astype(np.int32)))
+            truth = head.truth(test[index].labels)
             guess = torch.from_numpy(meters).float().expand(truth.shape)
             metric.update(head.comparable(guess, truth), truth)
         result = evaluation_result(head, metric.compute(), data.noun, len(test))

@@ -25,7 +25,7 @@ from tangent_train.geometry import (
     icosphere,
     random_rotation,
 )
-from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.geometry.icosphere import icosphere_directions
 from tangent_train.rendering import IcosphereRepresentation, rotate_equirect
 from tangent_train.rendering.mosaic import ScoreMosaic
 

@@ -3,15 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from difflib import get_close_matches
+from itertools import takewhile
 from numbers import Integral
+from typing import Any
 
 _LONGEST = 400
 """Largest number of characters of the value found, which may come from a file."""
 
 _CONTROL = re.compile(r"[^\n\t -~\xa0-\U0010ffff]")
 """Characters that terminals interpret as commands."""
+
+
+_UNKNOWN = "a known setting"
+_EXPECTED = {
+    "extra_forbidden": _UNKNOWN,
+    "unexpected_keyword_argument": _UNKNOWN,
+    "path_not_file": "an existing file",
+    "path_not_directory": "an existing folder",
+}
+"""Texts for errors of pydantic whose messages name no value."""
 
 
 def printable(text: str) -> str:
@@ -84,6 +97,47 @@ class SettingError(_ExplainedError):
 
 class DataError(_ExplainedError):
     """A file or folder that cannot be used."""
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """Return a remedy that names the most similar of the known names, or nothing.
+
+    >>> nearest("levl", ["level", "seed"])
+    'Did you mean level?'
+    """
+    return "".join(f"Did you mean {similar}?" for similar in get_close_matches(name, known, 1))
+
+
+def wrong_setting(error: Any, known: Mapping[str, str], prefix: str = "") -> SettingError:
+    """Return the first error of a validation; errors of a setting's alternatives are joined.
+
+    Args:
+        error: pydantic's ValidationError.
+        known: Comments of the known settings by name.
+        prefix: Prefix of the setting's name in the message.
+    """
+    first = error.errors()[0]
+    same = [one for one in error.errors() if one["loc"][:1] == first["loc"][:1]]
+    parts = zip(*(one["loc"] for one in same), strict=False)
+    common = takewhile(lambda part: len({*part}) == 1 and isinstance(part[0], str), parts)
+    name = ".".join(part[0] for part in common)
+    if first["type"].startswith("missing"):
+        return SettingError(prefix + name, found="nothing", expected=known.get(name, "a value"))
+    texts = (_EXPECTED.get(one["type"]) or one.get("ctx", {}).get("error") for one in same)
+    messages = (re.sub("^Input should be |, unable to .*", "", one["msg"]) for one in same)
+    expected = dict.fromkeys(str(text or m) for text, m in zip(texts, messages, strict=True))
+    return SettingError(
+        prefix + name,
+        found="null" if first["input"] is None else first["input"],
+        expected=" or ".join(expected),
+        remedy=nearest(name, known) if _UNKNOWN in expected else "",
+    )
+
+
+def wrong_field(error: Any) -> str:
+    """Return the first error of a validation of a file's content, for a message."""
+    wrong = wrong_setting(error, {})
+    return f"{wrong.subject}={wrong.found}, not {wrong.expected}"
 
 
 def at_least(name: str, value: object, least: int) -> int:

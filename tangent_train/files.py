@@ -11,11 +11,11 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, Annotated, Any
+from typing import IO, Any
 
-from pydantic import AfterValidator, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
-from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.errors import DataError, SettingError, wrong_field
 
 
 @contextmanager
@@ -68,10 +68,8 @@ def _sync(path: Path) -> None:
     if path.is_dir() and os.name == "nt":  # folders cannot be opened there
         return
     handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    os.fsync(handle)
+    os.close(handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -97,74 +95,17 @@ def load_plain(path: Path, expected: str, *, mmap: bool = False) -> Any:
     Raises:
         DataError: The file is missing, damaged, or contains other objects.
     """
-    if not path.exists():
-        raise DataError(path, found="no such file", expected=expected)
     import torch
 
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
+        return torch.load(path, map_location="cpu", weights_only=True, mmap=mmap)
     except Exception as error:
+        is_read = not isinstance(error, OSError)
+        found, remedy = "a damaged file, or not a file of torch.save" if is_read else error, ""
         if named := re.search(r"GLOBAL (\S+)", str(error)):
             found = f"{named[1]}, a class"
             remedy = "Save only its state_dict(): reading objects can run arbitrary code."
-        else:
-            found = "a damaged file, or not a file of torch.save"
-            remedy = ""
         raise DataError(path, found=found, expected=expected, remedy=remedy) from error
-    return content
-
-
-def is_text(value: Any) -> bool:
-    """Return True for one line of text without control characters, such as a class name."""
-    return isinstance(value, str) and "\n" not in value and printable(value) == value
-
-
-def is_class_name(value: Any) -> bool:
-    """Return True for a text that can be written as UTF-8; names of files may not."""
-    return is_text(value) and not any("\ud800" <= letter <= "\udfff" for letter in value)
-
-
-def _one_line(text: str) -> str:
-    if not is_text(text):
-        raise ValueError("one line of text")
-    return text
-
-
-Text = Annotated[str, AfterValidator(_one_line)]
-"""Kind of a field in a file: one line of text without control characters."""
-
-
-def check_fields(
-    path: Path, content: Any, kinds: Mapping[str, Any], expected: str, where: str = ""
-) -> dict[str, Any]:
-    """Return the fields of a mapping in a file, each of its kind.
-
-    Args:
-        path: File, for the message.
-        content: Content of the file.
-        kinds: Type of each field; a union with None if the field may be missing.
-        expected: Expected file, for the message.
-        where: Place in the file, for the message.
-
-    Returns:
-        Values of the fields; None for missing ones.
-
-    Raises:
-        DataError: The content is not a mapping, or a field is missing or of another type.
-    """
-    inside = f"in {where}" if where else "inside"
-    if not isinstance(content, Mapping):
-        found = f"{type(content).__name__} instead of a mapping {inside}"
-        raise DataError(path, found=found, expected=expected)
-    fields = {}
-    for name, kind in kinds.items():
-        value = content.get(name)
-        try:
-            fields[name] = TypeAdapter(kind).validate_python(value, strict=True)
-        except ValidationError as error:
-            found = f"no {name} {inside}" if value is None else f"{name}={value!r} {inside}"
-            raise DataError(path, found=found, expected=expected) from error
-    return fields
 
 
 def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> Any:
@@ -179,17 +120,12 @@ def read_json(path: Path, expected: str, remedy: str = "", kind: Any = None) -> 
     Raises:
         DataError: The file cannot be read, is not JSON or has other content.
     """
-    from pydantic import TypeAdapter, ValidationError  # slow to import
-
     try:
         content = json.loads(path.read_bytes())
         return content if kind is None else TypeAdapter(kind).validate_python(content)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        found = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
-        raise DataError(path, found=found, expected=expected, remedy=remedy) from error
     except (OSError, ValueError, RecursionError) as error:
-        raise DataError(path, found=error, expected=expected, remedy=remedy) from error
+        found = wrong_field(error) if isinstance(error, ValidationError) else error
+        raise DataError(path, found=found, expected=expected, remedy=remedy) from error
 
 
 _FORMULA = ("=", "+", "-", "@", "\t", "\r")

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib import import_module
 from pathlib import Path
-from typing import Any
+from unittest.mock import patch
 
 
 def check_own_packages() -> None:
@@ -36,22 +36,16 @@ def offline() -> Iterator[None]:
     except ImportError:  # no library downloads with it either
         yield
         return
-    hub: Any = constants
-    before = hub.HF_HUB_OFFLINE
-    hub.HF_HUB_OFFLINE = True  # the environment variable is read only at import
-    try:
+    with patch.object(constants, "HF_HUB_OFFLINE", new=True):  # its variable is read at import
         yield
-    finally:
-        hub.HF_HUB_OFFLINE = before
 
 
 @contextmanager
 def hide_output() -> Iterator[None]:
     """Hide log records, warnings and printed lines in a block whose results are verified."""
-    disabled = logging.root.manager.disable
+    disabled, silent = logging.root.manager.disable, io.StringIO()
     logging.disable()
     try:
-        silent = io.StringIO()
         with warnings.catch_warnings(), redirect_stdout(silent), redirect_stderr(silent):
             warnings.simplefilter("ignore")
             yield

@@ -2,7 +2,7 @@
 
 Every command that writes many files opens the manifest of its folder first. A folder with the same
 settings is continued with what is missing; a folder with others is refused, and nothing is written,
-unless nothing in it is finished.
+unless nothing in it is finished and no other process shares it.
 Shards of one work (`items[i::n]`) share the folder and its settings.
 
 A folder holds ``manifest.json``, and for each shard a file ``finished*.jsonl`` with a line for each
@@ -17,18 +17,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 from tangent_train.errors import SettingError
-from tangent_train.files import write_text
 
 MANIFEST = "manifest.json"
 
 _Item = TypeVar("_Item")
 
 
-@dataclass(frozen=True)
-class Shard:
+class Shard(NamedTuple):
     """One of several parts of a list: ``items[number - 1 :: count]``.
 
     Attributes:
@@ -49,14 +47,12 @@ class Shard:
         >>> Shard.parse("3/16")
         Shard(number=3, count=16)
         """
-        if setting is None:
-            return cls()
-        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting), re.ASCII)
-        number, count = map(int, match.groups()) if match else (0, 0)
-        if not 1 <= number <= count:
+        match = re.fullmatch(r"(\d{1,9})/(\d{1,9})", str(setting or "1/1"), re.ASCII)
+        shard = cls(*map(int, match.groups())) if match else cls(0)
+        if not 1 <= shard.number <= shard.count:
             expected = "number/count, such as 1/16 to 16/16, or null"
             raise SettingError("shard", found=setting, expected=expected)
-        return cls(number, count)
+        return shard
 
     def __str__(self) -> str:
         return f"{self.number}/{self.count}"
@@ -85,13 +81,22 @@ class Manifest:
     _shard: Shard = field(default_factory=Shard)
 
     @classmethod
-    def open(cls, folder: Path, settings: Mapping[str, Any], shard: Shard | None = None) -> Self:
+    def open(
+        cls,
+        folder: Path,
+        settings: Mapping[str, Any],
+        shard: Shard | None = None,
+        *,
+        is_shared: bool = False,
+    ) -> Self:
         """Create an output folder, or continue one that was written with the same settings.
 
         Args:
             folder: Output folder: new, empty, begun with the same settings, or nothing is finished.
             settings: Settings that decide the content, plain values; paths as text.
             shard: Part of the work that this process does; None for all of it.
+            is_shared: True if several processes may begin at once, as shards do: the first one
+                decides the settings.
 
         Raises:
             SettingError: The folder holds other files, or items finished with other settings.
@@ -100,33 +105,29 @@ class Manifest:
         wanted = json.loads(json.dumps(settings))  # tuples become lists, as in the file
         others = folder.iterdir() if folder.exists() and not path.is_file() else ()
         if any(other.name[0] != "." for other in others):
-            raise SettingError(
-                "output",
-                found=f"{folder}, which holds other files",
-                expected="a new or empty folder, or one that this command began",
-                remedy="Choose another folder.",
-            )
+            expected = "a new or empty folder, or one that this command began"
+            found = f"{folder}, which holds other files"
+            raise SettingError("output", found=found, expected=expected)
         finished: dict[str, dict[str, Any]] = {}
         for file in sorted(folder.glob("finished*.jsonl")):
-            finished |= _read_lines(file)
-        if finished:
-            cls._check_same(path, wanted)
-        else:
-            write_text(path, json.dumps(wanted, indent=1) + "\n")
-        return cls(folder, finished, shard or Shard())
-
-    @staticmethod
-    def _check_same(path: Path, wanted: Mapping[str, Any]) -> None:
-        """Refuse a folder that was begun with other settings."""
+            for line in file.read_text("utf-8").splitlines():
+                with suppress(ValueError):  # a line that was cut off by a kill
+                    entry = json.loads(line)
+                    finished[entry.pop("item")] = entry
+        shard = shard or Shard()
+        if not (finished or is_shared or shard.count > 1):
+            path.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        with suppress(FileExistsError), path.open("x", encoding="utf-8") as new:
+            new.write(json.dumps(wanted, indent=1) + "\n")
         before = json.loads(path.read_bytes())
         for name in sorted(before.keys() | wanted.keys()):
-            if before.get(name) != wanted.get(name):
-                raise SettingError(
-                    name,
-                    found=_shown(wanted.get(name)),
-                    expected=f"{_shown(before.get(name))}, with which {path.parent} was written",
-                    remedy="Choose another output, or delete this one to write it again.",
-                )
+            found, old = ("null" if s.get(name) is None else s[name] for s in (wanted, before))
+            if found != old:
+                remedy = "Choose another output, or delete this one to write it again."
+                expected = f"{old}, with which {folder} was written"
+                raise SettingError(name, found=found, expected=expected, remedy=remedy)
+        return cls(folder, finished, shard)
 
     def missing(self, names: Iterable[str]) -> list[str]:
         """Return the names of items that are not finished, in their order."""
@@ -144,17 +145,3 @@ class Manifest:
         suffix = "" if shard.count == 1 else f"-{shard.number}-of-{shard.count}"
         with (self.folder / f"finished{suffix}.jsonl").open("a", encoding="utf-8") as file:
             file.write(json.dumps({"item": name, **entry}) + "\n")
-
-
-def _shown(value: Any) -> str:
-    return "null" if value is None else str(value)
-
-
-def _read_lines(path: Path) -> dict[str, dict[str, Any]]:
-    """Return the entries of a file; a line that was cut off by a kill is ignored."""
-    entries = {}
-    for line in path.read_text("utf-8").splitlines():
-        with suppress(ValueError):
-            entry = json.loads(line)
-            entries[entry.pop("item")] = entry
-    return entries

@@ -8,14 +8,7 @@ from datetime import timedelta
 from typing import Any
 
 from rich import get_console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, Progress, TaskID, TimeRemainingColumn
 
 _EVERY_S = 60.0
 
@@ -33,19 +26,17 @@ class PlainLines:
             line: Text without line end.
             at_once: True to print it in any case.
         """
-        console = get_console()
-        if console.is_terminal or not (at_once or time.monotonic() - self._last >= _EVERY_S):
-            return
-        self._last = time.monotonic()
-        console.print(line, markup=False, highlight=False, soft_wrap=True)
+        console, now = get_console(), time.monotonic()
+        if not console.is_terminal and (at_once or now - self._last >= _EVERY_S):
+            self._last = now
+            console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 class _Progress(Progress):
     """Progress of one task, as a bar or as lines."""
 
     def __init__(self, *columns: Any, **settings: Any) -> None:
-        self._lines = PlainLines()
-        self._begun = time.monotonic()
+        self._lines, self._begun = PlainLines(), time.monotonic()
         super().__init__(*columns, **settings)
 
     def update(self, task_id: TaskID, **changes: Any) -> None:
@@ -57,42 +48,22 @@ class _Progress(Progress):
             self._lines.print(text, at_once=True)
             return
         each_s = (time.monotonic() - self._begun) / done
-        rate = _rate(each_s, task.fields["unit"])
+        rate = f"{60 / max(each_s, 1e-9):.3g}{task.fields['unit']}/min"
         super().update(task_id, rate=rate)
         # rich estimates from the last 30 seconds, in which possibly no piece was finished.
         left = timedelta(seconds=round(each_s * (total - task.completed)))
         self._lines.print(f"{text}, {rate}, {left} left")
 
 
-def _rate(each_s: float, unit: str) -> str:
-    """Return the number of pieces per second, minute or hour.
-
-    >>> _rate(0.5, " rooms"), _rate(45, ""), _rate(5000, "")
-    ('2.0 rooms/s', '1.3/min', '0.7/h')
-    """
-    scales = {"s": 1, "min": 60, "h": 3600}
-    name = next((name for name, seconds in scales.items() if seconds >= each_s), "h")
-    return f"{scales[name] / max(each_s, 1e-9):.1f}{unit}/{name}"
-
-
 def progress_bar() -> Progress:
     """Return a bar for a task with `unit`, `before` (pieces done earlier) and an empty `rate`."""
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[rate]}"),
-        TimeRemainingColumn(),
-    )
+    texts = "{task.description}", "{task.completed:g}/{task.total:g}", "{task.fields[rate]}"
+    columns = texts[0], BarColumn(), *texts[1:], TimeRemainingColumn()
     return _Progress(*columns, disable=not get_console().is_terminal)
 
 
 def show_progress(
-    done: Iterable[object],
-    description: str,
-    unit: str,
-    total: int,
-    before: int = 0,
+    done: Iterable[object], description: str, unit: str, total: int, before: int = 0
 ) -> None:
     """Consume finished pieces of work and show progress, unless all were done earlier.
 

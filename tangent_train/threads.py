@@ -1,12 +1,22 @@
-"""Work on many items in threads: OpenCV, zlib, Pillow, libav and compiled loops free the GIL."""
+"""Work on many items in threads, or in processes where the work holds the GIL.
+
+OpenCV, zlib, Pillow, libav and compiled loops free it.
+"""
 
 from __future__ import annotations
 
+import multiprocessing
 import os
+import signal
+import threading
 from collections import deque
-from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from multiprocessing.connection import wait
+from typing import Any, TypeVar
+
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Variables by which a process of many uses one thread for linear algebra."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -51,3 +61,55 @@ def in_threads(
             raise failed
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def in_processes(
+    work: Callable[..., _Result],
+    pieces: Sequence[tuple[Any, ...]],
+    workers: int | None = None,
+    least: int = 1,
+) -> Generator[_Result]:
+    """Yield ``work(*piece)`` for all pieces, in the order of completion.
+
+    After an interrupt, started pieces are finished and no others are started.
+
+    Args:
+        work: A function of a module.
+        pieces: Arguments of the function for each piece of work.
+        workers: Number of processes, by default one per CPU core; 0 and 1 mean this process.
+        least: Smallest number of pieces that justifies starting a process.
+    """
+    cores = os.cpu_count() or 1
+    processes = min(cores if workers is None else workers, -(-len(pieces) // least))
+    if processes <= 1:
+        for piece in pieces:
+            yield work(*piece)
+        return
+    context = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(processes, context, _prepare_worker)
+    before = dict(os.environ)
+    os.environ.update(_ONE_THREAD)
+    try:
+        futures = [pool.submit(work, *piece) for piece in pieces]
+        os.environ.clear()
+        os.environ.update(before)
+        for future in as_completed(futures):
+            yield future.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _prepare_worker() -> None:
+    import cv2  # slow to import
+
+    cv2.setNumThreads(1)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """End this worker when its parent ends; otherwise it would wait for work forever."""
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

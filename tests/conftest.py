@@ -44,7 +44,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Start the server of processes here: the folder of the first test that needs it may go."""
-    modules = ["datamodules.synthrooms.generate"]
+    modules = ["datamodules.synthrooms.datamodule"]
     if any(item.get_closest_marker("slow") for item in session.items):
         modules += ["tangent_train.cli.train", "tangent_train.cli.transfer", "tensorboard"]
     with pytest.MonkeyPatch.context() as patch:

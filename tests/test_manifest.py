@@ -69,6 +69,11 @@ def test_shards_share_a_folder_and_together_finish_everything(tmp_path: Path) ->
     assert {name: entry["shard"] for name, entry in found.items()} == {
         name: position % 3 + 1 for position, name in enumerate(names)
     }
+    begun = tmp_path / "begun"
+    Manifest.open(begun, SETTINGS, Shard(1, 2))
+    with pytest.raises(SettingError, match="blend: found nearest; expected feather"):
+        Manifest.open(begun, SETTINGS | {"blend": "nearest"}, Shard(2, 2))
+    assert Manifest.open(begun, SETTINGS, Shard(2, 2)).finished == {}, "before the first item"
     for wrong in ("0/3", "4/3", "1", 3, "a/b"):
         with pytest.raises(SettingError, match="number/count"):
             Shard.parse(wrong)

@@ -19,8 +19,8 @@ from torch.profiler import ProfilerActivity, profile
 
 from benchmarks.measuring import DEVICE, Goal, Row, Table, attempted
 from benchmarks.training import built, quiet
+from datamodules.core.dataset import Sample
 from datamodules.core.inputs import normalize
-from datamodules.core.samples import TrainingSample
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.rendering import equirect_to_tangent
 
@@ -138,4 +138,4 @@ def _rendered(data: Any, count: int) -> Iterator[Any]:
         inputs = normalize((rgb, depth), data.normalization, ("rgb", "depth"))
         rays = torch.empty(4, 0, 3, 3, device=DEVICE)
         lengths = torch.ones(4, 1, 1, 1)
-        yield TrainingSample(inputs, labels, rays, lengths, torch.arange(4))  # type: ignore[arg-type]
+        yield Sample(inputs, labels, lengths, torch.arange(4), rays)  # type: ignore[arg-type]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -18,7 +19,7 @@ from benchmarks.labels import NUM_CLASSES
 from benchmarks.measuring import DEVICE, Alternative, Goal, Row, Table, measure
 from datamodules.core.inputs import Normalization
 from tangent_train.checkpoints.loaded import LoadedNetwork
-from tangent_train.cli.processes import command_line, run_process
+from tangent_train.cli.processes import command_line
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.heads import head_of
@@ -79,12 +80,9 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
         Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))
     ]
     for blend in ("feather", "nearest"):
-        predictor = Predictor(
-            trained, head_of(trained), PanoramaViews(trained, blend=blend), DEVICE.type
-        )
-        alternatives.append(
-            Alternative(f"Predictor, {blend}", partial(labeled, predictor), is_ours=True)
-        )
+        views = PanoramaViews(trained, blend=blend)
+        call = partial(labeled, Predictor(trained, head_of(trained), views, DEVICE.type))
+        alternatives.append(Alternative(f"Predictor, {blend}", call, is_ours=True))
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):
         return measure(alternatives, rounds)
 
@@ -99,6 +97,6 @@ def _folder(checkpoint: Path, level: int, count: int) -> Row:
         shutil.copy(frames / "0.jpg", frames / f"{number}.jpg")
     given = [f"checkpoint={checkpoint}", f"input={frames}", f"output={folder / 'labels'}"]
     start = time.perf_counter()
-    if status := run_process(command_line("predict", [*given, f"device={DEVICE.type}"], folder)):
-        raise RuntimeError(f"tangent-predict ended with status {status}")
+    line = command_line("predict", [*given, f"device={DEVICE.type}"], folder)
+    subprocess.run(line, check=True)
     return Row("tangent-predict", [(time.perf_counter() - start) / count], True)

@@ -8,11 +8,11 @@ A data set is one class. Its fields are its settings, checked by their types::
 
         lighting: Literal["day", "night"] = "day"  # the setting data.lighting
 
-        def files(self, split: Split) -> list[ImageFiles]:
-            folder = self.root / self.lighting / split
-            return [ImageFiles(p.stem, p, p.with_suffix(".labels.png")) for p in ...]
+        def files(self) -> dict[Split, list[ImageFiles]]:
+            folder = self.root / self.lighting
+            return {s: [ImageFiles(p.stem, p, ...) for p in (folder / s).glob(...)] for s in SPLITS}
 
-`files` lists a split without opening files; lists that belong together go into a `cached_property`.
+`files` lists all splits without opening files.
 Problems and warnings of folders go to `self.problems`. Label images are read with the label map;
 `decode_labels`, `decode_depth`, `decode_camera` or `decode` read other formats. `decode_settings`
 adds the settings that the decoded arrays depend on, for the cache. `normalizations`, `units_per_m`,
@@ -20,5 +20,5 @@ adds the settings that the decoded arrays depend on, for the cache. `normalizati
 
 The way of a file to a sample: `ImageDataModule.decode` (as stored) -> `read` (size of the run,
 kept in the `cache`) -> `finish` (placed on the sphere, masked, rotated, aligned) ->
-`ImageDataset.__getitem__` (views of a representation) -> `make_loader`.
+`ImageDataset.sample` (views of a representation) -> loaders of `DataModule`.
 """

@@ -9,60 +9,33 @@ another file. Rendering a view reads only the pages it needs, shared by all proc
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
 from tangent_train.files import atomic_path
 
-_Item = TypeVar("_Item", bound=tuple[Any, ...])
 
-
-class Files(Protocol):
-    """The source files of one image or shape."""
-
-    @property
-    def name(self) -> str:
-        """Unique short name; ``/`` between groups."""
-        ...
-
-    @property
-    def paths(self) -> Iterable[Path]:
-        """All source files."""
-        ...
-
-
-@dataclass(frozen=True)
 class Cache:
-    """A folder of decoded items.
+    """A folder of decoded items, for the settings of a decoding.
 
-    Attributes:
-        folder: Folder, created on the first write.
+    Args:
+        folder: Folder of the caches for all settings, created on the first write.
+        settings: Everything that the arrays depend on besides the source files.
         kind: Named tuple of the arrays of an item; missing arrays are None.
     """
 
-    folder: Path
-    kind: type[Any]
+    def __init__(self, folder: Path, settings: Mapping[str, Any], kind: type[Any]) -> None:
+        self.folder = folder / _digest(sorted(settings.items()))
+        self.kind = kind
 
-    @classmethod
-    def of(cls, folder: Path, settings: Mapping[str, Any], kind: type[Any]) -> Cache:
-        """Return the cache for the settings of a decoding, in a subfolder.
-
-        Args:
-            folder: Folder of the caches for all settings.
-            settings: Everything that the arrays depend on besides the source files.
-            kind: Named tuple of the arrays.
-        """
-        return cls(folder / _digest(sorted(settings.items())), kind)
-
-    def read(self, files: Files, decode: Callable[[], _Item]) -> _Item:
+    def read(self, files: Any, decode: Callable[[], Any]) -> Any:
         """Return an item, as read-only views of its file, which is written first if missing.
 
         Args:
-            files: Source files of the item.
+            files: Source files of the item, with their `name` and `paths`.
             decode: Function that decodes them.
 
         Raises:
@@ -71,26 +44,23 @@ class Cache:
         """
         path = self.path(files)
         if not path.is_file():
-            self._write(path, decode())
+            arrays = {name: a for name, a in decode()._asdict().items() if a is not None}
+            record = np.empty((), [(name, a.dtype, a.shape) for name, a in arrays.items()])
+            for name, array in arrays.items():
+                record[name] = array
+            with atomic_path(path) as temporary:
+                np.save(temporary, record, allow_pickle=False)
         record = np.load(path, mmap_mode="r", allow_pickle=False)
-        arrays = {name: np.asarray(record[name]) for name in record.dtype.names}
-        item: _Item = self.kind(**{**dict.fromkeys(self.kind._fields), **arrays})
-        return item
+        missing = dict.fromkeys(self.kind._fields)
+        return self.kind(
+            **missing | {name: np.asarray(record[name]) for name in record.dtype.names}
+        )
 
-    def path(self, files: Files) -> Path:
+    def path(self, files: Any) -> Path:
         """Return the file of an item, in the present version of its source files."""
         stats = [(path.name, path.stat()) for path in files.paths]
         version = _digest([(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats])
         return self.folder / f"{files.name}.{version}.npy"
-
-    @staticmethod
-    def _write(path: Path, item: Any) -> None:
-        arrays = {name: a for name, a in item._asdict().items() if a is not None}
-        record = np.empty((), [(name, a.dtype, a.shape) for name, a in arrays.items()])
-        for name, array in arrays.items():
-            record[name] = array
-        with atomic_path(path) as temporary:
-            np.save(temporary, record, allow_pickle=False)
 
 
 def _digest(values: Any) -> str:

@@ -3,49 +3,47 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import field
 from functools import cached_property, partial, wraps
 from itertools import chain
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, dataclass_transform
 
+import cv2
 import numpy as np
+import torch
 from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
-from lightning.pytorch.utilities import rank_zero_only, rank_zero_warn
+from lightning.pytorch.utilities import rank_zero_only
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, NonNegativeInt, PositiveInt, ValidationError
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler
 
-from datamodules.core.cache import Cache, Files
-from datamodules.core.class_weights import ClassWeights, class_weights, label_doubts
+from datamodules.core.cache import Cache
 from datamodules.core.dataset import SplitDataset
-from datamodules.core.labels import PIXEL_CLASSES
-from datamodules.core.loading import (
-    EpochSampler,
-    ResumedOrder,
-    make_loader,
-    share_of_process,
-    this_process,
-)
-from datamodules.core.problems import Problems
-from datamodules.core.splits import SPLITS, Split
+from datamodules.core.files import SPLITS, Problems, Split, draw_groups
+from datamodules.core.label_map import PIXEL_CLASSES, ClassWeights, class_weights, label_doubts
+from datamodules.core.loading import EpochSampler, share_of_process, this_process
 from tangent_train.console import print_text
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, wrong_setting
+from tangent_train.manifest import Shard
 from tangent_train.progress import show_progress
+from tangent_train.rendering import TangentRepresentation
 from tangent_train.threads import in_threads
 
 _Class = TypeVar("_Class", bound=type[Any])
 
-REMEDY = (
+_REMEDY = (
     "tangent-check with the same data settings lists all problems; data.skip_broken=true leaves "
     "broken files out."
 )
-"""Remedy for broken files."""
+
+print_on_rank_zero = rank_zero_only(print_text)
+"""Print text unchanged, only in the first process."""
 
 
 @dataclass_transform(kw_only_default=True, eq_default=False, field_specifiers=(field,))
@@ -63,32 +61,23 @@ def data_set(kind: _Class) -> _Class:
         try:
             init(self, *values, **settings)
         except ValidationError as error:
-            raise _setting_error(error) from error
+            cause = error.errors()[0].get("ctx", {}).get("error")
+            if not isinstance(cause, DataError | SettingError):
+                known = dict.fromkeys(made.__dataclass_fields__, "a value")
+                cause = wrong_setting(error, known, "data.")
+            raise cause from error
 
     made.__init__ = checked
     return made
-
-
-def _setting_error(error: ValidationError) -> Exception:
-    """Return the first error of a validation; errors of a field's alternatives are joined."""
-    first = error.errors()[0]
-    cause = first.get("ctx", {}).get("error")
-    if isinstance(cause, DataError | SettingError):
-        return cause
-    name = first["loc"][0] if first["loc"] else "data"
-    texts = [e["msg"].removeprefix("Input should be ") for e in error.errors() if name in e["loc"]]
-    return SettingError(
-        f"data.{name}", found=first["input"], expected=" or ".join(dict.fromkeys(texts))
-    )
 
 
 @data_set
 class DataModule(LightningDataModule, ABC):
     """A data set split for training, validation and test, with loaders for a trainer.
 
-    Its fields are the settings `data.*` of a config. It lists the files of its splits (`files`),
-    reads them (`read`), and renders samples (`build_dataset`). Create the trainer with
-    ``use_distributed_sampler=False``, see `EpochSampler`.
+    Its fields are the settings `data.*` of a config. It lists the files of its splits (`files`)
+    and reads them (`read`). Create the trainer with ``use_distributed_sampler=False``, see
+    `EpochSampler`.
 
     Args:
         root: Folder of the data set.
@@ -107,12 +96,19 @@ class DataModule(LightningDataModule, ABC):
         num_workers: Number of worker processes of a loader; samples do not depend on it.
 
     Attributes:
-        labels: Kind of labels, see `datamodules.core.labels`.
+        labels: Kind of labels, see `datamodules.core.label_map`.
         noun: Name of the images or shapes, in the plural.
         kind: Named tuple of the arrays of an image or shape.
+        samples: Class of the samples of a split.
+        default_representation: Function that returns the representation of a level.
+        default_level: Its level without a setting.
+        suitable: Attribute that a representation must have, and the name of one that has it.
+        get_it: Where to get the data set, for messages.
         class_names: Name of every label; for pixel labels the first is unknown, not a class. Empty
             if the labels are distances.
         fact_settings: Settings of the class that scores on the test split depend on, see `facts`.
+        test_split: Published split of the test images. With `val`, validation uses scenes of the
+            training images, named ``<scene>/…``: nothing is selected on the test images.
         folds: Values of the setting ``fold``, over which published evaluations average.
         problems: Problems of the files, found so far.
         label_counts: After `check`, pixels of each of the `label_names` in the files, by split.
@@ -123,9 +119,15 @@ class DataModule(LightningDataModule, ABC):
 
     noun: ClassVar[str]
     kind: ClassVar[type[Any]]
+    samples: ClassVar[type[SplitDataset]]
+    suitable: ClassVar[tuple[str, str]] = ("erp_height", "tangent")
+    default_representation: ClassVar[Any] = staticmethod(partial(TangentRepresentation, 0))
+    default_level: ClassVar[int] = 7
+    get_it: ClassVar[str] = ""
     labels: ClassVar[str] = PIXEL_CLASSES
     class_names: ClassVar[tuple[str, ...]] = ()
     fact_settings: ClassVar[tuple[str, ...]] = ()
+    test_split: ClassVar[Literal["test", "val"]] = "test"
     folds: ClassVar[tuple[int, ...]] = ()
 
     root: Path = field(kw_only=False)
@@ -143,33 +145,46 @@ class DataModule(LightningDataModule, ABC):
 
     def __post_init__(self) -> None:
         LightningDataModule.__init__(self)
-        if self.representation is None:
-            self.representation = self.default_representation()
-        elif self.level is not None:
-            expected = "null: the representation has a level"
-            raise SettingError("data.level", found=self.level, expected=expected)
+        is_given = self.representation is not None
+        self.refuse("level", is_given and self.level is not None, "null: the representation has it")
+        if not is_given:
+            level = self.default_level if self.level is None else self.level
+            self.representation = self.default_representation(level)
+        if not hasattr(self.representation, self.suitable[0]):
+            raise SettingError(
+                "representation",
+                found=type(self.representation).__name__,
+                expected=f"one for {self.noun}, such as representation={self.suitable[1]}",
+            )
         self.problems = Problems()
         self.label_counts: dict[Split, NDArray[np.int64]] = {}
         self._splits: dict[Split, list[Any]] | None = None
-        self._datasets: dict[Split, SplitDataset] = {}
+        self._datasets: dict[Split, Any] = {}
         self._test_images = ""
         self._start = (0, 0)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "trainer": None, "_datasets": {}}
 
+    def refuse(self, setting: str, is_wrong: object, expected: str) -> None:
+        """Refuse the value of a setting that is wrong for this data set or beside other settings.
+
+        Raises:
+            SettingError: It is wrong.
+        """
+        if is_wrong:
+            found = getattr(self, setting)
+            found = list(found) if isinstance(found, tuple) else found
+            raise SettingError(f"data.{setting}", found=found, expected=expected)
+
     # --- defined by subclasses ---------------------------------------------------------------
 
     @abstractmethod
-    def default_representation(self) -> Any:
-        """Return the representation used without a setting for it, at `level`."""
+    def files(self) -> Mapping[Split, Sequence[Any]]:
+        """Return the files of every image or shape, not yet opened, by split.
 
-    @abstractmethod
-    def files(self, split: Split) -> Sequence[Files]:
-        """Return the files of every image or shape of a split, not yet opened.
-
-        Broken files are included, so that splits do not depend on them. Warnings and problems of
-        the folders are added to `problems`.
+        Files of an item have a unique `name` and `paths`. Broken files are included, so that splits
+        do not depend on them. Warnings and problems of the folders are added to `problems`.
 
         Raises:
             DataError: The data set as a whole cannot be used.
@@ -183,14 +198,6 @@ class DataModule(LightningDataModule, ABC):
             DataError: A file is broken.
         """
 
-    @abstractmethod
-    def build_dataset(self, split: Split) -> SplitDataset:
-        """Return the samples of a split as a map-style data set of PyTorch.
-
-        A sample of ``"train"`` holds randomly drawn views, a sample of ``"val"`` or ``"test"`` all
-        views. A key is an index, or an epoch and an index: each epoch draws other views.
-        """
-
     @property
     @abstractmethod
     def in_channels(self) -> int:
@@ -202,7 +209,6 @@ class DataModule(LightningDataModule, ABC):
 
     def finish(self, item: Any, split: Split, index: int) -> Any:
         """Return an item that was read or cached as samples are rendered from it."""
-        del split, index
         return item
 
     def check_files(self, files: Any) -> None:
@@ -219,7 +225,6 @@ class DataModule(LightningDataModule, ABC):
 
     def groups(self, files: Any) -> Sequence[str]:
         """Return the groups of an image that get rows in the results, such as its weather."""
-        del files
         return ()
 
     def make_files(self) -> None:
@@ -233,7 +238,11 @@ class DataModule(LightningDataModule, ABC):
         """Yield results of a function for all items as they come."""
         return in_threads(work, items)
 
-    # --- finding and checking ----------------------------------------------------------------
+    def inspect(self, files: Any, item: Any) -> tuple[NDArray[np.int64] | None, str]:
+        """Return the pixels of each label name, None for shapes, and perhaps a warning."""
+        return None, ""
+
+    # --- finding, checking and reading ---------------------------------------------------------
 
     def splits(self) -> dict[Split, list[Any]]:
         """Return the usable files of each split; the first call finds and checks them.
@@ -244,21 +253,27 @@ class DataModule(LightningDataModule, ABC):
         """
         if self._splits is None:
             found = self._find_files()
-            if self.problems.fatal:
-                self.problems.refuse(self.root)
             for warning in self.problems.warnings:
                 print_on_rank_zero(f"Warning: {warning}")
-            if self.skip_broken:
+            if self.skip_broken and not self.problems.fatal:
                 self._read_all(found, "Checking the data")
-                found = self._without_broken(found)
-            self.problems.refuse(self.root, REMEDY)
+                usable = self._usable(found)
+                if broken := self.problems.items:
+                    print_on_rank_zero(
+                        f"{len(broken)} {self.noun} are broken and left out "
+                        "(data.skip_broken=true); tangent-check lists them."
+                    )
+                if len(usable["test"]) < len(found["test"]):
+                    self._test_images = f"{len(usable['test'])} of {len(found['test'])}"
+                found, self.problems = usable, Problems()
+            self.problems.refuse(self.root, _REMEDY)
             self._splits = found
         return self._splits
 
     def dataset(self, split: Split) -> Any:
-        """Return the data set of a split; with `in_memory`, read everything now."""
+        """Return the samples of a split; with `in_memory`, read everything now."""
         if split not in self._datasets:
-            self._datasets[split] = self.build_dataset(split)
+            self._datasets[split] = self.samples(self, split)
         return self._datasets[split]
 
     def check(self) -> tuple[Problems, int]:
@@ -270,99 +285,60 @@ class DataModule(LightningDataModule, ABC):
         found = self._find_files()
         size = len(self.label_names)
         self.label_counts = {split: np.zeros(size, np.int64) for split in SPLITS}
-        usable = {split: self.problems.without(found[split]) for split in SPLITS}
-        self._read_all(usable, "Checking", self._counted)
+        self._read_all(found, "Checking", is_check=True)
         names = {files.name for files in chain.from_iterable(found.values())}
         return self.problems, len(names | self.problems.items)
-
-    def count_labels(self, item: Any) -> NDArray[np.int64] | None:
-        """Return the number of pixels of each of the `label_names`; None for shapes."""
-        del item
-        return None
-
-    def warning(self, files: Any, item: Any) -> str:
-        """Return a warning about usable files for `check`, or an empty string."""
-        del files, item
-        return ""
 
     def _find_files(self) -> dict[Split, list[Any]]:
         """Return the files of all splits; note problems of files and of the whole data set."""
         self.problems = Problems()
-        for name in [*vars(self)]:  # lists of files are made anew
-            if isinstance(getattr(type(self), name, None), cached_property):
-                delattr(self, name)
         found: dict[Split, list[Any]] = {split: [] for split in SPLITS}
         with self.problems.noted():
-            missing = f"no {self.noun}" if self.root.is_dir() else "no such folder"
-            try:
-                found = {split: list(self.files(split)) for split in SPLITS}
-            except DataError as error:
-                if self.root.is_dir():
-                    raise
-                given: Any = {"expected": error.expected, "remedy": error.remedy}
-                raise DataError(self.root, found=missing, **given) from error
+            listed = self.files() if self.root.is_dir() else {}
+            found |= {split: list(files) for split, files in listed.items()}
             if not any(found.values()) and not self.problems.items:
-                expected = f"{self.noun}, as docs and the docstring of the data set describe them"
-                raise DataError(self.root, found=missing, expected=expected)
-        self._test_images = self.problems.incomplete.get(getattr(self, "test_split", "test"), "")
+                raise DataError(
+                    self.root,
+                    found=f"no {self.noun}" if self.root.is_dir() else "no such folder",
+                    expected=f"{self.noun}, as docs and the docstring of the data set describe",
+                    remedy=self.get_it,
+                )
+        self._test_images = self.problems.incomplete.get(self.test_split, "")
+        if self.test_split == "val":
+            scenes = {files.name: files.name.partition("/")[0] for files in found["train"]}
+            fraction = self.val_fraction
+            drawn = draw_groups(scenes.values(), fraction, self.seed) if fraction else set()
+            found["test"] = found["val"]
+            found["val"] = [files for files in found["train"] if scenes[files.name] in drawn]
+            found["train"] = [files for files in found["train"] if scenes[files.name] not in drawn]
+        elif not self.val_fraction:
+            found["val"] = []
 
         def check(files: Any) -> None:
             with self.problems.noted(files.name):
                 self.check_files(files)
 
-        for _ in in_threads(check, self.problems.without(chain.from_iterable(found.values()))):
-            pass
+        list(in_threads(check, chain.from_iterable(self._usable(found).values())))
         return found
 
+    def _usable(self, found: Mapping[Split, Sequence[Any]]) -> dict[Split, list[Any]]:
+        return {split: self.problems.without(files) for split, files in found.items()}
+
     def _read_all(
-        self,
-        splits: Mapping[Split, Sequence[Any]],
-        description: str,
-        look: Callable[[Split, Any, str], None] | None = None,
+        self, found: Mapping[Split, Sequence[Any]], description: str, *, is_check: bool = False
     ) -> None:
         """Read all items once, into the cache if there is one; note broken files."""
-        items = [(s, files) for s in splits for files in self.problems.without(splits[s])]
-        work = partial(_try_read, self, look is not None)
+        items = [(split, files) for split in found for files in self.problems.without(found[split])]
 
-        def looked_at(results: Iterable[Any]) -> Generator[None]:
-            for (split, files), error, found in results:
-                if error is not None:
-                    with self.problems.noted(files.name, files.paths[0]):
-                        raise error
-                elif look is not None:
-                    look(split, *found)
-                yield
+        def noted() -> Iterator[None]:
+            with closing(self.in_parallel(partial(_try_read, self, is_check), items)) as results:
+                for split, problems, counts in results:
+                    self.problems.add_all(problems)
+                    if counts is not None:
+                        self.label_counts[split] += counts
+                    yield
 
-        with closing(self.in_parallel(work, items)) as results:
-            show_progress(looked_at(results), description, self.noun, len(items))
-
-    def _counted(self, split: Split, counts: NDArray[np.int64] | None, warning: str) -> None:
-        if counts is not None:
-            self.label_counts[split] += counts
-        self.problems.warnings += [warning] if warning else []
-
-    def _without_broken(self, found: Mapping[Split, Sequence[Any]]) -> dict[Split, list[Any]]:
-        """Return the usable files; refuse a split of which none is left."""
-        usable = {split: self.problems.without(found[split]) for split in SPLITS}
-        if len(usable["test"]) < len(found["test"]):
-            self._test_images = f"{len(usable['test'])} of {len(found['test'])}"
-        for split in SPLITS:
-            if found[split] and not usable[split]:
-                raise DataError(
-                    self.root,
-                    found=f"no {self.noun} for {split} that can be used",
-                    expected="one or more",
-                    remedy="tangent-check lists their problems.",
-                )
-        if self.problems.items:
-            print_on_rank_zero(
-                f"{len(self.problems.items)} {self.noun} are broken and left out "
-                "(data.skip_broken=true); tangent-check lists them."
-            )
-        self.problems = Problems()
-        return usable
-
-    # --- reading -------------------------------------------------------------------------------
+        show_progress(noted(), description, self.noun, len(items))
 
     def read_cached(self, files: Any) -> Any:
         """Read one image or shape from the cache, or from its files."""
@@ -373,10 +349,20 @@ class DataModule(LightningDataModule, ABC):
     @cached_property
     def _cache(self) -> Cache:
         folder: Any = self.cache
-        return Cache.of(folder, self.decode_settings(), self.kind)
+        return Cache(folder, self.decode_settings(), self.kind)
 
     def prepare_data(self) -> None:
-        """Generate the files and complete the cache.
+        """Generate the files and complete the cache."""
+        self.prepare(Shard())
+
+    def prepare(self, shard: Shard) -> int:
+        """Generate the files and complete a part of the cache, e.g. on one of several machines.
+
+        Args:
+            shard: Part of all items, which have the same order on every machine.
+
+        Returns:
+            Number of items of the part.
 
         Raises:
             DataError: A file is broken.
@@ -391,27 +377,14 @@ class DataModule(LightningDataModule, ABC):
                 expected="one or more",
                 remedy="Train on other data; these are for tangent-evaluate and tangent-transfer.",
             )
+        items = [(split, files) for split in SPLITS for files in splits[split]]
+        items = list(shard.part(items))
         if self.cache is not None:
-            self.fill_cache(lambda items: items)
-
-    def fill_cache(self, part: Callable[[Sequence[Any]], Sequence[Any]]) -> int:
-        """Read a part of the data into the cache, e.g. on one of several machines.
-
-        Args:
-            part: Selects some of all items, which have the same order on every machine.
-
-        Returns:
-            Number of items of the part.
-        """
-        splits = self.splits()
-        numbered = [(split, files) for split in SPLITS for files in splits[split]]
-        chosen: dict[Split, list[Any]] = {split: [] for split in SPLITS}
-        for split, files in part(numbered):
-            if not self._cache.path(files).is_file():
-                chosen[split].append(files)
-        self._read_all(chosen, f"Preparing {self.noun}")
-        self.problems.refuse(self.root, REMEDY)
-        return len(part(numbered))
+            missing = [item for item in items if not self._cache.path(item[1]).is_file()]
+            of_splits = {s: [files for split, files in missing if split == s] for s in SPLITS}
+            self._read_all(of_splits, f"Preparing {self.noun}")
+            self.problems.refuse(self.root, _REMEDY)
+        return len(items)
 
     def setup(self, stage: str | None = None) -> None:
         """Find and check the files once; other processes of the run take those of the first.
@@ -459,7 +432,7 @@ class DataModule(LightningDataModule, ABC):
         Print a warning if labels seem to belong to other classes.
 
         Args:
-            kind: Kind of weighting, see `class_weights.class_weights`.
+            kind: Kind of weighting, see `label_map.class_weights`.
         """
         counts = np.zeros(len(self.class_names), np.int64)
         if kind != "none":
@@ -474,20 +447,10 @@ class DataModule(LightningDataModule, ABC):
 
     def train_dataloader(self) -> DataLoader[Any]:
         """Return the training batches; with ``overfit_batches``, the same views in every epoch."""
-        dataset = self.dataset("train")
-        if getattr(self.trainer, "overfit_batches", 0):
-            share: Any = share_of_process(dataset)
-            return self._loader(share, self.batch_size, ResumedOrder(share, self._start[1]))
-        rank, world_size = this_process()
-        count = len(dataset)
-        if left_out := count % world_size:
-            rank_zero_warn(
-                f"{left_out} of {count} training {self.noun}, different ones each time, are left "
-                f"out of each epoch: {world_size} processes take equally many.",
-                category=UserWarning,
-            )
-        seed = self.seed, self.sampling_seed
-        sampler = EpochSampler(count, seed, rank, world_size, self._start)
+        dataset, seed = self.dataset("train"), (self.seed, self.sampling_seed)
+        is_fixed = bool(getattr(self.trainer, "overfit_batches", 0))
+        order = (*this_process(), self._start)
+        sampler = EpochSampler(len(dataset), seed, *order, is_fixed=is_fixed)
         return self._loader(dataset, self.batch_size, sampler)
 
     def val_dataloader(self) -> DataLoader[Any] | list[DataLoader[Any]]:
@@ -504,7 +467,17 @@ class DataModule(LightningDataModule, ABC):
     def _loader(
         self, dataset: Dataset[Any], batch_size: int, sampler: Sampler[Any] | None = None
     ) -> DataLoader[Any]:
-        return make_loader(dataset, batch_size, self.num_workers, self.seed, sampler)
+        return DataLoader(
+            dataset,
+            batch_size=batch_size,
+            sampler=sampler,
+            # Its own generator: it draws seeds for its workers, which would shift dropout's.
+            generator=torch.Generator().manual_seed(self.seed),
+            num_workers=self.num_workers,
+            persistent_workers=self.num_workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            worker_init_fn=_opencv_without_threads,
+        )
 
     def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
         """Normalize the images of a batch on their current device.
@@ -555,17 +528,17 @@ class DataModule(LightningDataModule, ABC):
 
 
 def _try_read(
-    data: DataModule, is_checked: bool, item: tuple[Split, Any]
-) -> tuple[tuple[Split, Any], Exception | None, Any]:
-    """Read an item; return its error, or its counts of labels and a warning."""
-    try:
-        if is_checked:
-            found = data.read(item[1])
-            return item, None, (data.count_labels(found), data.warning(item[1], found))
-        data.read_cached(item[1])
-    except (DataError, SettingError, OSError) as error:
-        return item, error, None
-    return item, None, None
+    data: DataModule, is_check: bool, item: tuple[Split, Any]
+) -> tuple[Split, Problems, NDArray[np.int64] | None]:
+    """Read an item; return its problems, and for a check the counts of its labels."""
+    (split, files), problems = item, Problems()
+    with problems.noted(files.name, files.paths[0]):
+        if is_check:
+            counts, warning = data.inspect(files, data.read(files))
+            problems.warnings += [warning] if warning else []
+            return split, problems, counts
+        data.read_cached(files)
+    return split, problems, None
 
 
 def _fact(value: Any) -> str:
@@ -577,7 +550,7 @@ def _fact(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else Path(str(value)).name
 
 
-@rank_zero_only
-def print_on_rank_zero(text: str) -> None:
-    """Print text unchanged, only in the first process."""
-    print_text(text)
+def _opencv_without_threads(_worker: int) -> None:
+    # The workers are the parallelism; threads inside them would only fight over the cores. Not 1:
+    # that waits for threads which the parent had and the forked worker does not.
+    cv2.setNumThreads(0)

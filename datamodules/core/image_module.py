@@ -1,48 +1,72 @@
-"""Base data modules of labeled images, and of photos."""
+"""Bases of data sets of labeled images: panoramas, and photos."""
 
 from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, PositiveInt
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import ImageDataset
-from datamodules.core.images import (
+from datamodules.core.dataset import Image, ImageDataset, Labels, sample_rng
+from datamodules.core.depth import (
     MOST_STEPS,
     STEPS_PER_M,
-    Image,
-    ImageFiles,
-    Labels,
-    Unknown,
     distance_from_z_depth,
-    mask_black,
     resize_depth,
     units_to_steps,
 )
+from datamodules.core.files import ImageFiles, Split
 from datamodules.core.inputs import (
+    INPUTS,
     RGB_NORMALIZATION,
     RGBD_NORMALIZATION,
     Input,
     Normalization,
     channel_names,
     normalize,
-    ordered_inputs,
 )
-from datamodules.core.label_map import UNKNOWN_NAME, LabelMap
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.core.splits import SPLITS, Split
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES, UNKNOWN_NAME, LabelMap
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import PanoramaPose, shift_range
+from tangent_train.geometry import PanoramaPose, random_rotation, rotation_about, shift_range
+from tangent_train.geometry.sphere import check_area
+from tangent_train.io.gpano import (
+    Fill,
+    PanoramaArea,
+    black_outside,
+    check_resolution,
+    read_area,
+    read_up,
+)
+from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_image_size, read_pixels, read_rgb
-from tangent_train.rendering import PerspectiveRepresentation
+from tangent_train.orientation.gravity import estimate_up
+from tangent_train.orientation.manhattan import MOST_ROWS
+from tangent_train.progress import show_progress
+from tangent_train.rendering import (
+    PerspectiveRepresentation,
+    rotate_equirect,
+)
 from tangent_train.rendering.resampling import resize
+
+Unknown = Literal["labels", "any_black", "all_black"]
+"""Pixels that are unknown in addition to unlabeled pixels; see `mask_black`."""
+
+Upright = Literal["pose", "auto"] | None
+"""Source of the up direction of a panorama."""
+
+TestRotation = Annotated[float, Field(ge=0, le=180)] | Literal["so3"] | None
+"""Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or null."""
+
+PanoramaJudge = Callable[[Image, "NDArray[np.float64]"], "NDArray[np.float64]"]
+"""Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
 _USUAL_M = (0.05, 100)  # median distances; others are probably in other units
 
@@ -73,6 +97,7 @@ class ImageDataModule(DataModule):
     """
 
     kind = Image
+    samples = ImageDataset
     normalizations: ClassVar[tuple[Normalization, Normalization]] = (
         RGB_NORMALIZATION,
         RGBD_NORMALIZATION,
@@ -91,17 +116,15 @@ class ImageDataModule(DataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        self.inputs = ordered_inputs(self.inputs)
-        with_depth = "depth" in self.inputs
-        if self.has_distances and (self.no_depth or self.no_distances):
-            reason = f"{PIXEL_CLASSES}: {self.no_depth or self.no_distances}"
-            raise SettingError("data.labels", found=DISTANCE, expected=reason)
-        if self.has_distances and self.classes is not None:
-            raise SettingError("data.classes", found=self.classes, expected="null, with distances")
-        if with_depth and (self.no_depth or self.has_distances):
-            expected = f"no depth: {self.no_depth or 'it is the target'}"
-            raise SettingError("data.inputs", found=list(self.inputs), expected=expected)
-        self.label_map = None if self.has_distances else self.find_label_map()
+        self.inputs = tuple(name for name in INPUTS if name in self.inputs)
+        with_depth, distances = "depth" in self.inputs, self.has_distances
+        no_labels, no_depth = self.no_depth or self.no_distances, self.no_depth
+        self.refuse("labels", distances and no_labels, f"{PIXEL_CLASSES}: {no_labels}")
+        self.refuse("classes", distances and self.classes is not None, "null, with distances")
+        no_depth = "it is the target" if distances else no_depth
+        self.refuse("inputs", with_depth and no_depth, f"no depth: {no_depth}")
+        self.refuse("inputs", "rgb" not in self.inputs, "rgb, and perhaps others")
+        self.label_map = None if distances else self.find_label_map()
         if self.label_map is not None:
             self.class_names = (UNKNOWN_NAME, *self.label_map.names)  # type: ignore[misc]
         given = self.normalization or self.normalizations[with_depth]
@@ -114,9 +137,7 @@ class ImageDataModule(DataModule):
             SettingError: There is no such set of classes.
         """
         name = next(iter(self.label_maps)) if self.classes is None else str(self.classes)
-        if name not in self.label_maps:
-            expected = " or ".join(self.label_maps)
-            raise SettingError("data.classes", found=name, expected=expected)
+        self.refuse("classes", name not in self.label_maps, " or ".join(self.label_maps))
         return self.label_maps[name]
 
     @property
@@ -137,7 +158,7 @@ class ImageDataModule(DataModule):
     # --- decoding, which data sets may override ------------------------------------------------
 
     @abstractmethod
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`; depth files are among them if the data set `reads_depth`."""
 
     def decode(self, files: ImageFiles) -> Image:
@@ -162,7 +183,6 @@ class ImageDataModule(DataModule):
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64] | None:
         """Return ``(3, 3)`` K of a photo for integer pixel centers; None for a panorama."""
-        del files
         return None
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
@@ -170,17 +190,21 @@ class ImageDataModule(DataModule):
 
         In a photo's axes, x is the optical axis, y points to the right and z up in the image.
         """
-        del files
         return None
 
     # --- reading -------------------------------------------------------------------------------
 
     def read(self, files: ImageFiles) -> Image:
-        """See `DataModule`: the image at its size in training, with its labels or distances."""
+        """See `DataModule`: the image at its size in training, with its labels or distances.
+
+        RGB, depth and labels are resized on one pixel grid: the outer edges of source and target
+        agree, so target row i covers source rows ``i · H / h`` to ``(i + 1) · H / h``. RGB is
+        averaged over that area; labels and depth are taken from the source pixel at its center.
+        """
         rgb, depth, labels, *_, matrix = self.decode(files)
-        shape, near = self.read_shape, rgb
         if depth is not None and matrix is not None:
             depth = distance_from_z_depth(depth, matrix)
+        near, shape = rgb, self.read_shape
         if shape is not None:
             near = rgb if self.unknown == "labels" else resize(rgb, shape, "nearest")
             rgb = resize(rgb, shape, "bilinear")
@@ -189,8 +213,7 @@ class ImageDataModule(DataModule):
         if self.has_distances and depth is not None:
             # From 128 m, 16 bits do not hold the distance.
             labels, depth = np.where(depth < MOST_STEPS, depth, np.uint16(0)), None
-        labels = mask_black(labels, near, self.unknown)
-        return Image(rgb, depth, labels, camera_matrix=matrix)
+        return Image(rgb, depth, mask_black(labels, near, self.unknown), camera_matrix=matrix)
 
     def read_labels(self, files: ImageFiles) -> Labels:
         """Return only the labels of `read`."""
@@ -202,11 +225,11 @@ class ImageDataModule(DataModule):
     def _find_files(self) -> dict[Split, list[Any]]:
         found = super()._find_files()
         if self.has_distances:
-            found = {split: [f._replace(labels=None) for f in found[split]] for split in SPLITS}
+            found = {s: [files._replace(labels=None) for files in found[s]] for s in found}
         return found
 
     def check_files(self, files: ImageFiles) -> None:
-        """See `DataModule`: the files of an image are complete and have one size."""
+        """See `DataModule`: the files of an image are complete, suit the settings, of one size."""
         size = read_image_size(files.rgb)
         self.check_size(files, size)
         for path in (files.labels, files.depth):
@@ -216,6 +239,7 @@ class ImageDataModule(DataModule):
                     expected = f"{width_height(size)}, as {files.rgb}"
                     raise DataError(path, found=width_height(found), expected=expected)
 
+    @abstractmethod
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """Refuse an image whose rows and columns do not suit the settings."""
 
@@ -224,29 +248,22 @@ class ImageDataModule(DataModule):
         settings = {"shape": self.read_shape, "unknown": self.unknown, "labels": self.labels}
         return {**super().decode_settings(), **settings, "label map": repr(self.label_map)}
 
-    def count_labels(self, item: Image) -> NDArray[np.int64]:
-        """See `DataModule`: classes, or pixels without and with a distance."""
+    def inspect(self, files: ImageFiles, item: Image) -> tuple[NDArray[np.int64], str]:
+        """See `DataModule`; of distances that are probably in other units is warned."""
+        labels: Any = item.labels
+        warning = ""
         if self.has_distances:
-            known = np.count_nonzero(item.labels)
-            return np.array([item.labels.size - known, known])
-        return np.bincount(item.labels.ravel(), minlength=len(self.class_names))
-
-    def warning(self, files: ImageFiles, item: Image) -> str:
-        """See `DataModule`: of distances that are probably in other units."""
-        if not self.has_distances:
-            return ""
-        known = item.labels[item.labels > 0]
-        median_m = np.median(known) / STEPS_PER_M if known.size else 0
-        if _USUAL_M[0] <= median_m <= _USUAL_M[1]:
-            return ""
-        found = f"median distance {median_m:.3g} m" if median_m else "no distance below 128 m"
-        return f"{files.depth}: {found}; check the units and the missing value."
+            known = labels[labels > 0]
+            median_m = np.median(known) / STEPS_PER_M if known.size else 0
+            if not _USUAL_M[0] <= median_m <= _USUAL_M[1]:
+                found = (
+                    f"median distance {median_m:.3g} m" if known.size else "no distance below 128 m"
+                )
+                warning = f"{files.depth}: {found}; check the units and the missing value."
+            labels = labels > 0
+        return np.bincount(labels.ravel(), minlength=len(self.label_names)), warning
 
     # --- samples -------------------------------------------------------------------------------
-
-    def build_dataset(self, split: Split) -> ImageDataset:
-        """See `DataModule`: samples `TrainingSample` or `EvaluationSample`."""
-        return ImageDataset(self, split)
 
     @property
     def in_channels(self) -> int:
@@ -256,23 +273,6 @@ class ImageDataModule(DataModule):
     def normalized(self, batch: Any) -> Tensor:
         """See `DataModule`."""
         return normalize(batch.images, self.normalization, self.inputs)
-
-
-def check_representation(data: DataModule, attribute: str, choice: str) -> None:
-    """Refuse a representation that is made for another kind of images.
-
-    Args:
-        data: The data module.
-        attribute: Attribute that all suitable representations have.
-        choice: Name of a suitable representation, for the error message.
-
-    Raises:
-        SettingError: The representation is not suitable.
-    """
-    if not hasattr(data.representation, attribute):
-        found, expected = type(data.representation).__name__, f"one for {data.noun}"
-        remedy = f"Choose representation={choice}, or other data."
-        raise SettingError("representation", found=found, expected=expected, remedy=remedy)
 
 
 @data_set
@@ -287,16 +287,16 @@ class PhotoDataModule(ImageDataModule):
     """
 
     noun: ClassVar[str] = "photos"
+    suitable = ("of_camera", "perspective")
+    default_representation = staticmethod(PerspectiveRepresentation)  # crops of 45°
     fact_settings: ClassVar[tuple[str, ...]] = ("size",)
 
     batch_size: PositiveInt = 16
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_representation(self, "of_camera", "perspective")
-        if "elevation" in self.inputs:
-            expected = "no elevation: the horizon of a photo is unknown"
-            raise SettingError("data.inputs", found=list(self.inputs), expected=expected)
+        unknown = "no elevation: the horizon of a photo is unknown"
+        self.refuse("inputs", "elevation" in self.inputs, unknown)
 
     @property
     def size(self) -> str:
@@ -304,23 +304,198 @@ class PhotoDataModule(ImageDataModule):
         height, width = self.representation.image_size
         return f"crops of {self.representation.fov_deg:g}° in {width} × {height}"
 
-    def default_representation(self) -> PerspectiveRepresentation:
-        """Crops of 45° at the resolution of level 7."""
-        return PerspectiveRepresentation(7 if self.level is None else self.level)
-
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: the crops fit into the photo."""
         camera: Any = self.decode_camera(files)
         fov_deg, (_, columns) = self.representation.fov_deg, self.representation.image_size
+        rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
         try:
             shift_range(camera, size, fov_deg, self.representation.image_size)
         except SettingError as error:
-            rows = int(size[0] / 2 / (camera[1, 1] * math.tan(math.radians(fov_deg) / 2)) * columns)
             # A setting: if it fits none of the photos, it is refused once.
             raise SettingError(
                 "representation.fov_deg",
                 found=f"{error.found}, {files.rgb}",
                 expected=f"all of a crop of {fov_deg:g}°",
-                remedy="Lower it, make the crops less high with "
-                f"representation.dim=[{rows},{columns}] or fewer rows, or remove the photo.",
+                remedy=f"Lower it, or crop fewer rows: representation.dim=[{rows},{columns}].",
             ) from error
+
+
+@data_set
+class PanoramaDataModule(ImageDataModule):
+    """Labeled panoramas of one data set, see `ImageDataModule`.
+
+    Args:
+        batch_size: Panoramas per training step and process. Evaluation takes one at a time.
+        area: The part of the sphere that all files show: west, east, south and north in degrees,
+            see `check_area`; None for the whole sphere.
+        fill: Colors of the panorama outside the area, in views that leave it.
+        mask: Pixels that are ignored in training and evaluation, before the panorama is rotated:
+            their labels are unknown. See `Masks`.
+        test_rotation: Rotate the test panoramas, as seen by a tilted camera: a tilt in degrees
+            about a random horizontal axis, after a random rotation about the vertical; or `so3`,
+            uniform over all rotations. Labels rotate with the image.
+        upright: Align tilted panoramas with gravity. `pose`: as their files say (GPano) and, of
+            test panoramas, as they were rotated. `auto`: as their files say, else as estimated from
+            the image.
+        max_tilt_deg: Largest tilt that `auto` considers, a few degrees above that of the data.
+
+    Attributes:
+        erp_height: Rows of the panoramas read.
+        canvas: The area, in pixels of these panoramas.
+
+    Raises:
+        DataError: The mask cannot be used.
+    """
+
+    noun: ClassVar[str] = "panoramas"
+    fact_settings: ClassVar[tuple[str, ...]] = ("size", "area", "mask", "test_rotation")
+
+    area: Sequence[float] | None = None
+    fill: Fill = "mean"
+    mask: Any = None
+    test_rotation: TestRotation = None
+    upright: Upright = None
+    max_tilt_deg: Annotated[float, Field(gt=0, le=180)] = 60.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.erp_height: int = self.representation.erp_height
+        self.canvas = PanoramaArea.on_canvas(self.area, self.erp_height, "data.area")
+        self.representation.view_sets(self.canvas.valid)  # refuses views that miss a pixel
+        self._judge: PanoramaJudge | None = None
+        self._ups: dict[tuple[Split, int], NDArray[np.float64] | None] = {}
+        self._masks = Masks(self.mask, "data.mask")
+        if not self._masks.of_each:
+            self._masks.read("", self.canvas)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_judge": None}  # a network
+
+    @property
+    def size(self) -> str:
+        """Width and height of the panoramas whose pixels are scored."""
+        return f"{2 * self.erp_height} × {self.erp_height}"
+
+    @property
+    def read_shape(self) -> tuple[int, int]:
+        """Rows and columns of the area in panoramas of `erp_height` rows."""
+        return self.canvas.image_shape
+
+    def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
+        """See `ImageDataModule`: enough pixels, in the shape of the area, and a mask."""
+        check_resolution(files.rgb, size, self.canvas, self.area)
+        if self._masks.of_each:
+            self._masks.check(files.name, self.canvas)
+
+    def finish(self, item: Image, split: Split, index: int) -> Image:
+        """See `DataModule`: placed on the sphere, masked, rotated, then aligned with gravity."""
+        files: ImageFiles = self.splits()[split][index]
+        image, canvas, rotation = item, self.canvas, None
+        if not canvas.is_whole:
+            colors = canvas.filled(canvas.place(image.rgb), self.fill)
+            image = _changed(image, colors, canvas.place)._replace(valid=canvas.valid)
+        if self.mask is not None:
+            counts, labels = self._masks.read(files.name, canvas), image.labels
+            image = image._replace(labels=np.where(counts, labels, labels.dtype.type(0)))
+        up = None if self.upright is None else read_up(files.rgb)
+        if split == "test" and self.test_rotation is not None:
+            rotation = draw_rotation(self.test_rotation, self.seed, index)
+            colors = rotate_equirect(image.rgb, rotation, "bilinear")
+            image = _changed(image, colors, partial(_rotated, rotation=rotation))
+            up = None if self.upright != "pose" else rotation @ ([0, 0, 1] if up is None else up)
+        if self.upright == "auto" and up is None:
+            if (split, index) not in self._ups:
+                self._ups[split, index] = self._estimated_up(image, files, rotation, split)
+            up = self._ups[split, index]
+        return image._replace(up=up)
+
+    def _estimated_up(
+        self, image: Image, files: ImageFiles, rotation: NDArray[np.float64] | None, split: Split
+    ) -> NDArray[np.float64] | None:
+        """Estimate the up direction; small panoramas are read again at the size of the file."""
+        rgb = black_outside(image.rgb, image.valid)  # estimates ignore what is black
+        judge = self._judge if split == "test" else None
+        evidence = judge and partial(judge, image._replace(rgb=rgb))
+        if len(rgb) < MOST_ROWS:
+            rgb = read_rgb(files.rgb)
+            size = rgb.shape[0], rgb.shape[1]
+            whole = read_area(files.rgb, size, check_area(self.area)).full_shape
+            canvas = PanoramaArea.on_canvas(self.area, min(whole[0], MOST_ROWS))
+            rgb = canvas.place(resize(rgb, canvas.image_shape, "bilinear"))
+            rgb = rgb if rotation is None else rotate_equirect(rgb, rotation, "bilinear")
+        return estimate_up(rgb, self.max_tilt_deg, evidence)
+
+    def estimate_up(self, judge: PanoramaJudge) -> None:
+        """Let a network help to estimate the up directions of the test panoramas.
+
+        They are estimated when the loader of the test split is created, because the network is on
+        its device by then. Without ``upright=auto`` nothing changes.
+
+        Args:
+            judge: Returns log-likelihoods of up directions, see `gravity.estimate_up`.
+        """
+        if self.upright == "auto":
+            self._judge = judge
+            self._ups = {key: up for key, up in self._ups.items() if key[0] != "test"}
+            self._datasets.pop("test", None)
+
+    def test_dataloader(self) -> DataLoader[Any]:
+        """Return the test batches; a network first estimates the up directions, in this process."""
+        dataset = self.dataset("test")
+        if self._judge is not None:
+            read = map(dataset.read, range(len(dataset)))
+            show_progress(read, "Estimating up", self.noun, len(dataset))
+        return super().test_dataloader()
+
+
+def mask_black(labels: Labels, rgb: NDArray[np.uint8], unknown: Unknown) -> Labels:
+    """Make black pixels unknown.
+
+    The paper's released code applies `any_black` in training and evaluation, before resizing. This
+    function does the same at the pixels that the labels are taken from.
+
+    Args:
+        labels: ``(H, W)``.
+        rgb: ``(H, W, 3)`` at the same pixels.
+        unknown: `labels` changes nothing; `any_black` makes pixels unknown where any channel is 0;
+            `all_black` where all channels are 0.
+
+    Returns:
+        ``(H, W)`` labels.
+    """
+    if unknown == "labels":
+        return labels
+    black = rgb == 0
+    return np.where(black.any(-1) if unknown == "any_black" else black.all(-1), np.uint8(0), labels)
+
+
+def draw_rotation(rotation: float | Literal["so3"], seed: int, index: int) -> NDArray[np.float64]:
+    """Draw the rotation R of a test panorama, ``(3, 3)``: direction d moves to R d.
+
+    Args:
+        rotation: See `PanoramaDataModule.test_rotation`.
+        seed: Seed of the run.
+        index: Index of the panorama.
+    """
+    rng = sample_rng(seed, 0, index)
+    if rotation == "so3":
+        return random_rotation(rng)
+    yaw, azimuth = rng.uniform(0, 2 * math.pi, 2)
+    tilt = rotation_about((math.cos(azimuth), math.sin(azimuth), 0), math.radians(rotation))
+    return tilt @ rotation_about((0, 0, 1), yaw)
+
+
+def _changed(
+    image: Image, rgb: NDArray[np.uint8], change: Callable[[NDArray[Any]], NDArray[Any]]
+) -> Image:
+    """Return a panorama of other colors, with its other pixels changed."""
+    others = {name: getattr(image, name) for name in ("depth", "labels", "valid")}
+    changed = {name: change(array) for name, array in others.items() if array is not None}
+    return image._replace(rgb=rgb, **changed)
+
+
+def _rotated(pixels: NDArray[Any], rotation: NDArray[np.float64]) -> NDArray[Any]:
+    if pixels.dtype == np.bool_:
+        return rotate_equirect(pixels.view(np.uint8), rotation, "nearest") > 0
+    return rotate_equirect(pixels, rotation, "nearest")

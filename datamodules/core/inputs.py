@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Literal, Self, get_args
 
 import torch
 from torch import Tensor
 
-from datamodules.core.images import STEPS_PER_M
+from datamodules.core.depth import STEPS_PER_M
 from tangent_train.errors import SettingError
 
 Input = Literal["rgb", "depth", "elevation"]
@@ -26,13 +24,11 @@ INPUTS: tuple[Input, ...] = get_args(Input)
 
 _COLORS = ("red", "green", "blue")
 
-_BYTE = 255
+MAX_DEPTH_M = 4.0
+"""Maximum depth in meters; larger depth is clipped (released code of the paper)."""
 
 _SHAPES = 6
 """Channels of spheres of shapes, which are not colors."""
-
-MAX_DEPTH_M = 4.0
-"""Maximum depth in meters; larger depth is clipped (released code of the paper)."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +41,6 @@ class Normalization:
     Attributes:
         mean: 3, 4 or 6 numbers.
         std: As many numbers, greater than 0.
-
-    Raises:
-        SettingError: The counts differ, or a number is out of range.
     """
 
     mean: Sequence[float]
@@ -55,20 +48,8 @@ class Normalization:
 
     def __post_init__(self) -> None:
         # Plain tuples, whatever list a config brought: comparable and safe in checkpoints.
-        mean: tuple[float, ...] = ()
-        std: tuple[float, ...] = ()
-        with suppress(TypeError, ValueError):
-            mean, std = (tuple(map(float, values)) for values in (self.mean, self.std))
-        right = len(mean) == len(std) and len(mean) in (3, 4, 6)
-        if not (right and all(map(math.isfinite, mean + std)) and min(std) > 0):
-            raise SettingError(
-                "normalization",
-                found=f"mean {self.mean}, std {self.std}",
-                expected="3 numbers each, as mean: [0.5, 0.5, 0.5], 4 with depth, 6 of shapes, std "
-                "greater than 0",
-            )
-        object.__setattr__(self, "mean", mean)
-        object.__setattr__(self, "std", std)
+        object.__setattr__(self, "mean", tuple(map(float, self.mean)))
+        object.__setattr__(self, "std", tuple(map(float, self.std)))
 
     @classmethod
     def of(cls, given: Any, channels: int, setting: str = "normalization") -> Self:
@@ -87,43 +68,29 @@ class Normalization:
             given = _NAMED.get(given, given)
         if isinstance(given, Mapping) and set(given) == {"mean", "std"}:
             given = cls(given["mean"], given["std"])
-            if given.channels < _SHAPES:
-                _check_colors(given, setting)
-        if not isinstance(given, cls):
+        if not (isinstance(given, cls) and given._suits(channels)):
             raise SettingError(
                 setting,
                 found="none" if given is None else given,
-                expected=f"{', '.join(_NAMED)}, or {{mean: […], std: […]}} of 0 to 1",
-                remedy="Take what the network was trained with; labels are poor with another one.",
-            )
-        if given.channels != channels:
-            raise SettingError(
-                setting,
-                found=f"{given.channels} channels",
-                expected=f"{channels}, as the inputs have",
+                expected=f"{', '.join(_NAMED)}, or {{mean: […], std: […]}} with {channels} numbers "
+                "each, of images from 0 to 1",
+                remedy="Take what the network was trained with; divide numbers of images from 0 to "
+                "255 by 255.",
             )
         return given
+
+    def _suits(self, channels: int) -> bool:
+        largest = 1 if channels < _SHAPES else float("inf")
+        return (
+            len(self.mean) == len(self.std) == channels
+            and min(self.std) > 0
+            and max(*self.mean[:3], *self.std[:3]) <= largest
+        )
 
     @property
     def channels(self) -> int:
         """3, 4 with depth, or 6 of shapes."""
         return len(self.mean)
-
-
-def _check_colors(given: Normalization, setting: str) -> None:
-    """Refuse RGB numbers that are not meant for images from 0 to 1."""
-    mean, std = given.mean[:3], given.std[:3]
-    if min(mean) >= 0 and max(*mean, *std) <= 1:
-        return
-    numbers = [[float(f"{value / _BYTE:.4g}") for value in values] for values in (mean, std)]
-    raise SettingError(
-        setting,
-        found=f"mean {mean}, std {std} of red, green and blue",
-        expected="numbers from 0 to 1, for images from 0 to 1",
-        remedy="If they are of images from 0 to 255, divide all by 255: mean {}, std {}.".format(
-            *numbers
-        ),
-    )
 
 
 _NAMED = {
@@ -155,23 +122,6 @@ def channel_names(inputs: Sequence[Input]) -> tuple[str, ...]:
     return tuple(name for each in inputs for name in (_COLORS if each == "rgb" else (each,)))
 
 
-def ordered_inputs(inputs: Sequence[Input]) -> tuple[Input, ...]:
-    """Return the names of inputs in the order of their channels.
-
-    Raises:
-        SettingError: An unknown name, or `rgb` is missing.
-    """
-    ordered = tuple(name for name in INPUTS if name in inputs)
-    known = not isinstance(inputs, str) and sorted(ordered) == sorted(inputs)
-    if not known or "rgb" not in inputs:
-        raise SettingError(
-            "data.inputs",
-            found=inputs if isinstance(inputs, str) else list(inputs),
-            expected="a list: rgb, perhaps depth and elevation",
-        )
-    return ordered
-
-
 def normalize(
     rendered: Sequence[Tensor], normalization: Normalization, inputs: Sequence[Input]
 ) -> Tensor:
@@ -186,22 +136,15 @@ def normalize(
     Returns:
         ``(..., C, h, w)`` float32, on the same device.
 
-    Raises:
-        SettingError: The normalization has other channels.
     """
-    parts = dict(zip([name for name in INPUTS if name in inputs], rendered, strict=True))
-    measured = 3 + ("depth" in parts)
-    rgb = parts["rgb"]
+    rgb, *others = rendered
     *batch, height, width, _ = rgb.shape
-    channels = len(channel_names(inputs))
-    images = rgb.new_empty((*batch, channels, height, width), dtype=torch.float32)
+    images = rgb.new_empty((*batch, 3 + len(others), height, width), dtype=torch.float32)
     images[..., :3, :, :] = rgb.movedim(-1, -3)
-    if "depth" in parts:
-        images[..., 3, :, :] = parts["depth"]
-    units = [255] * 3 + [STEPS_PER_M] * (measured - 3)
-    normalize_channels(images[..., :measured, :, :], units, normalization)
-    if "elevation" in inputs:
-        images[..., -1, :, :] = parts["elevation"]
+    for channel, other in enumerate(others, start=3):
+        images[..., channel, :, :] = other
+    units = [255] * 3 + [STEPS_PER_M] * ("depth" in inputs)
+    normalize_channels(images[..., : len(units), :, :], units, normalization)
     return images
 
 

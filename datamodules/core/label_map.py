@@ -1,4 +1,4 @@
-"""Label maps: the class of every value, color or name.
+"""Labels: their kinds, maps from values, colors or names to classes, and weights of the classes.
 
 Label 0 is unknown, and the label of a class is its index plus one.
 """
@@ -11,15 +11,30 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from tangent_train.errors import DataError, counted
 from tangent_train.files import read_json
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import read_pixels, read_rgb
+
+PIXEL_CLASSES = "pixel_classes"
+"""Kind of labels: a class for every pixel; 0 is unknown, which is not a class of the network."""
+
+IMAGE_CLASS = "image_class"
+"""Kind of labels: one class index for an image or shape."""
+
+DISTANCE = "distance"
+"""Kind of labels: a distance from the center for every pixel, in steps of 1/512 m, 0 where
+unknown."""
+
+ClassWeights = Literal["log", "sqrt", "none"]
+"""Class weighting of the loss; see `class_weights`."""
 
 UNKNOWN_NAME = "unknown"
 """Name of label 0, pixels without a class."""
@@ -30,13 +45,15 @@ Key = int | str
 _REFUSED = 255
 _MOST_CLASSES = 254  # labels are uint8, and 0 is unknown
 _MOST_VALUE = 65535
-_UNKNOWN_VALUES = (255, 65535)
 _COLOR = re.compile(r"#[0-9a-f]{6}")
 _MOST_SHOWN = 8
 _EXPECTED = (
     'a list of class names, ["wall", "floor"], or an object with the values, colors or names of '
-    'each class, {"wall": 1, "floor": [2, 3]}, {"wall": "#ff0000"} or {"wall": ["painting"]}'
+    'each class, {"wall": 1, "floor": [2, 3]}, {"wall": "#ff0000"} or {"wall": ["painting"]}, '
+    f"every key once; 1 to {_MOST_CLASSES} classes"
 )
+_LOG_OFFSET = 1.02
+_MOST_UNKNOWN = 0.5
 
 
 @dataclass(frozen=True)
@@ -58,8 +75,6 @@ class LabelMap:
         cls,
         classes: Mapping[str, Key | Sequence[Key]] | Sequence[str],
         unknown: Iterable[Key] = (),
-        *,
-        refuses_others: bool = True,
     ) -> Self:
         """Return the map of some classes.
 
@@ -67,7 +82,6 @@ class LabelMap:
             classes: Values, colors or names of each class; or the names of the classes, whose
                 values are then 1 to K.
             unknown: Values of pixels without a class.
-            refuses_others: See the class.
 
         >>> LabelMap.of({"car": [7, 8], "bus": 9}, [0]).decode(np.array([0, 7, 8, 9])).tolist()
         [0, 1, 1, 2]
@@ -77,28 +91,21 @@ class LabelMap:
         labels = dict.fromkeys(unknown, 0)
         for label, given in enumerate(classes.values(), start=1):
             keys = [given] if isinstance(given, Key) else given
-            labels |= dict.fromkeys(map(_plain_key, keys), label)
-        return cls(tuple(classes), labels, refuses_others)
+            labels |= dict.fromkeys(keys, label)
+        return cls(tuple(classes), labels)
 
-    @classmethod
-    def grouped(cls, names: Sequence[str], groups: Mapping[str, str] | None = None) -> Self:
-        """Return the map of class names to the classes of a benchmark, e.g. for `regrouped`.
+    def regrouped(self, names: Sequence[str], groups: Mapping[str, str] | None = None) -> LabelMap:
+        """Return the map from the same values to the classes of a benchmark, by names of classes.
 
         Args:
             names: Names of the benchmark's classes, which classes of the same name belong to.
             groups: Class of the benchmark by name of other classes. Further classes are unknown.
         """
-        members = {name: [name] for name in names}
-        for name, group in (groups or {}).items():
-            if group in members and name not in members:
-                members[group].append(name)
-        return cls.of(members, refuses_others=False)
-
-    def regrouped(self, groups: LabelMap) -> LabelMap:
-        """Return the map from the same values to other classes, by the names of the classes."""
-        of_labels = [0, *(groups.labels.get(plain_name(name), 0) for name in self.names)]
+        label_of = {name: label for label, name in enumerate(names, start=1)}
+        label_of = {old: label_of.get(new, 0) for old, new in (groups or {}).items()} | label_of
+        of_labels = [0, *(label_of.get(name, 0) for name in self.names)]
         labels = {key: of_labels[label] for key, label in self.labels.items()}
-        return LabelMap(groups.names, labels, self.refuses_others)
+        return LabelMap(tuple(names), labels, self.refuses_others)
 
     @cached_property
     def in_colors(self) -> bool:
@@ -131,18 +138,16 @@ class LabelMap:
         if self.in_colors:
             wide = stored.astype(np.int32)
             codes = wide[..., 0] << 16 | wide[..., 1] << 8 | wide[..., 2]
-        elif stored.dtype.itemsize > 2 or stored.dtype.kind != "u":
+        elif stored.dtype.itemsize > 2:
             codes = np.clip(stored, 0, _MOST_VALUE)
         labels = self._table[codes]
         if self.refuses_others and labels.max(initial=0) == _REFUSED:
-            others, count = np.unique(stored[labels == _REFUSED]), (labels == _REFUSED).sum()
-            known = [key for key in self.labels if isinstance(key, int)]
+            others = stored[labels == _REFUSED]
             raise DataError(
                 path,
-                found=f"{_shown(others.tolist())} in {counted(int(count), 'pixels')}",
-                expected=_shown(sorted(known)),
-                remedy="Name the values in the label map, e.g. classes.json, or take the files "
-                "unconverted.",
+                found=f"{_shown(np.unique(others).tolist())} in {counted(len(others), 'pixels')}",
+                expected=_shown(sorted(key for key in self.labels if isinstance(key, int))),
+                remedy="Name the values in the label map, e.g. classes.json.",
             )
         return labels
 
@@ -156,10 +161,6 @@ class LabelMap:
         if stored.ndim == 3 and not self.in_colors:
             raise DataError(path, found="colors", expected="values of classes, one per pixel")
         return self.decode(stored, path)
-
-    def describe(self) -> str:
-        """Return the values or colors of the map in one line."""
-        return ("colors " if self.in_colors else "values ") + _shown(list(self.labels))
 
 
 def _shown(keys: Sequence[Any]) -> str:
@@ -188,47 +189,34 @@ def read_label_map(path: Path) -> LabelMap:
     Raises:
         DataError: The file cannot be read, has another form, or repeats a value.
     """
-    content = read_json(
-        path, _EXPECTED, "docs/how-to/own_data.md shows how to bring your own data."
-    )
+    content = read_json(path, _EXPECTED)
     if isinstance(content, dict) and isinstance(content.get("classes"), dict):
         content = content["classes"]
-    if isinstance(content, list):
-        named = [(name, [value]) for value, name in enumerate(content) if name is not None]
+    is_list, labels, named = isinstance(content, list), dict[Key, int](), list[tuple[Any, Any]]()
+    if is_list:
+        named = [(name, value) for value, name in enumerate(content) if name is not None]
     elif isinstance(content, dict):
-        named = [(n, keys if isinstance(keys, list) else [keys]) for n, keys in content.items()]
-    else:
-        named = []
-    labels: dict[Key, int] = {}
-    for label, (name, keys) in enumerate(named, start=1):
-        for key in keys:
-            _check(path, name, key, labels)
-            labels[_plain_key(key)] = label
-    names = tuple(composed(name) for name, _ in named)
+        named = list(content.items())
+    names = [name for name, _ in named if name != UNKNOWN_NAME]
+    usable = [name for name in names if isinstance(name, str) and name.isprintable()]
+    wrong = [json.dumps(name) for name, _ in named if name not in usable]
+    for label, (name, given) in enumerate(named, start=1):
+        for key in given if isinstance(given, list) else [given]:
+            plain = plain_name(key) if isinstance(key, str) else key
+            is_key = type(key) is str or (type(key) is int and 0 <= key <= _MOST_VALUE)
+            if not is_key or plain in labels:
+                wrong.append(f"{json.dumps(key)} for {json.dumps(name)}")
+            else:
+                labels[plain] = label
+    names = tuple(composed(str(name)) for name, _ in named)
     kinds = {str if isinstance(key, str) and _COLOR.fullmatch(key) else type(key) for key in labels}
-    if not 1 <= len(set(names)) == len(names) <= _MOST_CLASSES or len(kinds) > 1:
-        found = f"{counted(len(names), 'classes')}, {counted(len(set(names)), 'different names')}"
-        expected = f"{_EXPECTED}; 1 to {_MOST_CLASSES} classes with different names"
-        raise DataError(path, found=found, expected=expected)
-    if not isinstance(content, list):
-        return LabelMap(names, labels, refuses_others=False)
-    unknown: list[Key] = [*(v for v, name in enumerate(content) if name is None), *_UNKNOWN_VALUES]
-    return LabelMap(names, dict.fromkeys(unknown, 0) | labels)
-
-
-def _check(path: Path, name: Any, key: Any, labels: Mapping[Key, int]) -> None:
-    """Refuse names and keys of other kinds, and repeated keys."""
-    is_value = type(key) is int and 0 <= key <= _MOST_VALUE
-    is_name = isinstance(name, str) and bool(name.strip()) and name.isprintable()
-    found = f"{json.dumps(key)} for {json.dumps(name)}"
-    if not is_name or name == UNKNOWN_NAME or not (is_value or isinstance(key, str)):
+    if wrong or len(kinds) > 1 or not 1 <= len(set(names)) == len(names) <= _MOST_CLASSES:
+        found = _shown(wrong) or f"{len(names)} classes, {len(set(names))} different names"
         raise DataError(path, found=found, expected=_EXPECTED)
-    if _plain_key(key) in labels:
-        raise DataError(path, found=f"{found}, twice", expected="every key once")
-
-
-def _plain_key(key: Key) -> Key:
-    return plain_name(key) if isinstance(key, str) else key
+    if is_list:
+        others = [value for value, name in enumerate(content) if name is None]
+        labels = {**dict.fromkeys([*others, 255, _MOST_VALUE], 0), **labels}
+    return LabelMap(names, labels, refuses_others=is_list)
 
 
 def plain_name(name: str) -> str:
@@ -241,3 +229,49 @@ def plain_name(name: str) -> str:
     """
     first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
     return " ".join(first.casefold().split())
+
+
+def class_weights(counts: NDArray[np.int64], kind: ClassWeights) -> Tensor:
+    """Return the weights of the classes in the loss.
+
+    With r the share of a class among the labeled pixels: `log` is ``1 / ln(1.02 + r)``
+    (released code of the paper), `sqrt` is ``1 / √r``, scaled to a mean of 1; `none` is 1.
+
+    Args:
+        counts: ``(K,)`` number of pixels of every class.
+        kind: Kind of weighting.
+
+    Returns:
+        ``(K,)`` float32; 0 for classes without pixels, except with `none`.
+    """
+    if kind == "none":
+        return torch.ones(len(counts))
+    seen = counts > 0
+    shares = counts[seen] / counts.sum()
+    of_seen = 1 / (np.log(_LOG_OFFSET + shares) if kind == "log" else np.sqrt(shares))
+    if kind == "sqrt" and len(of_seen):
+        of_seen /= of_seen.mean()
+    weights = np.zeros(len(counts), np.float32)
+    weights[seen] = of_seen
+    return torch.from_numpy(weights)
+
+
+def label_doubts(split: str, counts: NDArray[np.int64], class_names: Sequence[str]) -> list[str]:
+    """Return warnings about labels that may belong to other classes.
+
+    Args:
+        split: Name of the split.
+        counts: ``(K+1,)`` number of pixels of every label, at least one above 0.
+        class_names: ``(K+1,)`` names; the first is the name of unknown pixels.
+    """
+    doubts = []
+    unknown = counts[0] / counts.sum()
+    if unknown > _MOST_UNKNOWN:
+        doubts.append(f"{100 * unknown:.1f} % of the pixels for {split} are unknown.")
+    missing = [name for name, count in zip(class_names[1:], counts[1:], strict=True) if not count]
+    if missing:
+        doubts.append(
+            f"Classes without a pixel for {split}: {_shown(missing)} "
+            f"({len(missing)} of {len(class_names) - 1})."
+        )
+    return doubts

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.data_module import print_on_rank_zero
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.gpano import PanoramaArea, check_resolution, read_area
 from tangent_train.io.image_files import image_paths, short_names
@@ -81,17 +81,14 @@ class PanoramaPairs(ABC):
 
     Attributes:
         published: The paper's scores by name of the pair, for the paper's pairs.
+        pairs: Unique name of each pair, and the files of its two panoramas.
     """
 
     published: Mapping[str, PublishedPair] = MappingProxyType({})
+    pairs: Any
 
     def make_files(self) -> None:  # noqa: B027, most have all their files
         """Generate missing files; called before anything else."""
-
-    @property
-    @abstractmethod
-    def pairs(self) -> Sequence[tuple[str, Any, Any]]:
-        """Return the files of the two panoramas of each pair, by unique name of the pair."""
 
     @abstractmethod
     def image(self, files: Any) -> Path:
@@ -150,8 +147,7 @@ class ImagePairs(PanoramaPairs):
             paths) or `all` (every combination).
 
     Raises:
-        SettingError: The settings exclude each other.
-        DataError: There are fewer than two panoramas.
+        SettingError: The settings exclude each other, or there are not two panoramas.
     """
 
     def __init__(
@@ -161,36 +157,16 @@ class ImagePairs(PanoramaPairs):
         input: str | None = None,  # noqa: A002, the name of the setting
         pairing: Literal["consecutive", "all"] = "consecutive",
     ) -> None:
-        given = tuple(name is not None for name in (left, right, input))
-        if given not in ((True, True, False), (False, False, True)):
-            raise SettingError(
-                "input",
-                found=f"left={left} right={right} input={input}",
-                expected="left=<panorama> right=<panorama>, or input=<folder of panoramas>",
-            )
-        if pairing not in ("consecutive", "all"):
-            raise SettingError("pairing", found=pairing, expected="consecutive or all")
-        if input is not None:
-            paths = image_paths(input, tell=print_on_rank_zero)
-        else:
-            paths = [
-                path
-                for side in (str(left), str(right))
-                for path in image_paths(side, tell=print_on_rank_zero)
-            ]
-        if len(paths) < 2 or (input is None and len(paths) > 2):
-            expected = "two panoramas" + ("" if input is None else " or more")
-            raise DataError(input or left, found=f"{len(paths)}", expected=expected)
-        self._paths = paths
+        given = [path for path in (left, right, input) if path is not None]
+        paths = [path for one in given for path in image_paths(one, tell=print_on_rank_zero)]
+        if len(given) != (1 if input else 2) or len(paths) < 2 or (left and len(paths) > 2):
+            expected = "left=<panorama> right=<panorama>, or input=<folder of panoramas>"
+            found = f"{' '.join(map(str, given))}: {len(paths)} panoramas"
+            raise SettingError("input", found=found, expected=expected)
+        self._paths, self._names = paths, short_names(paths)
         indices = range(len(paths))
         chosen = pairwise(indices) if pairing == "consecutive" else combinations(indices, 2)
-        self._names = short_names(paths)
-        self._pairs = [(f"{self._names[k]} – {self._names[j]}", k, j) for k, j in chosen]
-
-    @property
-    def pairs(self) -> list[tuple[str, int, int]]:
-        """See `PanoramaPairs`; names of both files, with their indices in the paths."""
-        return self._pairs
+        self.pairs = [(f"{self._names[k]} – {self._names[j]}", k, j) for k, j in chosen]
 
     def image(self, files: int) -> Path:
         """See `PanoramaPairs`."""

@@ -2,28 +2,43 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, Field, PositiveFloat
 
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
-from tangent_train.geometry import camera_matrix_from_fov, is_camera_matrix
+from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.image_files import composed
 from tangent_train.io.pixel_files import photo_fov_deg, read_image_size
 
-_KEYS = ("fx", "fy", "cx", "cy")
+_Zero = Annotated[float, Field(ge=0, le=0)]
+_One = Annotated[float, Field(ge=1, le=1)]
+_Rows = tuple[
+    tuple[PositiveFloat, _Zero, float],
+    tuple[_Zero, PositiveFloat, float],
+    tuple[_Zero, _Zero, _One],
+]
 _EXPECTED = (
     'an object of cameras by name of an image or folder: {"kitchen/door": {"fx": …, "fy": …, '
     '"cx": …, "cy": …}} or [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], in pixels of the photo as '
     'displayed, without skew; "." stands for all images'
 )
+
+
+class _Pinhole(BaseModel, extra="forbid"):
+    """Focal lengths and principal point in pixels."""
+
+    fx: PositiveFloat
+    fy: PositiveFloat
+    cx: float
+    cy: float
 
 
 @dataclass(frozen=True)
@@ -96,25 +111,10 @@ def read_folder_cameras(path: Path, fov_deg: float | None) -> FolderCameras:
     Raises:
         DataError: The file cannot be read, or has another content.
     """
-    content = read_json(path, _EXPECTED) if path.exists() else {}
-    if not isinstance(content, dict):
-        raise DataError(path, found=json.dumps(content), expected=_EXPECTED)
-    matrices = {
-        PurePosixPath(composed(name)).as_posix(): _matrix(path, name, given)
-        for name, given in content.items()
-    }
+    kind = dict[str, _Pinhole | _Rows]
+    cameras = read_json(path, _EXPECTED, kind=kind) if path.exists() else {}
+    matrices = {}
+    for name, k in cameras.items():
+        rows = k if isinstance(k, tuple) else [[k.fx, 0, k.cx], [0, k.fy, k.cy], [0, 0, 1]]
+        matrices[PurePosixPath(composed(name)).as_posix()] = np.array(rows, np.float64)
     return FolderCameras(path, matrices, fov_deg)
-
-
-def _matrix(path: Path, name: str, given: Any) -> NDArray[np.float64]:
-    rows = given
-    if isinstance(given, dict) and given.keys() == set(_KEYS):
-        fx, fy, cx, cy = (given[key] for key in _KEYS)
-        rows = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]
-    try:
-        matrix = np.array(rows, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.empty(0)
-    if not is_camera_matrix(matrix):
-        raise DataError(path, found=f"{name!r}: {json.dumps(given)}", expected=_EXPECTED)
-    return matrix

@@ -13,7 +13,7 @@ On disk::
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,12 +23,11 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeInt, PositiveFloat
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles, meters_to_steps
+from datamodules.core.depth import meters_to_steps
+from datamodules.core.files import ImageFiles, Split
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap, read_label_map
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import Split
 from datamodules.folder.cameras import FolderCameras, read_folder_cameras
 from datamodules.folder.splits import FolderSplits
 from tangent_train.errors import DataError, SettingError
@@ -61,19 +60,14 @@ class LabeledFolder(ImageDataModule):
         """Return the classes of ``classes.json``: the network needs their number early."""
         return read_label_map(self.root / "classes.json")
 
-    def files(self, split: Split) -> list[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ImageFiles]]:
         images = self._list_images()
         self._note_ignored(images)
-        division = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
-        divided: dict[Split, list[ImageFiles]] = {"train": images, "val": [], "test": []}
+        splits = FolderSplits(self.root, self.test_fraction, self.val_fraction, self.split_seed)
         with self.problems.noted():  # all images are checked even without splits
-            divided = division.divide(images, self.problems)
-        return divided  # noqa: RET504
+            return splits.divide(images, self.problems)
+        return {"train": images}  # type: ignore[unreachable]  # the error was noted
 
     def _list_images(self) -> list[ImageFiles]:
         """Return all images, in the order of their names: paths below ``images/`` without suffix.

@@ -8,10 +8,8 @@ from pathlib import Path
 
 from lightning.pytorch.utilities import rank_zero_warn
 
-from datamodules.core.images import ImageFiles
-from datamodules.core.problems import Problems
-from datamodules.core.splits import SPLITS, Split, draw_groups
-from tangent_train.errors import DataError, counted
+from datamodules.core.files import SPLITS, ImageFiles, Problems, Split, draw_groups
+from tangent_train.errors import DataError
 from tangent_train.io.image_files import composed
 
 
@@ -49,48 +47,54 @@ class FolderSplits:
             problems: Collects invalid lines of lists.
 
         Raises:
-            DataError: A list cannot be used, or there are too few images to draw a test from.
+            DataError: A list cannot be used, or there are no images for training or test.
         """
         listed = self._read_lists(images, problems)
-        named = {name for names in listed.values() for name in names}
-        rest = {files.name for files in images} - named
-        if "test" in listed or "train" in listed:
-            test = self._some("test", listed.get("test", rest))
-        else:
-            test = self._draw("test", images, rest, self.test_fraction)
-        train = self._some("train", listed.get("train", rest - test))
+        rest = {files.name for files in images}.difference(*listed.values())
         held: set[str] = set()
-        if self.val_fraction and "val" in listed:
-            held = self._some("val", listed["val"])
-        elif self.val_fraction:
-            held = self._draw("val", images, train, self.val_fraction)
+        if "test" in listed or "train" in listed:
+            test = listed.get("test", rest)
+        else:
+            test = self._draw("test", rest, self.test_fraction)
+        train = listed.get("train", rest - test)
+        if self.val_fraction:
+            is_listed = "val" in listed
+            held = listed["val"] if is_listed else self._draw("val", train, self.val_fraction)
         chosen: dict[Split, set[str]] = {"train": train - held, "val": held, "test": test}
+        for split in SPLITS[::2]:
+            if not chosen[split]:
+                expected, remedy = "one or more", f"Add images, or name some in {split}.txt."
+                found = f"no images for {split}"
+                raise DataError(self.root, found=found, expected=expected, remedy=remedy)
         return {split: [f for f in images if f.name in chosen[split]] for split in SPLITS}
 
     def _read_lists(
         self, images: Sequence[ImageFiles], problems: Problems
     ) -> dict[Split, set[str]]:
-        """Read the names in each existing list."""
+        """Read the names in each existing list: one per line, without comments (#)."""
         # Lists may name images with or without their suffix.
-        names = {f.name + suffix: f.name for f in images for suffix in ("", f.rgb.suffix)}
+        free = {f.name + suffix: f.name for f in images for suffix in ("", f.rgb.suffix)}
         listed: dict[Split, set[str]] = {}
-        owners: dict[str, Path] = {}
         for split in SPLITS:
             path = self.root / f"{split}.txt"
             if not path.is_file():
                 continue
+            lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
             listed[split] = set()
-            for line in _lines(path):
+            for line in lines:
+                name = free.get(line)
                 with problems.noted(f"{path.name}: {line}"):
-                    listed[split].add(_listed_name(path, line, names, owners))
+                    if name in set().union(*listed.values()) or not (name or line[:1] in "#"):
+                        expected = "names of files in images/, each once, e.g. scene/name"
+                        raise DataError(path, found=repr(line), expected=expected)
+                if name:
+                    listed[split].add(name)
         return listed
 
-    def _draw(
-        self, split: Split, images: Sequence[ImageFiles], names: set[str], fraction: float
-    ) -> set[str]:
+    def _draw(self, split: Split, names: set[str], fraction: float) -> set[str]:
         """Draw the names of the images of some scenes."""
         # Scenes are top-level folders; an image outside folders is a separate scene.
-        groups = {f.name: f.name.partition("/")[0] for f in images if f.name in names}
+        groups = {name: name.partition("/")[0] for name in names}
         if len(set(groups.values())) == 1 < len(groups):
             rank_zero_warn(
                 f"All {len(groups)} images to draw those of {split} from are in one scene, "
@@ -100,50 +104,4 @@ class FolderSplits:
             )
             groups = {name: name for name in groups}
         drawn = draw_groups(groups.values(), fraction, [self.seed, SPLITS.index(split)])
-        if not drawn and split == "test":
-            raise DataError(
-                self.root / "images",
-                found=f"{counted(len(groups), 'images')} to draw those of test from",
-                expected="two or more",
-                remedy="Add images, or name some in test.txt.",
-            )
         return {name for name, group in groups.items() if group in drawn}
-
-    def _some(self, split: Split, names: set[str]) -> set[str]:
-        """Return the names if there are any."""
-        if not names:
-            raise DataError(
-                self.root,
-                found=f"no images for {split}",
-                expected="one or more",
-                remedy=f"Name some in {split}.txt; without validation, set data.val_fraction=0.",
-            )
-        return names
-
-
-def _listed_name(path: Path, line: str, names: dict[str, str], owners: dict[str, Path]) -> str:
-    """Return the image named in a line of a list, and assign it to that list."""
-    if line not in names:
-        raise DataError(
-            path,
-            found=f"{line!r}, which is not an image",
-            expected="names of files in images/, e.g. scene/name",
-        )
-    name = names[line]
-    if name in owners:
-        raise DataError(
-            path,
-            found=f"{line!r}, also in {owners[name]}",
-            expected="every image once, in one of the lists",
-        )
-    owners[name] = path
-    return name
-
-
-def _lines(path: Path) -> list[str]:
-    """Read the names in a list, without empty lines and comments (#)."""
-    try:
-        lines = [composed(line.strip()) for line in path.read_text("utf-8-sig").splitlines()]
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(path, found=error, expected="names, one per line, in UTF-8") from error
-    return [line for line in lines if line and not line.startswith("#")]

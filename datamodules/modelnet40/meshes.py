@@ -46,24 +46,24 @@ _LEAST_HEIGHT = 1e-8
 """Smallest height of a triangle, relative to the longest extent; lower ones are dropped."""
 
 
-def read_off(path: Path) -> Trimesh:
-    """Read a mesh with trimesh's OFF loader; polygons become triangles.
+def read_mesh(path: Path) -> Trimesh:
+    """Read a mesh with trimesh's OFF loader, and clean it; polygons become triangles.
 
     Raises:
-        DataError: The file cannot be read, is not an OFF file, is truncated or has no triangles.
+        DataError: The file cannot be read, is not an OFF file, is truncated or has no surface.
     """
     try:
         text = re.sub("#.*", "", path.read_text(encoding="latin-1"))
         mesh = Trimesh(**load_off(StringIO(text)), process=False)
         # The loader accepts files that end within the faces, and NaN coordinates.
         count = int(re.findall(r"\d+", text)[1])
-        if not 0 < count <= len(mesh.faces) or not np.isfinite(mesh.vertices).all():
+        if count > len(mesh.faces) or not np.isfinite(mesh.vertices).all():
             raise ValueError(f"{len(mesh.faces)} faces instead of {count}, or NaN")  # noqa: TRY301
+        return clean_mesh(mesh)
     # The loader raises anything from ValueError to IndexError for broken files.
     except Exception as error:
-        expected, remedy = "a mesh in OFF format", "Copy or extract it again."
+        expected, remedy = "a surface in OFF format", "Copy or extract it again."
         raise DataError(path, found=error, expected=expected, remedy=remedy) from error
-    return mesh
 
 
 def clean_mesh(mesh: Trimesh) -> Trimesh:
@@ -71,9 +71,6 @@ def clean_mesh(mesh: Trimesh) -> Trimesh:
 
     The centroid of the surface, which need not be closed, is moved to the origin, and the mesh is
     scaled to `RADIUS`.
-
-    Raises:
-        DataError: There is no surface.
     """
     low, high = mesh.bounds
     extent = float(np.max(high - low)) or 1.0
@@ -81,8 +78,6 @@ def clean_mesh(mesh: Trimesh) -> Trimesh:
     clean.merge_vertices(digits_vertex=_DIGITS)
     clean.update_faces(clean.nondegenerate_faces(height=_LEAST_HEIGHT) & clean.unique_faces())
     clean.remove_unreferenced_vertices()
-    if not len(clean.faces):
-        raise DataError("mesh", found="no triangle with an area", expected="a surface")
     vertices = clean.vertices - clean.centroid
     vertices *= RADIUS / np.linalg.norm(vertices, axis=1).max()
     return Trimesh(vertices, clean.faces, process=False)

@@ -18,8 +18,7 @@ The class is the folder, or the name of the file without its number. Other files
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
-from functools import cached_property
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -30,17 +29,13 @@ from pydantic import PositiveInt
 from torch import Tensor
 
 from datamodules.core.data_module import DataModule, data_set
-from datamodules.core.dataset import SplitDataset
-from datamodules.core.image_module import check_representation
+from datamodules.core.dataset import SplitDataset, sample_rng
+from datamodules.core.files import SPLITS, Split, draw_groups
 from datamodules.core.inputs import Normalization, normalize_channels
-from datamodules.core.labels import IMAGE_CLASS
-from datamodules.core.loading import sample_key, sample_rng
-from datamodules.core.processes import in_processes
-from datamodules.core.splits import Split, draw_groups
-from datamodules.modelnet40.meshes import CHANNELS, clean_mesh, mesh_spheres, read_off
-from tangent_train.errors import DataError
+from datamodules.core.label_map import IMAGE_CLASS
+from datamodules.modelnet40.meshes import CHANNELS, mesh_spheres, read_mesh
 from tangent_train.geometry import random_rotation, rotation_about
-from tangent_train.rendering import TangentRepresentation
+from tangent_train.threads import in_processes
 
 MODELNET40 = (
     *("airplane", "bathtub", "bed", "bench", "bookshelf", "bottle", "bowl", "car", "chair", "cone"),
@@ -85,7 +80,7 @@ class ShapeFile(NamedTuple):
     path: Path
     name: str
     label: str
-    part: Literal["train", "test"]
+    part: Split
 
     @property
     def paths(self) -> tuple[Path]:
@@ -94,23 +89,14 @@ class ShapeFile(NamedTuple):
 
 
 def find_shapes(root: Path) -> list[ShapeFile]:
-    """List all meshes of a data set, ordered by name within each part.
-
-    Raises:
-        DataError: The folder is missing or has another layout.
-    """
-    shapes: list[ShapeFile] = []
-    parts: tuple[Literal["train", "test"], ...] = ("train", "test")
-    for part in parts:
-        for path in (*root.glob(f"*/{part}/*.off"), *root.glob(f"modelnet40_{part}/*.off")):
+    """List all meshes of a data set, ordered by name within each part."""
+    shapes = []
+    for part in SPLITS[::2]:
+        for path in (*root.glob(f"*/{part}/[!.]*.off"), *root.glob(f"modelnet40_{part}/[!.]*.off")):
             by_class = path.parent.name == part
             label = path.parents[1].name if by_class else path.stem.rpartition("_")[0]
             name = path.relative_to(root).with_suffix("").as_posix()
-            if not path.name.startswith("."):
-                shapes.append(ShapeFile(path, name, label, part))
-    if not shapes:
-        expected = "<class>/{train,test}/*.off or modelnet40_{train,test}/<class>_<number>.off"
-        raise DataError(root, found="no meshes", expected=expected, remedy=_GET_IT)
+            shapes.append(ShapeFile(path, name, label, part))
     return sorted(shapes, key=lambda shape: (shape.part, shape.name))
 
 
@@ -130,22 +116,22 @@ class ShapeSample(NamedTuple):
     Attributes:
         images: ``(N, h, w, 6)`` int16 in steps of `STEPS`, which is half the bytes; normalized
             later, to ``(N, 6, h, w)`` float32.
-        target: Class, int64.
+        labels: Class, int64.
         index: Index in its split, int64.
     """
 
     images: Tensor
-    target: Tensor
+    labels: Tensor
     index: Tensor  # type: ignore[assignment]  # hides tuple.index
 
 
 class ShapeDataset(SplitDataset):
     """Views of shapes, by index or (epoch, index): random ones of training shapes, else all."""
 
-    def __getitem__(self, key: int | tuple[int, int]) -> ShapeSample:
-        epoch, index = sample_key(key, len(self))
+    def sample(self, index: int, rng: np.random.Generator) -> ShapeSample:
+        """See `SplitDataset`."""
         spheres = self.read(index).spheres
-        images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(epoch, index)])
+        images = np.concatenate([v.render(spheres, "bilinear") for v in self._views(index, rng)])
         # torch has few operations on uint16; all values are below 2 · STEPS = 2¹⁵.
         return ShapeSample(
             torch.from_numpy(np.require(images, requirements="W").view(np.int16)),
@@ -153,12 +139,11 @@ class ShapeDataset(SplitDataset):
             torch.tensor(index),
         )
 
-    def _views(self, epoch: int, index: int) -> list[Any]:
+    def _views(self, index: int, rng: np.random.Generator) -> list[Any]:
         data = self.data
-        if self.split == "train":
-            seed = (data.seed, data.sampling_seed)
-            return [data.representation.sample(sample_rng(seed, epoch, index))]
         representation = data.representation
+        if self.split == "train":
+            return [representation.sample(rng)]
         if self.split == "test" and data.test_rotation is not None:
             # Rotated back, it sees what a rotated shape shows.
             representation = representation.with_rotation(self.shape_rotation(index).T)
@@ -193,6 +178,9 @@ class ModelNet40(DataModule):
 
     noun: ClassVar[str] = "shapes"
     kind = Spheres
+    samples = ShapeDataset
+    default_level = 5
+    get_it = _GET_IT
     labels = IMAGE_CLASS
     fact_settings: ClassVar[tuple[str, ...]] = ("test_rotation",)
 
@@ -201,16 +189,11 @@ class ModelNet40(DataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_representation(self, "erp_height", "tangent")
         self.cache = self.cache or self.root / "spheres"
         self.erp_height: int = self.representation.erp_height
         self.class_names = self.find_classes()  # type: ignore[misc]
         given = self.normalization or SPHERE_NORMALIZATION
         self.normalization = Normalization.of(given, CHANNELS, "data.normalization")
-
-    def default_representation(self) -> TangentRepresentation:
-        """Tangent images of base level 0, at level 5."""
-        return TangentRepresentation(0, 5 if self.level is None else self.level)
 
     def find_classes(self) -> tuple[str, ...]:
         """Return the names of the classes, even before the files exist."""
@@ -218,12 +201,8 @@ class ModelNet40(DataModule):
             return MODELNET40
         return tuple(sorted({mesh.label for mesh in find_shapes(self.root)}))
 
-    def files(self, split: Split) -> list[ShapeFile]:
+    def files(self) -> Mapping[Split, Sequence[ShapeFile]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ShapeFile]]:
         splits: dict[Split, list[ShapeFile]] = {"train": [], "val": [], "test": []}
         meshes = find_shapes(self.root)
         held: set[str] = set()
@@ -237,7 +216,7 @@ class ModelNet40(DataModule):
     def read(self, files: ShapeFile) -> Spheres:
         """See `DataModule`."""
         shape = self.erp_height, 2 * self.erp_height
-        values = mesh_spheres(clean_mesh(read_off(files.path)), shape)
+        values = mesh_spheres(read_mesh(files.path), shape)
         return Spheres(np.rint(values * STEPS).astype(np.uint16))
 
     def decode_settings(self) -> dict[str, Any]:
@@ -247,10 +226,6 @@ class ModelNet40(DataModule):
     def in_parallel(self, work: Callable[[Any], Any], items: Sequence[Any]) -> Generator[Any]:
         """See `DataModule`: in processes, because reading meshes holds the GIL."""
         return in_processes(work, [(item,) for item in items], least=_PER_PROCESS)
-
-    def build_dataset(self, split: Split) -> ShapeDataset:
-        """See `DataModule`: samples `ShapeSample`; the test shapes are rotated if set."""
-        return ShapeDataset(self, split)
 
     @property
     def in_channels(self) -> int:

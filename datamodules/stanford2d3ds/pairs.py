@@ -12,7 +12,7 @@ hard although six easy pairs have the same overlap, 0.86: the split uses figures
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import field
 from functools import cached_property
 from itertools import combinations
@@ -22,22 +22,22 @@ from typing import Literal
 from pydantic import PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import resize_depth, steps_to_meters
+from datamodules.core.depth import resize_depth, steps_to_meters
+from datamodules.core.files import ImageFiles, Problems
 from datamodules.core.panorama_pairs import (
     PairedPanorama,
     PanoramaPairs,
     PublishedPair,
     paired_shape,
 )
-from datamodules.core.problems import Problems
 from datamodules.stanford2d3ds.files import AREAS
 from datamodules.stanford2d3ds.panoramas import (
     GET_IT,
-    PictureFiles,
     list_pictures,
-    pose_file,
     read_depth,
     read_panorama_pose,
+    room_of,
+    sibling,
 )
 from datamodules.tables import read_table
 from tangent_train.errors import DataError
@@ -45,19 +45,18 @@ from tangent_train.io.pixel_files import read_rgb
 from tangent_train.rendering.resampling import resize
 
 _REPRESENTATIONS = ("ERP", "L0", "L1", "L2")
-_SHORT = 7  # number of hexadecimal digits of a camera printed in the paper
 
 
 def published_pairs() -> list[PublishedPair]:
     """Read the paper's pairs in the order of their numbers."""
     pairs = []
     for row in read_table("stanford2d3ds_pairs"):
-        number, split, left, right, overlap, *printed = row.values()
-        figures = list(map(float, printed))
+        number, split, left, right, *printed = row.values()
+        overlap, *figures = map(float, printed)
         scores = {
             name: tuple(figures[3 * k : 3 * k + 3]) for k, name in enumerate(_REPRESENTATIONS)
         }
-        pairs.append(PublishedPair(int(number), split, left, right, float(overlap), scores))
+        pairs.append(PublishedPair(int(number), split, left, right, overlap, scores))
     return pairs
 
 
@@ -82,74 +81,58 @@ class StanfordPairs(PanoramaPairs):
         self.published = {str(p.number): p for p in published_pairs()} if is_paper else {}
 
     @cached_property
-    def pairs(self) -> list[tuple[str, PictureFiles, PictureFiles]]:
+    def pairs(self) -> list[tuple[str, ImageFiles, ImageFiles]]:
         """See `PanoramaPairs`; names are the paper's numbers, or rooms and abbreviated cameras.
 
         Raises:
             DataError: Panoramas are missing.
         """
-        areas = self.areas or [a for a in AREAS if (self.root / f"area_{a}").is_dir()]
+        present = [area for area in AREAS if (self.root / f"area_{area}").is_dir()]
         problems = Problems()
         files = [
             files
-            for area in (["1"] if self.published else areas)
+            for area in (["1"] if self.published else self.areas or present)
             for files in list_pictures(self.root, area, "pano", True, problems)
         ]
         problems.refuse(self.root)
-        if self.published:
-            pairs = self.published.items()
-            found = _resolve({name for _, p in pairs for name in (p.left, p.right)}, files)
-            return [(name, found[pair.left], found[pair.right]) for name, pair in pairs]
+        by_name: defaultdict[str, list[ImageFiles]] = defaultdict(list)
+        for image in files:
+            by_name[f"{_camera(image)}_{image.name.split('/')[1]}"].append(image)
+        wanted = {name for p in self.published.values() for name in (p.left, p.right)}
+        if wrong := [name for name in sorted(wanted) if len(by_name[name]) != 1]:
+            raise DataError(
+                self.root,
+                found=", ".join(f"{name} ({len(by_name[name])} times)" for name in wrong),
+                expected="one panorama for each image of the paper's pairs",
+                remedy="Copy or extract area_1 again; data.selection=rooms uses all panoramas.",
+            )
         chosen = [
-            (f"{one.area}_{_room(one)}_{_camera(one)}_{_camera(other)}", one, other)
+            (number, by_name[pair.left][0], by_name[pair.right][0])
+            for number, pair in self.published.items()
+        ] or [
+            ("_".join([*one.name[5:].split("/")[:2], _camera(one), _camera(other)]), one, other)
             for one, other in combinations(files, 2)
-            if one.room == other.room
+            if room_of(one) == room_of(other)
         ]
         if not chosen:
             none, expected = "no two panoramas of one room", "area_1 and so on, with pairs"
             raise DataError(self.root, found=none, expected=expected, remedy=GET_IT)
         return chosen
 
-    def image(self, files: PictureFiles) -> Path:
+    def image(self, files: ImageFiles) -> Path:
         """See `PanoramaPairs`."""
-        return files.image.rgb
+        return files.rgb
 
-    def panorama(self, files: PictureFiles) -> PairedPanorama:
+    def panorama(self, files: ImageFiles) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        image = files.image
-        rgb, depth = read_rgb(image.rgb), image.depth
-        shape = paired_shape(image.rgb, rgb, self.erp_height)
-        steps = resize_depth(read_depth(depth), shape) if depth else None
-        distance_m = None if steps is None else steps_to_meters(steps)
-        pose = read_panorama_pose(pose_file(image))
+        rgb = read_rgb(files.rgb)
+        shape = paired_shape(files.rgb, rgb, self.erp_height)
+        distance_m = steps_to_meters(resize_depth(read_depth(files.depth), shape))
+        pose = read_panorama_pose(sibling(files.rgb, "pose.json"))
         small = resize(rgb, shape, "bilinear")
-        return PairedPanorama(image.name, small, image.rgb, distance_m, pose)
+        return PairedPanorama(files.name, small, files.rgb, distance_m, pose)
 
 
-def _room(files: PictureFiles) -> str:
-    return f"{files.room[1]}_{files.room[2]}"
-
-
-def _camera(files: PictureFiles) -> str:
-    return files.camera[:_SHORT]
-
-
-def _resolve(names: Collection[str], files: Sequence[PictureFiles]) -> dict[str, PictureFiles]:
-    """Return the files of abbreviated names, ``<beginning of the camera>_<room>_<number>``.
-
-    Raises:
-        DataError: Lists all names that match no panorama, or several.
-    """
-    by_name: defaultdict[str, list[PictureFiles]] = defaultdict(list)
-    for file in files:
-        by_name[f"{_camera(file)}_{_room(file)}"].append(file)
-    counts = {name: len(by_name[name]) for name in sorted(names)}
-    wrong = [f"{name} ({count} times)" for name, count in counts.items() if count != 1]
-    if wrong:
-        raise DataError(
-            files[0].image.rgb.parent,
-            found=", ".join(wrong),
-            expected="one panorama for each image of the paper's pairs",
-            remedy="Copy or extract area_1 again; data.selection=rooms uses the panoramas present.",
-        )
-    return {name: by_name[name][0] for name in names}
+def _camera(files: ImageFiles) -> str:
+    """Return the digits of a camera that are printed in the paper."""
+    return files.name.rpartition("/")[2][:7]

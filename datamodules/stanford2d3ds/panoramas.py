@@ -32,28 +32,19 @@ import re
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import STEPS_PER_M, ImageFiles, meters_to_steps
+from datamodules.core.depth import STEPS_PER_M, meters_to_steps
+from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split, draw_groups
-from datamodules.stanford2d3ds.files import (
-    AREAS,
-    CLASSES,
-    EIGHT,
-    FOLDS,
-    UNKNOWN_CLASS,
-)
-from datamodules.synthrooms.camera import CAMERA_FROM_SPHERE, euler_rotation
-from tangent_train.errors import DataError, SettingError
+from datamodules.stanford2d3ds import files as stanford
+from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
 from tangent_train.io.pixel_files import read_depth_m
@@ -65,31 +56,15 @@ GET_IT = (
 """Remedy if the data set is missing."""
 
 _NAME = re.compile(
-    r"camera_([0-9a-f]{32})_([A-Za-z]+)_(\d+)_frame_(equirectangular|\d+)_domain_rgb\.png"
+    r"camera_([0-9a-f]{32})_([A-Za-z]+_\d+)_frame_(equirectangular|\d+)_domain_rgb\.png"
 )
 _CENTERS_FROM_CORNERS = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
-_THIRTEEN = LabelMap.of(CLASSES)
-
-
-class PictureFiles(NamedTuple):
-    """One panorama (`pano`) or photo (`data`).
-
-    Attributes:
-        area: One of `AREAS`.
-        room: Building, kind and number of the room; 5a and 5b are one building.
-        camera: 32 hexadecimal digits.
-        image: Files of the image, named ``area_3/office_2/<32 hex>``; for photos, ``…/<frame>``.
-    """
-
-    area: str
-    room: tuple[str, str, int]
-    camera: str
-    image: ImageFiles
+_THIRTEEN = LabelMap.of(stanford.CLASSES)
 
 
 def list_pictures(
     root: Path, area: str, group: Literal["pano", "data"], with_depth: bool, problems: Problems
-) -> list[PictureFiles]:
+) -> list[ImageFiles]:
     """List the panoramas or photos of an area in the order of their names.
 
     Args:
@@ -98,9 +73,11 @@ def list_pictures(
         group: Panoramas or photos.
         with_depth: True to list depth files too.
         problems: Collects problems: no images, or unknown files.
+
+    Returns:
+        Images named ``area_3/office_2/<32 hex>``; photos, ``…/<frame>``.
     """
-    folder = root / f"area_{area}" / group
-    found = []
+    folder, found = root / f"area_{area}" / group, []
     # Hidden files are leftovers of archives made on a Mac.
     images = sorted((folder / "rgb").glob("[!.]*.png"))
     with problems.noted():
@@ -113,19 +90,30 @@ def list_pictures(
             if name is None:
                 expected = "camera_<32 hex>_<room>_<n>_frame_<frame>_domain_rgb.png"
                 raise DataError(rgb, found="an unknown file name", expected=expected)
-            camera, kind, number, frame = name.groups()
-            semantic, depth, pose = (
-                folder / end.partition(".")[0] / (rgb.name.removesuffix("rgb.png") + end)
-                for end in ("semantic.png", "depth.png", "pose.json")
-            )
+            camera, room, frame = name.groups()
             is_photo = group == "data"
-            title = f"area_{area}/{kind}_{number}/{camera}" + (f"/{frame}" if is_photo else "")
-            image = ImageFiles(
-                title, rgb, semantic, depth if with_depth else None, pose if is_photo else None
+            files = ImageFiles(
+                f"area_{area}/{room}/{camera}" + (f"/{frame}" if is_photo else ""),
+                rgb,
+                sibling(rgb, "semantic.png"),
+                sibling(rgb, "depth.png") if with_depth else None,
+                sibling(rgb, "pose.json") if is_photo else None,
             )
-            room = area.rstrip("ab"), kind, int(number)
-            found.append(PictureFiles(area, room, camera, image))
+            found.append(files)
     return found
+
+
+def sibling(rgb: Path, end: str) -> Path:
+    """Return another file of an image, e.g. its ``pose.json``."""
+    name = rgb.name.removesuffix("rgb.png") + end
+    return rgb.parents[1] / end.partition(".")[0] / name
+
+
+def room_of(files: ImageFiles) -> tuple[str, str, int]:
+    """Return building, kind and number of a room; 5a and 5b are one building."""
+    area, room, *_ = files.name.removeprefix("area_").split("/")
+    kind, _, number = room.rpartition("_")
+    return area.rstrip("ab"), kind, int(number)
 
 
 def read_label_table(path: Path) -> LabelMap:
@@ -138,15 +126,14 @@ def read_label_table(path: Path) -> LabelMap:
     Raises:
         DataError: The file cannot be read or is not such a list.
     """
-    expected = "semantic_labels.json of the release: a list of names"
-    labels = {UNKNOWN_CLASS: 0} | {name: i for i, name in enumerate(CLASSES, start=1)}
-    classes = [name.partition("_")[0] for name in read_json(path, expected, kind=list[str])]
-    if strange := sorted(set(classes) - set(labels)):
-        raise DataError(path, found=f"class {strange[0]!r}", expected=expected)
-    colors: dict[int | str, int] = {
-        f"#{instance:06x}": labels[name] for instance, name in enumerate(classes)
+    labels = {stanford.UNKNOWN_CLASS: 0} | {
+        name: i for i, name in enumerate(stanford.CLASSES, start=1)
     }
-    return LabelMap(CLASSES, colors, refuses_others=False)
+    instances = read_json(path, "semantic_labels.json of the release", kind=list[str])
+    colors: dict[int | str, int] = {
+        f"#{k:06x}": labels[name.partition("_")[0]] for k, name in enumerate(instances)
+    }
+    return LabelMap(stanford.CLASSES, colors, refuses_others=False)
 
 
 @data_set
@@ -167,45 +154,38 @@ class StanfordImages(ImageDataModule):
 
     label_maps: ClassVar[Mapping[str, LabelMap]] = {
         "13": _THIRTEEN,
-        "8": _THIRTEEN.regrouped(LabelMap.grouped(EIGHT)),
+        "8": _THIRTEEN.regrouped(stanford.EIGHT),
     }
     group: ClassVar[Literal["pano", "data"]]
+    get_it = GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("areas",)
-    folds: ClassVar[tuple[int, ...]] = tuple(FOLDS)
+    folds: ClassVar[tuple[int, ...]] = tuple(stanford.FOLDS)
 
     fold: Literal[1, 2, 3] = 1
-    areas: Sequence[Literal["1", "2", "3", "4", "5a", "5b", "6"]] = AREAS  # type: ignore[assignment]
+    areas: Sequence[stanford.Area] = stanford.AREAS
     label_table: Path | None = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        areas, testing = set(self.areas), set(FOLDS[self.fold])
-        if not (testing & areas and areas - testing):
-            expected = f"some for testing ({', '.join(FOLDS[self.fold])}) and some for training"
-            raise SettingError("data.areas", found=list(self.areas), expected=expected)
+        testing = set(self.areas) & set(stanford.FOLDS[self.fold])
+        expected = (
+            f"some for testing ({', '.join(stanford.FOLDS[self.fold])}) and some for training"
+        )
+        self.refuse("areas", not testing or testing == set(self.areas), expected)
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ImageFiles]]:
-        pictures = [
-            picture
-            for area in self.areas
-            for picture in list_pictures(
-                self.root, area, self.group, self.reads_depth, self.problems
-            )
-        ]
-        training = [picture for picture in pictures if picture.area not in FOLDS[self.fold]]
+        training: list[ImageFiles] = []
+        test: list[ImageFiles] = []
+        for area in self.areas:
+            part = test if area in stanford.FOLDS[self.fold] else training
+            part += list_pictures(self.root, area, self.group, self.reads_depth, self.problems)
         rooms: set[tuple[str, str, int]] = set()
         if self.val_fraction:
-            rooms = draw_groups((p.room for p in training), self.val_fraction, self.seed)
-        return {
-            "train": [picture.image for picture in training if picture.room not in rooms],
-            "val": [picture.image for picture in training if picture.room in rooms],
-            "test": [picture.image for picture in pictures if picture.area in FOLDS[self.fold]],
-        }
+            rooms = draw_groups(map(room_of, training), self.val_fraction, self.seed)
+        val = [files for files in training if room_of(files) in rooms]
+        train = [files for files in training if room_of(files) not in rooms]
+        return {"train": train, "val": val, "test": test}
 
     @cached_property
     def _label_table(self) -> LabelMap:
@@ -213,7 +193,7 @@ class StanfordImages(ImageDataModule):
         label_map: Any = self.label_map
         places = [self.root / folder / "semantic_labels.json" for folder in ("", "assets")]
         path = self.label_table or next(filter(Path.is_file, places), places[0])
-        return read_label_table(path).regrouped(LabelMap.grouped(label_map.names))
+        return read_label_table(path).regrouped(label_map.names)
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
         """See `ImageDataModule`: by the class table."""
@@ -222,12 +202,11 @@ class StanfordImages(ImageDataModule):
 
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""
-        path: Any = files.depth
-        return read_depth(path)
+        return read_depth(files.depth)
 
     def pose(self, files: ImageFiles) -> PanoramaPose | None:
         """See `ImageDataModule`: by the pose file, if there is one."""
-        path = pose_file(files)
+        path = sibling(files.rgb, "pose.json")
         if not path.is_file():
             return None
         return read_panorama_pose(path) if files.camera is None else read_photo_pose(path)
@@ -256,16 +235,11 @@ class Stanford2D3DSPerspective(StanfordImages, PhotoDataModule):
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`: by the pose file."""
-        return read_camera_matrix(pose_file(files))
+        matrix: NDArray[np.float64] = np.array(_read_pose_file(files.camera).camera_k_matrix)
+        return _CENTERS_FROM_CORNERS @ matrix
 
 
-def pose_file(files: ImageFiles) -> Path:
-    """Return the pose file of an image."""
-    name = files.rgb.name.removesuffix("rgb.png") + "pose.json"
-    return files.rgb.parents[1] / "pose" / name
-
-
-def read_depth(path: Path) -> NDArray[np.uint16]:
+def read_depth(path: Any) -> NDArray[np.uint16]:
     """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
@@ -285,25 +259,9 @@ class _PoseRecord(BaseModel):
     camera_location: tuple[float, float, float]
 
 
-def _read_pose_file(path: Path) -> _PoseRecord:
+def _read_pose_file(path: Any) -> _PoseRecord:
     record: _PoseRecord = read_json(path, "a pose file of the release", kind=_PoseRecord)
     return record
-
-
-def read_camera_matrix(path: Path) -> NDArray[np.float64]:
-    """Read the camera matrix of a pose file.
-
-    Args:
-        path: ``camera_…_domain_pose.json``.
-
-    Returns:
-        ``(3, 3)`` K for integer pixel centers (the file counts from pixel corners).
-
-    Raises:
-        DataError: The file is missing or broken.
-    """
-    matrix: NDArray[np.float64] = np.array(_read_pose_file(path).camera_k_matrix)
-    return _CENTERS_FROM_CORNERS @ matrix
 
 
 def read_panorama_pose(path: Path) -> PanoramaPose:
@@ -319,14 +277,14 @@ def read_panorama_pose(path: Path) -> PanoramaPose:
     angles = np.array(record.camera_original_rotation)
     if np.abs(angles).max() > 2 * math.pi:
         angles = np.radians(angles)
-    original = euler_rotation(angles)
+    original = stanford.euler_rotation(angles)
     rotation = np.array(record.camera_rt_matrix)[:3, :3]
-    world_from_panorama = original @ rotation @ original @ CAMERA_FROM_SPHERE
-    return _checked_pose(path, world_from_panorama, np.array(record.camera_location))
+    world_from_panorama = original @ rotation @ original @ stanford.CAMERA_FROM_SPHERE
+    return PanoramaPose(world_from_panorama, record.camera_location)
 
 
 def read_photo_pose(path: Path) -> PanoramaPose:
-    """Read the pose of a photo, in the axes of `LabeledImage`.
+    """Read the pose of a photo, in the axes of `ImageDataModule.pose`.
 
     The camera matrix [R | t] of the file takes points of the world to the camera: x right, y down,
     z forward. This was tested with SynthRooms.
@@ -339,14 +297,6 @@ def read_photo_pose(path: Path) -> PanoramaPose:
     """
     rt = np.array(_read_pose_file(path).camera_rt_matrix)
     world_from_camera = rt[:3, :3].T
-    location_m = -world_from_camera @ rt[:3, 3]
-    return _checked_pose(path, world_from_camera @ CAMERA_FROM_SPHERE, location_m)
-
-
-def _checked_pose(
-    path: Path, world_from_panorama: NDArray[np.float64], location_m: NDArray[np.float64]
-) -> PanoramaPose:
-    try:
-        return PanoramaPose(world_from_panorama, location_m)
-    except SettingError as error:
-        raise DataError(path, found=error.found, expected="a rotation") from error
+    return PanoramaPose(
+        world_from_camera @ stanford.CAMERA_FROM_SPHERE, -world_from_camera @ rt[:3, 3]
+    )

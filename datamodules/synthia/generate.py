@@ -8,7 +8,7 @@ including labels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -18,8 +18,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.images import distance_from_z_depth
-from datamodules.core.problems import Problems
+from datamodules.core.depth import distance_from_z_depth
+from datamodules.core.files import Problems
 from datamodules.synthia import reader
 from tangent_train.geometry import (
     equirect_latitudes,
@@ -140,41 +140,30 @@ def make_panoramas(
     """
     for sequence in sequences:
         folder = reader.sequence_folder(root, sequence)
-        is_published = (
-            any(folder.glob("pano/RGB/*.png")) and not (folder / "pano" / MANIFEST).exists()
-        )
+        is_generated = (folder / "pano" / MANIFEST).exists()
         views = reader.list_frames(folder)
-        if is_published or not views:
+        if not views or (any(folder.glob("pano/RGB/*.png")) and not is_generated):
             continue
         settings = {"generator": "OmniSYNTHIA", "frames": frames, "height": height}
-        manifest = Manifest.open(folder / "pano", settings)
+        manifest = Manifest.open(folder / "pano", settings, is_shared=True)
         chosen = reader.choose_frames(views, frames)
         missing = manifest.missing(chosen)
-        first = reader.view_files(root, sequence, chosen[0], reader.VIEWS[0], with_depth=False)
-        size = read_image_size(first.rgb)
+        size = read_image_size(reader.view_files(folder, chosen[0], reader.VIEWS[0]).rgb)
         stitcher = ViewStitcher(reader.read_view_camera(folder, size), size, height)
-        make = partial(_make, stitcher, root, sequence, problems)
+        make = partial(_make, stitcher, folder, problems, manifest)
         # Threads, as fast as processes: OpenCV releases the GIL, and the tables are shared.
         # Closed, so that an interrupt drops queued work.
         with closing(in_threads(make, missing)) as made:
-            done = _note_finished(made, manifest)
             before = len(chosen) - len(missing)
-            show_progress(done, f"Making panoramas of {sequence}", "panoramas", len(chosen), before)
-
-
-def _note_finished(made: Iterable[str | None], manifest: Manifest) -> Iterator[None]:
-    for frame in made:
-        if frame is not None:
-            manifest.finish(frame)
-        yield
+            show_progress(made, f"Making panoramas of {sequence}", "panoramas", len(chosen), before)
 
 
 def _make(
-    stitcher: ViewStitcher, root: Path, sequence: str, problems: Problems, frame: str
-) -> str | None:
-    """Write the panorama of a frame; return the frame, or None if a view is broken."""
-    target = reader.panorama_files(root, sequence, frame, with_depth=True)
-    views = [reader.view_files(root, sequence, frame, v, with_depth=True) for v in reader.VIEWS]
+    stitcher: ViewStitcher, folder: Path, problems: Problems, manifest: Manifest, frame: str
+) -> None:
+    """Write the panorama of a frame, unless a view is broken."""
+    target = reader.panorama_files(folder, frame)
+    views = [reader.view_files(folder, frame, view) for view in reader.VIEWS]
     with problems.noted(target.name):
         depth = [reader.read_first_channel(view.depth) for view in views]
         far = [distance_from_z_depth(one, stitcher.camera_matrix) for one in depth]
@@ -186,5 +175,4 @@ def _make(
         }
         for path, image in parts.items():
             write_pixels(path, image)
-        return frame
-    return None  # type: ignore[unreachable]  # the error was noted
+        manifest.finish(frame)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cached_property
 from itertools import chain
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -25,16 +24,14 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.images import ImageFiles, units_to_steps
+from datamodules.core.depth import units_to_steps
+from datamodules.core.files import ImageFiles, Problems, Split
+from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.inputs import RGBD_NORMALIZATION, Input, Normalization
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split
 from datamodules.synthia import reader
 from datamodules.synthia.generate import HEIGHT, make_panoramas
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_image_size
 
 # YAML reads 01 as a number.
@@ -77,6 +74,7 @@ class SynthiaSequences(ImageDataModule):
     label_maps: ClassVar[Mapping[str, LabelMap]] = {"13": _LABELS}
     normalizations = _NORMALIZATIONS
     units_per_m = 100
+    get_it = reader.GET_IT
     fact_settings: ClassVar[tuple[str, ...]] = ("test_sequences",)
 
     inputs: Sequence[Input] = ("rgb",)
@@ -86,36 +84,30 @@ class SynthiaSequences(ImageDataModule):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if both := set(self.train_sequences) & set(self.test_sequences):
-            expected = "sequences that are not for training"
-            raise SettingError("data.test_sequences", found=", ".join(both), expected=expected)
+        both = set(self.train_sequences) & set(self.test_sequences)
+        self.refuse("test_sequences", both, "sequences that are not for training")
 
     @abstractmethod
     def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """Return the images of every frame of a sequence, if any."""
 
-    def files(self, split: Split) -> Sequence[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        return self._divided[split]
-
-    @cached_property
-    def _divided(self) -> dict[Split, list[ImageFiles]]:
         splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
         for sequence in (*self.train_sequences, *self.test_sequences):
             found = self.list_images(sequence)
             if not found:
-                folder, expected = reader.sequence_folder(self.root, sequence), "000000.png …"
-                raise DataError(
-                    folder, found=f"no {self.noun}", expected=expected, remedy=reader.GET_IT
-                )
-            if sequence in self.test_sequences:
-                splits["test"] += chain.from_iterable(found)
-                continue
+                folder, none = reader.sequence_folder(self.root, sequence), f"no {self.noun}"
+                expected = "000000.png …"
+                raise DataError(folder, found=none, expected=expected, remedy=reader.GET_IT)
+            if not self.reads_depth:
+                found = [[files._replace(depth=None) for files in frame] for frame in found]
             # Neighboring frames are nearly identical: validation takes those at the end.
             held = min(max(1, round(self.val_fraction * len(found))), len(found) - 1)
             last = len(found) - held if self.val_fraction else len(found)
-            splits["train"] += chain.from_iterable(found[:last])
-            splits["val"] += chain.from_iterable(found[last:])
+            is_test = sequence in self.test_sequences
+            splits["test" if is_test else "train"] += chain.from_iterable(found[:last])
+            splits["test" if is_test else "val"] += chain.from_iterable(found[last:])
         return splits
 
     def decode_labels(self, files: ImageFiles) -> NDArray[np.uint8]:
@@ -155,17 +147,14 @@ class OmniSynthia(SynthiaSequences, PanoramaDataModule):
         sequences = (*self.train_sequences, *self.test_sequences)
         size = {"frames": self.frames, "height": self.panorama_height}
         make_panoramas(self.root, sequences, broken, **size)
-        vars(self).pop("_divided", None)  # listed before there were files
         if not self.skip_broken:
             broken.refuse(self.root, "data.skip_broken=true leaves out these frames.")
 
     def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
         folder = reader.sequence_folder(self.root, sequence)
-        return [
-            [reader.panorama_files(self.root, sequence, frame, with_depth=self.reads_depth)]
-            for frame in reader.list_panorama_frames(folder)
-        ]
+        frames = reader.list_frames(folder, "pano/RGB")
+        return [[reader.panorama_files(folder, frame)] for frame in frames]
 
 
 @data_set
@@ -174,14 +163,9 @@ class SynthiaPerspective(SynthiaSequences, PhotoDataModule):
 
     def list_images(self, sequence: str) -> list[list[ImageFiles]]:
         """See `SynthiaSequences`."""
-        frames = reader.list_frames(reader.sequence_folder(self.root, sequence))
-        return [
-            [
-                reader.view_files(self.root, sequence, frame, view, with_depth=self.reads_depth)
-                for view in reader.VIEWS
-            ]
-            for frame in reader.choose_frames(frames, self.frames)
-        ]
+        folder = reader.sequence_folder(self.root, sequence)
+        frames = reader.choose_frames(reader.list_frames(folder), self.frames)
+        return [[reader.view_files(folder, frame, v) for v in reader.VIEWS] for frame in frames]
 
     def decode_camera(self, files: ImageFiles) -> NDArray[np.float64]:
         """See `ImageDataModule`: the camera of all views of the sequence."""

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from tangent_train.errors import DataError
 from tangent_train.io.pixel_files import read_pixels
 
@@ -47,19 +47,8 @@ _CAMERA = "532.740352 640 380"  # of views of that size, center from pixel corne
 _NAME = "[0-9]" * 6 + ".png"
 
 CLASSES: tuple[str, ...] = (
-    "sky",
-    "building",
-    "road",
-    "sidewalk",
-    "fence",
-    "vegetation",
-    "pole",
-    "car",
-    "traffic sign",
-    "pedestrian",
-    "bicycle",
-    "lane marking",
-    "traffic light",
+    *("sky", "building", "road", "sidewalk", "fence", "vegetation", "pole", "car"),
+    *("traffic sign", "pedestrian", "bicycle", "lane marking", "traffic light"),
 )
 """The classes as labels 1 to 13. In the files traffic lights are 15; 13 and 14 are reserved."""
 
@@ -77,44 +66,40 @@ def sequence_folder(root: Path, sequence: str) -> Path:
     return root / f"SYNTHIA-SEQS-{sequence}-SUMMER"
 
 
-def view_files(root: Path, sequence: str, frame: str, view: str, *, with_depth: bool) -> ImageFiles:
-    """Return the files of one of `VIEWS` of a frame, e.g. ``000000``."""
-    folder = sequence_folder(root, sequence)
+def view_files(folder: Path, frame: str, view: str) -> ImageFiles:
+    """Return the files of one of `VIEWS` of a frame, e.g. ``000000``, of a sequence."""
     place = f"Stereo_Left/Omni_{view}/{frame}.png"
     camera = _camera_file(folder)
     return ImageFiles(
-        f"sequence_{sequence}/{frame}/{view}",
+        f"{_title(folder)}/{frame}/{view}",
         folder / "RGB" / place,
         folder / "GT" / "LABELS" / place,
-        folder / "Depth" / place if with_depth else None,
+        folder / "Depth" / place,
         camera if camera.exists() else None,
     )
 
 
-def panorama_files(root: Path, sequence: str, frame: str, *, with_depth: bool) -> ImageFiles:
-    """Return the files of the panorama of a frame, e.g. ``000000``."""
-    pano, name = sequence_folder(root, sequence) / "pano", f"{frame}.png"
+def panorama_files(folder: Path, frame: str) -> ImageFiles:
+    """Return the files of the panorama of a frame, e.g. ``000000``, of a sequence."""
+    pano, name = folder / "pano", f"{frame}.png"
+    labels = pano / "GT" / "LABELS_Correct" / name
     return ImageFiles(
-        f"sequence_{sequence}/{frame}",
-        pano / "RGB" / name,
-        pano / "GT" / "LABELS_Correct" / name,
-        pano / "Depth" / name if with_depth else None,
+        f"{_title(folder)}/{frame}", pano / "RGB" / name, labels, pano / "Depth" / name
     )
 
 
-def list_frames(folder: Path) -> list[str]:
-    """List frames with a color image of a view, e.g. ``000000``, in order."""
-    return _names(*(folder / "RGB" / "Stereo_Left" / f"Omni_{view}" for view in VIEWS))
+def _title(folder: Path) -> str:
+    return f"sequence_{folder.name.split('-')[2]}"
 
 
-def list_panorama_frames(folder: Path) -> list[str]:
-    """List frames with the color image of a panorama, in order."""
-    return _names(folder / "pano" / "RGB")
+def list_frames(folder: Path, images: str = "RGB/Stereo_Left/Omni_[FRBL]") -> list[str]:
+    """List frames with a color image of a view, e.g. ``000000``, in order.
 
-
-def _names(*folders: Path) -> list[str]:
-    # A folder that is missing or unreadable has no frames.
-    return sorted({path.stem for folder in folders for path in folder.glob(_NAME)})
+    Args:
+        folder: Folder of the sequence.
+        images: Folders of the images in it; ``pano/RGB`` for panoramas.
+    """
+    return sorted({path.stem for path in folder.glob(f"{images}/{_NAME}")})
 
 
 def choose_frames(frames: Sequence[str], count: int = FRAMES) -> list[str]:

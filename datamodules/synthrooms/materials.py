@@ -7,45 +7,25 @@ Colors are display values in [0, 1]; light is computed with their squares (a gam
 from __future__ import annotations
 
 import colorsys
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from enum import IntEnum
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-MaterialTable = dict[str, NDArray[Any]]
+Limits = tuple[float, float]
+_COMMON_SHARES = (0.47, 0.1, 0.07, 0.2, 0.16)  # of the first patterns
 
 
-class Pattern(IntEnum):
-    """Procedural textures; the last four are for one kind of object each."""
-
-    PLAIN = 0
-    STRIPES = 1
-    TILES = 2
-    WOOD = 3
-    SPECKLE = 4
-    BOOKS = 5
-    STROKES = 6
-    PAPERS = 7
-    OUTSIDE = 8
-
-
-_COMMON = (Pattern.PLAIN, Pattern.STRIPES, Pattern.TILES, Pattern.WOOD, Pattern.SPECKLE)
-_COMMON_SHARES = (0.47, 0.1, 0.07, 0.2, 0.16)
-
-
-@dataclass(frozen=True)
-class Material:
+class Material(NamedTuple):
     """Surface of one part of an object.
 
     Attributes:
         color: Main color, display values.
         second: The pattern's other color.
-        pattern: Procedural texture.
+        pattern: Index of the procedural texture in `_PATTERNS`.
         frequency: Repetitions per meter.
         contrast: Strength of the fine mottling that every surface has.
         offset: Shift of the texture in meters.
@@ -55,7 +35,7 @@ class Material:
 
     color: NDArray[np.float64]
     second: NDArray[np.float64]
-    pattern: Pattern
+    pattern: int
     frequency: float
     contrast: float
     offset: NDArray[np.float64]
@@ -64,8 +44,12 @@ class Material:
 
     def shaded(self, factor: float) -> Material:
         """Return the material in a lighter or darker color, without its pattern."""
-        color = np.clip(self.color * factor, 0.02, 0.98)
-        return replace(self, color=color, pattern=Pattern.PLAIN)
+        return self._replace(color=np.clip(self.color * factor, 0.02, 0.98), pattern=0)
+
+
+SURFACE = np.dtype("3f4, 3f4, i8, f4, f4, 2f4, f4, ?", align=True)
+SURFACE.names = Material._fields
+"""A `Material` as an element of an array."""
 
 
 class Palette:
@@ -79,12 +63,9 @@ class Palette:
         self._rng = rng
         vivid = [self.hsv((0, 1), (0, 0.7), (0.2, 0.95)) for _ in range(5)]
         woody = [self.hsv((0.05, 0.12), (0.2, 0.65), (0.3, 0.85)) for _ in range(2)]
-        pale = [self.pale() for _ in range(3)]
-        self._colors = np.array([*vivid, *woody, *pale])
+        self._colors = np.array([*vivid, *woody, *(self.pale() for _ in range(3))])
 
-    def hsv(
-        self, hue: tuple[float, float], saturation: tuple[float, float], value: tuple[float, float]
-    ) -> NDArray[np.float64]:
+    def hsv(self, hue: Limits, saturation: Limits, value: Limits) -> NDArray[np.float64]:
         """Draw a color uniformly between the limits of hue, saturation and value."""
         drawn = [self._rng.uniform(*limits) for limits in (hue, saturation, value)]
         return np.array(colorsys.hsv_to_rgb(*drawn))
@@ -101,62 +82,40 @@ class Palette:
 
     def material(
         self,
-        *patterns: Pattern,
+        *patterns: str,
         color: NDArray[np.float64] | None = None,
-        second: NDArray[np.float64] | None = None,
-        frequency: tuple[float, float] = (1.5, 8.0),
-        emission: float = 0.0,
-        unscanned: bool = False,
+        frequency: Limits = (1.5, 8.0),
+        **given: Any,
     ) -> Material:
         """Draw a material.
 
         Args:
             *patterns: Patterns to choose from; the common ones by default.
             color: Main color; one of the room's by default.
-            second: The pattern's color; a relative of the main one by default.
             frequency: Limits of the pattern's repetitions per meter.
-            emission: See `Material`.
-            unscanned: See `Material`.
+            **given: Other attributes of `Material`, which are not drawn.
         """
         rng = self._rng
         base = self.color() if color is None else color
-        related = np.clip(base * rng.uniform(0.5, 1.3) + rng.normal(0, 0.05, 3), 0.02, 0.98)
+        second = np.clip(base * rng.uniform(0.5, 1.3) + rng.normal(0, 0.05, 3), 0.02, 0.98)
         if patterns:
-            pattern = patterns[rng.integers(len(patterns))]
+            pattern = _PATTERNS.index(patterns[rng.integers(len(patterns))])
         else:
-            pattern = _COMMON[rng.choice(len(_COMMON), p=_COMMON_SHARES)]
-        return Material(
-            color=base,
-            second=related if second is None else second,
-            pattern=pattern,
-            frequency=rng.uniform(*frequency),
-            contrast=rng.uniform(0.03, 0.14),
-            offset=rng.uniform(0, 50, 2),
-            emission=emission,
-            unscanned=unscanned,
-        )
+            pattern = int(rng.choice(len(_COMMON_SHARES), p=_COMMON_SHARES))
+        repetitions, contrast = rng.uniform(*frequency), rng.uniform(0.03, 0.14)
+        drawn = Material(base, second, pattern, repetitions, contrast, rng.uniform(0, 50, 2))
+        return drawn._replace(**given)
 
 
-_TYPES = {"pattern": np.int64, "unscanned": np.bool_}
 _NOISE: Floats = np.random.default_rng(0).random((256, 256), dtype=np.float32)
 _NOISE_ROW = 1024  # cv2.remap takes at most 32,767 columns
-
-
-def material_table(materials: Sequence[Material]) -> MaterialTable:
-    """Return an array ``(n, ...)`` for each attribute of materials."""
-    return {
-        field.name: np.array(
-            [getattr(m, field.name) for m in materials], _TYPES.get(field.name, np.float32)
-        )
-        for field in fields(Material)
-    }
 
 
 def _noise(x: NDArray[np.floating[Any]], y: NDArray[np.floating[Any]]) -> Floats:
     """Return smooth noise in [0, 1] with one knot per unit, the same in all rooms."""
     size = -(-len(x) // _NOISE_ROW) * _NOISE_ROW
     xy = np.zeros((2, size), np.float32)
-    xy[0, : len(x)], xy[1, : len(x)] = np.mod(x, 256), np.mod(y, 256)
+    xy[:, : len(x)] = np.mod(x, 256), np.mod(y, 256)
     maps = xy.reshape(2, -1, _NOISE_ROW)
     noise = cv2.remap(_NOISE, maps[0], maps[1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
     return noise.reshape(-1)[: len(x)]
@@ -184,27 +143,27 @@ def _outside(u: Floats, v: Floats, f: Floats) -> NDArray[Any]:
     return np.where(v < skyline, 0.75 + 0.25 * _noise(u * 3, v * 3), 0)
 
 
-_WEIGHTS: dict[int, Callable[[Floats, Floats, Floats], NDArray[Any]]] = {
-    Pattern.STRIPES: lambda u, v, f: np.mod(u * f, 1) < 0.45,
-    Pattern.TILES: lambda u, v, f: (np.mod(u * f, 1) < 0.05) | (np.mod(v * f, 1) < 0.05),
-    Pattern.WOOD: lambda u, v, f: 0.6 * _noise(u * 1.2, v * 24) + 0.4 * (np.mod(v * f, 1) < 0.04),
-    Pattern.SPECKLE: lambda u, v, f: _noise(u * 60, v * 60),
-    Pattern.BOOKS: lambda u, v, f: _hash(np.floor(u * f), 0.0),
-    Pattern.STROKES: _strokes,
-    Pattern.PAPERS: _papers,
-    Pattern.OUTSIDE: _outside,
+_WEIGHTS: dict[str, Callable[[Floats, Floats, Floats], NDArray[Any]]] = {
+    "stripes": lambda u, v, f: np.mod(u * f, 1) < 0.45,
+    "tiles": lambda u, v, f: (np.mod(u * f, 1) < 0.05) | (np.mod(v * f, 1) < 0.05),
+    "wood": lambda u, v, f: 0.6 * _noise(u * 1.2, v * 24) + 0.4 * (np.mod(v * f, 1) < 0.04),
+    "speckle": lambda u, v, f: _noise(u * 60, v * 60),
+    "books": lambda u, v, f: _hash(np.floor(u * f), 0.0),
+    "strokes": _strokes,
+    "papers": _papers,
+    "outside": _outside,
 }
 """Weight of the second color at positions u, v in meters, with f repetitions per meter."""
 
+_PATTERNS = ("plain", *_WEIGHTS)
+"""Procedural textures; the last four are for one kind of object each."""
 
-def albedo(
-    materials: MaterialTable, rows: NDArray[np.int64], points: Floats, normals: Floats
-) -> Floats:
+
+def albedo(surface: NDArray[np.void], points: Floats, normals: Floats) -> Floats:
     """Return the albedo of surface points.
 
     Args:
-        materials: From `material_table`.
-        rows: ``(n,)`` material of every point.
+        surface: ``(n,)`` material of every point, of type `SURFACE`; overwritten.
         points: ``(n, 3)`` in meters; textures are projected along the main axis of the normal.
         normals: ``(n, 3)``.
 
@@ -214,23 +173,22 @@ def albedo(
     axis = np.abs(normals).argmax(axis=1)
     u = np.where(axis == 0, points[:, 1], points[:, 0])
     v = np.where(axis == 2, points[:, 1], points[:, 2])
-    surface = {name: values[rows] for name, values in materials.items()}
-    pattern, frequency = surface["pattern"], surface["frequency"]
-    offset, color = surface["offset"], surface["color"]
-    weight = np.zeros(len(rows), np.float32)
-    for kind, weigh in _WEIGHTS.items():
-        chosen = np.flatnonzero(pattern == kind)
+    color = surface["color"]
+    weight = np.zeros(len(surface), np.float32)
+    for name, weigh in _WEIGHTS.items():
+        chosen = np.flatnonzero(surface["pattern"] == _PATTERNS.index(name))
         if len(chosen) == 0:
             continue
+        offset, frequency = surface["offset"][chosen], surface["frequency"][chosen]
         # The view outside keeps its horizon; other textures are shifted at random.
-        shift = 0 if kind == Pattern.OUTSIDE else offset[chosen, 1]
-        uc, vc, fc = u[chosen] + offset[chosen, 0], v[chosen] + shift, frequency[chosen]
-        weight[chosen] = weigh(uc, vc, fc)
-        if kind == Pattern.BOOKS:
-            cell = np.floor(uc * fc)
+        shift = 0 if name == "outside" else offset[:, 1]
+        u_shifted = u[chosen] + offset[:, 0]
+        weight[chosen] = weigh(u_shifted, v[chosen] + shift, frequency)
+        if name == "books":
+            cell = np.floor(u_shifted * frequency)
             tint = np.stack([_hash(cell, salt) for salt in (2.0, 3.0, 4.0)], axis=1)
             color[chosen] = np.clip(color[chosen] * (0.5 + tint), 0, 1)
     color += weight[:, None] * (surface["second"] - color)
     coarse, fine = (_noise(u * k, v * k) - np.float32(0.5) for k in (2.3, 31.0))
     color *= (1 + surface["contrast"] * (2 * coarse + fine))[:, None]
-    return np.clip(color, 0, 1, out=color) ** 2
+    return np.clip(color, 0, 1) ** 2

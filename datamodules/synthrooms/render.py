@@ -1,23 +1,29 @@
-"""Rendering of rooms: ray casting with Embree, shading, exposure, noise, and holes in the scan."""
+"""Views of rooms: ray casting with Embree, shading, exposure, noise, and holes in the scan.
+
+Room coordinates are right-handed, in meters, z up. Camera axes are x right, y down, z forward, as
+in `tangent_train.geometry`. The pose of a panorama is that of an upright camera that faces the
+middle of the panorama, see `datamodules.stanford2d3ds.files`.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import PictureRays
-from datamodules.synthrooms.layout import FloorPlan
-from datamodules.synthrooms.materials import albedo, material_table
+from datamodules.stanford2d3ds.files import BLENDER, CAMERA_FROM_SPHERE
+from datamodules.synthrooms.materials import SURFACE, Floats, albedo
 from datamodules.synthrooms.room import Light, Room
+from tangent_train import geometry
 
-Floats = NDArray[np.float32]
+ViewKind = Literal["stanford", "wide", "uniform"]
+"""Viewing directions of photos, see `RoomSettings.views`."""
 
 MISSING = -1
 """Item number of pixels without a scan."""
@@ -32,6 +38,102 @@ _HEIGHTS = (1.3, 1.7)
 _CLEAR = 0.55  # meters around a camera that should be free
 _APART = 1.2  # meters between the cameras of a room
 _PLACES = 60  # locations tried for every camera
+
+
+@dataclass(frozen=True)
+class View:
+    """A panorama, or a square pinhole image.
+
+    Attributes:
+        location: ``(3,)`` center in meters.
+        world_from_camera: ``(3, 3)``; its columns are the camera's right, down and forward.
+        size: Rows in pixels.
+        fov_rad: Field of view between the outer pixel edges; None for a panorama of twice as many
+            columns.
+    """
+
+    location: NDArray[np.float64]
+    world_from_camera: NDArray[np.float64]
+    size: int
+    fov_rad: float | None = None
+
+    @classmethod
+    def looking(
+        cls,
+        location: NDArray[np.float64],
+        size: int,
+        fov_rad: float | None = None,
+        *,
+        heading: float,
+        pitch: float = 0.0,
+        roll: float = 0.0,
+    ) -> View:
+        """Return the view for some angles in radians.
+
+        Args:
+            location: ``(3,)`` center in meters.
+            size: Rows in pixels.
+            fov_rad: Field of view; None for a panorama.
+            heading: Counterclockwise from the room's x axis, seen from above.
+            pitch: Upward tilt.
+            roll: Clockwise as seen by the camera; the picture tilts counterclockwise.
+        """
+        x, _, z = np.eye(3)
+        turns = ((z, heading - math.pi / 2), (x, math.pi / 2 + pitch), (z, -roll))
+        yaw, tilt, tip = (geometry.rotation_about(axis, angle) for axis, angle in turns)
+        return cls(location, yaw @ tilt @ tip @ BLENDER, size, fov_rad)
+
+    @property
+    def camera_matrix(self) -> NDArray[np.float64]:
+        """``(3, 3)`` K for integer pixel centers; of one cube face for a panorama."""
+        fov_deg = math.degrees(self.fov_rad or math.pi / 2)
+        return geometry.camera_matrix_from_fov(fov_deg, (self.size, self.size))
+
+    def rays(self, dx: float = 0.0, dy: float = 0.0) -> Floats:
+        """Return the room directions of all pixels, shifted by (dx, dy) pixels: ``(h, w, 3)``."""
+        if self.fov_rad is not None:
+            moved = self.camera_matrix
+            moved[:2, 2] -= (dx, dy)
+            directions = geometry.perspective_directions(moved, (self.size, self.size)).astype(
+                np.float32
+            )
+            return directions @ self.world_from_camera.T.astype(np.float32)
+        lon = geometry.equirect_longitudes(2 * self.size, dx)
+        lat = geometry.equirect_latitudes(self.size, dy)
+        # A direction is cos φ times its horizontal part plus the vertical: no trigonometry here.
+        room_from_sphere = (self.world_from_camera @ CAMERA_FROM_SPHERE).T
+        level = geometry.lonlat_to_xyz(np.stack([lon, 0 * lon], axis=-1)) @ room_from_sphere
+        vertical = np.sin(lat)[:, None] * room_from_sphere[2]
+        spread = np.cos(lat).astype(np.float32)[:, None, None] * level.astype(np.float32)
+        return spread + vertical.astype(np.float32)[:, None, :]
+
+    def depth_m(self, distance_m: Floats) -> Floats:
+        """Return the depth ``(h, w)`` of distances: the z-depth, in panoramas the distance."""
+        if self.fov_rad is None:
+            return distance_m
+        return distance_m * (self.rays() @ self.world_from_camera[:, 2].astype(np.float32))
+
+
+def draw_view(
+    rng: np.random.Generator, kind: ViewKind, location: NDArray[np.float64], size: int
+) -> View:
+    """Draw a perspective view from a location.
+
+    Args:
+        rng: Source of randomness.
+        kind: See `RoomSettings.views`.
+        location: ``(3,)`` center in meters.
+        size: Side in pixels.
+    """
+    heading = rng.uniform(-math.pi, math.pi)
+    if kind == "uniform":
+        pitch, roll = math.asin(rng.uniform(-1, 1)), rng.uniform(-math.pi, math.pi)
+    else:
+        spread = math.radians(35 if kind == "wide" else 20)
+        pitch = float(np.clip(rng.normal(0, spread), -1.4, 1.4))
+        roll = rng.normal(0, math.radians(3))
+    fov = math.radians(rng.uniform(96, 106) if kind == "wide" else rng.uniform(45, 75))
+    return View.looking(location, size, fov, heading=heading, pitch=pitch, roll=roll)
 
 
 class Hits(NamedTuple):
@@ -67,10 +169,11 @@ class RayScene:
     """A furnished room ready for rays.
 
     Args:
-        room: Furnished room, which is not changed.
+        room: Furnished room; only its source of randomness changes.
     """
 
     def __init__(self, room: Room) -> None:
+        self.room = room
         triangles = np.concatenate([part.triangles for part in room.parts]).astype(np.float32)
         self._tree = EmbreeScene()
         self._mesh = TriangleMesh(self._tree, triangles)
@@ -81,9 +184,8 @@ class RayScene:
         self._normals = normals / size
         self._areas = size[:, 0] / 2
         self._triangles = triangles
-        self.materials = material_table([part.material for part in room.parts])
+        self.materials = np.array([part.material for part in room.parts], SURFACE)
         self.item_of_part = np.array([part.item for part in room.parts])
-        self._lights = room.lights
         self._ambient = _bounced_light(room)
 
     def cast(self, origin: NDArray[np.float64], directions: Floats) -> Hits:
@@ -91,21 +193,30 @@ class RayScene:
         start = origin.astype(np.float32)
         origins = np.broadcast_to(start, directions.shape).copy()
         answer = self._tree.run(origins, directions, query="INTERSECT", output=1)
-        triangle, distance = answer["primID"], answer["tfar"]
-        found = triangle >= 0
-        triangle = np.where(found, triangle, 0)
-        distance = np.where(found, distance, 1).astype(np.float32)
+        found = answer["primID"] >= 0
+        triangle = np.where(found, answer["primID"], 0)
+        distance = np.where(found, answer["tfar"], 1).astype(np.float32)
         normals = self._normals[triangle]
         cosine = -np.einsum("ij,ij->i", normals, directions)
         normals = normals * np.sign(cosine)[:, None]
         points = start + directions * distance[:, None]
         return Hits(found, distance, self._part[triangle], points, normals, np.abs(cosine))
 
-    def surface_points(self, rng: np.random.Generator, count: int) -> NDArray[np.float64]:
+    def cast_image(
+        self, origin: NDArray[np.float64], rays: Floats
+    ) -> Iterator[tuple[slice, tuple[int, int], Hits]]:
+        """Yield rows of a picture, their shape and their hits, few enough rays in each."""
+        height, width, _ = rays.shape
+        step = max(1, _RAYS_AT_ONCE // width)
+        for start in range(0, height, step):
+            rows = slice(start, start + step)
+            yield rows, (-1, width), self.cast(origin, rays[rows].reshape(-1, 3))
+
+    def surface_points(self, count: int) -> NDArray[np.float64]:
         """Draw points uniformly from all surfaces, ``(count, 3)``."""
-        chosen = rng.choice(len(self._areas), count, p=self._areas / self._areas.sum())
-        weights = rng.dirichlet(np.ones(3), count)
-        return np.einsum("nk,nkd->nd", weights, self._triangles[chosen])
+        rng, shares = self.room.rng, self._areas / self._areas.sum()
+        chosen = rng.choice(len(shares), count, p=shares)
+        return np.einsum("nk,nkd->nd", rng.dirichlet(np.ones(3), count), self._triangles[chosen])
 
     def radiance(self, hits: Hits, place: tuple[float, float], spread: Floats) -> Floats:
         """Return the radiance along rays.
@@ -124,10 +235,11 @@ class RayScene:
         """
         lifted = hits.points + hits.normals * np.float32(_LIFT)
         light = self._ambient * self._openness(lifted, hits.normals, spread)[:, None]
-        for lamp in self._lights:
+        for lamp in self.room.lights:
             light += self._direct(lamp, lifted, hits.normals, place)[:, None]
-        light += self.materials["emission"][hits.part, None]
-        light *= albedo(self.materials, hits.part, hits.points, hits.normals)
+        surface = self.materials[hits.part]
+        light += surface["emission"][:, None]
+        light *= albedo(surface, hits.points, hits.normals)
         light[~hits.found] = 0
         return light
 
@@ -152,9 +264,8 @@ class RayScene:
         leaving = -(way @ lamp.normal.astype(np.float32))
         light = np.zeros(len(points), np.float32)
         lit = np.flatnonzero((arriving > 0) & (leaving > 0))
-        shadow = self._tree.run(
-            points[lit], way[lit], dists=distance[lit] - np.float32(0.01), query="OCCLUDED"
-        )
+        reach = distance[lit] - np.float32(0.01)
+        shadow = self._tree.run(points[lit], way[lit], dists=reach, query="OCCLUDED")
         lit = lit[shadow < 0]
         strength = np.float32(lamp.intensity) * arriving[lit] * leaving[lit]
         light[lit] = strength / np.maximum(distance[lit] ** 2, _NEAREST)
@@ -168,7 +279,8 @@ def _bounced_light(room: Room) -> Floats:
     Φρ / (A(1 − ρ)); a Lambertian lamp of intensity I along its normal emits Φ = πI.
     """
     plan = room.plan
-    area = 2 * plan.floor_area + plan.height * sum(wall.length for wall in plan.walls)
+    floor_area = sum((x1 - x0) * (y1 - y0) for x0, y0, x1, y1 in plan.floors)
+    area = 2 * floor_area + plan.height * sum(wall.length for wall in plan.walls)
     flux = math.pi * sum(lamp.intensity for lamp in room.lights)
     reflectance = np.clip(room.reflectance, 0.2, 0.7)
     return (flux / area * reflectance / (1 - reflectance)).astype(np.float32)
@@ -188,29 +300,7 @@ class Picture(NamedTuple):
     items: NDArray[np.int64]
 
 
-class Holes(NamedTuple):
-    """Balls in the room within which the scan has no surface.
-
-    Attributes:
-        centers: ``(n, 3)`` meters.
-        radii: ``(n,)`` meters.
-    """
-
-    centers: NDArray[np.float64]
-    radii: NDArray[np.float64]
-
-    def cover(self, points: Floats) -> NDArray[np.bool_]:
-        """Return mask of the ``(n, 3)`` points that lie in a hole; the rims are ragged."""
-        ragged = 1 + 0.25 * np.sin(points @ np.array([23.0, 29.0, 31.0], np.float32))
-        covered = np.zeros(len(points), np.bool_)
-        for center, radius in zip(self.centers, self.radii, strict=True):
-            away = points - center.astype(np.float32)
-            covered |= np.einsum("ij,ij->i", away, away) < ragged * np.float32(radius**2)
-        return covered
-
-
-@dataclass(frozen=True)
-class Camera:
+class Camera(NamedTuple):
     """Location and sensor of a camera, the same in all of its pictures.
 
     Attributes:
@@ -223,48 +313,56 @@ class Camera:
 
     location: NDArray[np.float64]
     heading: float
-    caps: tuple[float, float]
+    caps: Sequence[float]
     gain: Floats
     noise: float
 
 
-def draw_holes(rng: np.random.Generator, scene: RayScene) -> Holes:
-    """Draw up to six holes of 10 to 35 cm on the room's surfaces."""
-    count = int(rng.integers(0, 7))
-    return Holes(scene.surface_points(rng, count), rng.uniform(0.1, 0.35, count))
+def draw_holes(scene: RayScene) -> NDArray[np.float64]:
+    """Draw up to six holes in the scan: balls of 10 to 35 cm around points of the surfaces.
+
+    Returns:
+        ``(n, 4)`` center and radius in meters.
+    """
+    count = int(scene.room.rng.integers(0, 7))
+    centers = scene.surface_points(count)
+    return np.column_stack([centers, scene.room.rng.uniform(0.1, 0.35, count)])
 
 
-def draw_camera(
-    rng: np.random.Generator, scene: RayScene, plan: FloorPlan, others: list[Camera]
-) -> Camera:
+def _is_in_hole(points: Floats, holes: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return mask of the ``(n, 3)`` points that lie in a hole; the rims are ragged."""
+    ragged = 1 + 0.25 * np.sin(points @ np.array([23.0, 29.0, 31.0], np.float32))
+    covered = np.zeros(len(points), np.bool_)
+    for *center, radius in holes:
+        away = points - np.array(center, np.float32)
+        covered |= np.einsum("ij,ij->i", away, away) < ragged * np.float32(radius**2)
+    return covered
+
+
+def draw_camera(scene: RayScene, others: Sequence[Camera] = ()) -> Camera:
     """Draw a camera with free space around it, away from the others, and expose it."""
-    location = _draw_location(rng, scene, plan, [camera.location for camera in others])
-    caps = tuple(math.radians(rng.uniform(6, 15)) if rng.random() < 0.7 else 0.0 for _ in range(2))
+    rng = scene.room.rng
+    location = _draw_location(scene, others)
+    caps = [math.radians(rng.uniform(6, 15)) if rng.random() < 0.7 else 0.0 for _ in range(2)]
     around = scene.cast(location, even_directions(1024))
     light = scene.radiance(around, (0.0, 0.0), even_directions(1)[0]).mean(axis=1)
     typical = math.exp(float(np.log(light + 1e-3).mean()))
     exposure = 0.26 * rng.uniform(0.75, 1.35) / typical
     gain = (exposure * rng.uniform(0.92, 1.08, 3)).astype(np.float32)
     heading, noise = rng.uniform(-math.pi, math.pi), rng.uniform(0.004, 0.012)
-    return Camera(location, heading, (caps[0], caps[1]), gain, noise)
+    return Camera(location, heading, caps, gain, noise)
 
 
-def _draw_location(
-    rng: np.random.Generator,
-    scene: RayScene,
-    plan: FloorPlan,
-    others: list[NDArray[np.float64]],
-) -> NDArray[np.float64]:
+def _draw_location(scene: RayScene, others: Sequence[Camera]) -> NDArray[np.float64]:
     """Draw the first location with enough free space, or the best one tried."""
-    directions = even_directions(192)
+    rng, floors, directions = scene.room.rng, scene.room.plan.floors, even_directions(192)
     best, most = np.zeros(3), -math.inf
     for _ in range(_PLACES):
-        area = plan.floors[rng.integers(len(plan.floors))]
-        x, y = rng.uniform(area.x0, area.x1), rng.uniform(area.y0, area.y1)
-        place = np.array([x, y, rng.uniform(*_HEIGHTS)])
+        x0, y0, x1, y1 = floors[rng.integers(len(floors))]
+        place = np.array([rng.uniform(x0, x1), rng.uniform(y0, y1), rng.uniform(*_HEIGHTS)])
         clear = float(scene.cast(place, directions).distance.min()) / _CLEAR
-        apart = min((float(np.linalg.norm(place - other)) for other in others), default=math.inf)
-        free = min(clear, apart / _APART)
+        apart = [float(np.linalg.norm(place - other.location)) / _APART for other in others]
+        free = min([clear, *apart])
         if free > most:
             best, most = place, free
         if most >= 1:
@@ -273,12 +371,7 @@ def _draw_location(
 
 
 def render_picture(
-    scene: RayScene,
-    view: PictureRays,
-    camera: Camera,
-    holes: Holes,
-    supersample: int,
-    rng: np.random.Generator,
+    scene: RayScene, view: View, camera: Camera, holes: NDArray[np.float64], supersample: int
 ) -> Picture:
     """Render a view.
 
@@ -289,54 +382,38 @@ def render_picture(
         scene: Scene of the room.
         view: Pixels of the picture, at the camera's location.
         camera: Sensor of the camera.
-        holes: Holes in the scan.
+        holes: From `draw_holes`.
         supersample: Rays per pixel side.
-        rng: Random generator of the sensor's noise.
     """
     rays = view.rays()
-    shape = (rays.shape[0], rays.shape[1])
-    distance, items = np.empty(shape, np.float32), np.empty(shape, np.int64)
-    for rows in _bands(shape):
-        hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
-        missing = ~hits.found | (hits.cosine < _GRAZING) | holes.cover(hits.points)
+    distance, items = np.empty(rays.shape[:2], np.float32), np.empty(rays.shape[:2], np.int64)
+    for rows, shape, hits in scene.cast_image(camera.location, rays):
+        missing = ~hits.found | (hits.cosine < _GRAZING) | _is_in_hole(hits.points, holes)
         missing |= scene.materials["unscanned"][hits.part]
-        distance[rows] = np.where(missing, np.nan, hits.distance).reshape(-1, shape[1])
-        found = np.where(missing, MISSING, scene.item_of_part[hits.part])
-        items[rows] = found.reshape(-1, shape[1])
+        distance[rows] = np.where(missing, np.nan, hits.distance).reshape(shape)
+        items[rows] = np.where(missing, MISSING, scene.item_of_part[hits.part]).reshape(shape)
     zenith, nadir = camera.caps
     black = (rays[..., 2] > math.cos(zenith)) & (zenith > 0)
     black |= (rays[..., 2] < -math.cos(nadir)) & (nadir > 0)
     items[black] = MISSING
     distance[black] = np.nan
-    color = _colors(scene, view, camera, shape, supersample)
-    color += rng.normal(0, camera.noise, color.shape).astype(np.float32)
+    color = _colors(scene, view, camera, supersample)
+    color += scene.room.rng.normal(0, camera.noise, color.shape).astype(np.float32)
     rgb = np.clip(color * 255 + 0.5, 0, 255).astype(np.uint8)
     rgb[black] = 0
     return Picture(rgb, view.depth_m(distance), items)
 
 
-def _colors(
-    scene: RayScene, view: PictureRays, camera: Camera, shape: tuple[int, int], supersample: int
-) -> Floats:
+def _colors(scene: RayScene, view: View, camera: Camera, supersample: int) -> Floats:
     """Return display values ``(h, w, 3)``."""
     steps = (np.arange(supersample) + 0.5) / supersample - 0.5
     spreads = even_directions(supersample**2)
-    color = np.zeros((*shape, 3), np.float32)
+    color = np.zeros_like(view.rays())
     for k, spread in enumerate(spreads):
         dx, dy = float(steps[k % supersample]), float(steps[k // supersample])
-        rays = view.rays(dx, dy)
-        for rows in _bands(shape):
-            hits = scene.cast(camera.location, rays[rows].reshape(-1, 3))
+        for rows, shape, hits in scene.cast_image(camera.location, view.rays(dx, dy)):
             light = scene.radiance(hits, (2 * dx, 2 * dy), spread) * camera.gain
             # Tone curve (Reinhard et al. 2002, equation 4) and a gamma of 2.
             toned = light * (1 + light / np.float32(_WHITE)) / (1 + light)
-            color[rows] += np.sqrt(np.minimum(toned, 1)).reshape(color[rows].shape)
+            color[rows] += np.sqrt(np.minimum(toned, 1)).reshape(*shape, 3)
     return color / np.float32(len(spreads))
-
-
-def _bands(shape: tuple[int, int]) -> Iterator[slice]:
-    """Yield slices of rows that together make a picture, few enough rays in each."""
-    height, width = shape
-    step = max(1, _RAYS_AT_ONCE // width)
-    for start in range(0, height, step):
-        yield slice(start, start + step)

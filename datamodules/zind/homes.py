@@ -11,19 +11,19 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from datamodules.core.problems import Problems
+from datamodules.core.files import Problems
 from datamodules.zind.layout import DOOR, OPENING, WINDOW, Fixture, Layout
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose, rotation_about
 
-_GET_IT = (
+GET_IT = (
     "Get the sample tour from https://github.com/zillow/zind or request the whole set there, and "
     "point data.root at the folder that holds the homes (sample_tour)."
 )
@@ -108,13 +108,10 @@ class HomePanorama:
         vertices = np.array(seen.vertices if seen else [], np.float64).reshape(-1, 2)
         if seen is None or not _surrounds_origin(vertices):
             raise DataError(self.file, found=f"{seen}", expected=f"a room around {self.name}")
+        kinds = ((seen.openings, OPENING), (seen.doors, DOOR), (seen.windows, WINDOW))
         fixtures = [
             Fixture(np.stack(ends), bottom_z, top_z, label)
-            for points, label in (
-                (seen.openings, OPENING),
-                (seen.doors, DOOR),
-                (seen.windows, WINDOW),
-            )
+            for points, label in kinds
             for *ends, (bottom_z, top_z) in np.array(points, np.float64).reshape(-1, 3, 2)
         ]
         return Layout(vertices, floor_z, self.record.ceiling_height + floor_z, fixtures)
@@ -135,32 +132,21 @@ def list_home_panoramas(root: Path, problems: Problems) -> list[HomePanorama]:
     Args:
         root: Folder with a folder for every home.
         problems: Collects unreadable files.
-
-    Raises:
-        DataError: There are no homes.
     """
-    files = sorted(root.glob("*/zind_data.json"))
-    if not files:
-        expected = "a folder with zind_data.json and panos for every home"
-        raise DataError(root, found="no */zind_data.json", expected=expected, remedy=_GET_IT)
     found: list[HomePanorama] = []
-    for file in files:
+    for file in sorted(root.glob("*/zind_data.json")):
         with problems.noted(file.parent.name, file):
-            found += _read_home(file)
+            home = read_json(file, "zind_data.json as released", kind=_HomeRecord)
+            units_m = home.scale_meters_per_coordinate
+            found += [
+                HomePanorama(file, room, f"{room}/{part}/{name}", record, units_m[floor])
+                for floor, rooms in home.merger.items()
+                for room_name, parts in rooms.items()
+                for room in [f"{file.parent.name}/{floor}/{room_name}"]
+                for part, panoramas in parts.items()
+                for name, record in panoramas.items()
+            ]
     return found
-
-
-def _read_home(file: Path) -> list[HomePanorama]:
-    home: Any = read_json(file, "zind_data.json as released", kind=_HomeRecord)
-    unit_m = home.scale_meters_per_coordinate
-    return [
-        HomePanorama(file, room, f"{room}/{part}/{name}", record, unit_m[floor])
-        for floor, rooms in home.merger.items()
-        for room_name, parts in rooms.items()
-        for room in [f"{file.parent.name}/{floor}/{room_name}"]
-        for part, panoramas in parts.items()
-        for name, record in panoramas.items()
-    ]
 
 
 def _surrounds_origin(vertices: NDArray[np.float64]) -> bool:

@@ -35,7 +35,7 @@ Dataset: Annotated Floor Plans With 360º Panoramas and 3D Room Layouts", CVPR 2
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import field
 from functools import cached_property
 from itertools import combinations
@@ -47,14 +47,12 @@ from numpy.typing import NDArray
 from pydantic import Field, NonNegativeInt, PositiveInt
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
 from datamodules.core.panorama_pairs import PairedPanorama, PanoramaPairs, paired_shape
-from datamodules.core.problems import Problems
-from datamodules.core.splits import Split, draw_groups
-from datamodules.zind.homes import HomePanorama, list_home_panoramas
+from datamodules.zind.homes import GET_IT, HomePanorama, list_home_panoramas
 from datamodules.zind.layout import CLASSES, DOOR
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
@@ -79,6 +77,7 @@ class Zind(PanoramaDataModule):
 
     label_maps = {"5": LabelMap.of(CLASSES, [0])}  # noqa: RUF012, never changed
     no_depth = "ZInD has no depth images"
+    get_it = GET_IT
     fact_settings = ("doors",)
 
     inputs: Sequence[Input] = ("rgb",)
@@ -86,50 +85,37 @@ class Zind(PanoramaDataModule):
     test_fraction: Annotated[float, Field(gt=0, le=1)] = 0.2
     split_seed: NonNegativeInt = 0
 
-    def files(self, split: Split) -> list[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """See `DataModule`."""
-        panoramas = zip(self._panoramas, self._split_of_each, strict=True)
-        if split == "val" and not self.val_fraction:
-            return []
-        return [ImageFiles(p.name, p.image, p.file) for p, part in panoramas if part == split]
-
-    @cached_property
-    def _panoramas(self) -> list[HomePanorama]:
         found = list_home_panoramas(self.root, self.problems)
-        return [panorama for panorama in found if panorama.record.layout_visible]
+        panoramas = [panorama for panorama in found if panorama.record.layout_visible]
+        of_group = self._split_of_groups(panoramas)
+        splits: dict[Split, list[ImageFiles]] = {"train": [], "val": [], "test": []}
+        for one in panoramas:
+            split = of_group[one.home] if one.home in of_group else of_group[one.room]
+            splits[split].append(ImageFiles(one.name, one.image, one.file))
+        return splits
 
     @cached_property
     def _by_name(self) -> dict[str, HomePanorama]:
-        return {panorama.name: panorama for panorama in self._panoramas}
+        return {one.name: one for one in list_home_panoramas(self.root, Problems())}
 
-    @cached_property
-    def _split_of_each(self) -> list[Split]:
-        homes = {panorama.home for panorama in self._panoramas}
+    def _split_of_groups(self, panoramas: Sequence[HomePanorama]) -> dict[str, Split]:
+        """Return the split of every home, or of every room of a single home."""
         partition = self.root / "zind_partition.json"
         if partition.is_file():
             kind = dict[Split, list[str]]
             lists = read_json(partition, "lists of homes for train, val and test", kind=kind)
-            of_home = {home: split for split, names in lists.items() for home in names}
-            if missing := sorted(homes - of_home.keys()):
-                found = f"no home {', '.join(missing[:5])}"
-                raise DataError(partition, found=found, expected=f"every home of {self.root}")
-            return [of_home[panorama.home] for panorama in self._panoramas]
-        groups = [p.home if len(homes) > 1 else p.room for p in self._panoramas]
-        test, held = set(groups), set[str]()
+            return {home: split for split, names in lists.items() for home in names}
+        groups = {panorama.home for panorama in panoramas}
+        if len(groups) == 1:
+            groups = {panorama.room for panorama in panoramas}
+        test, held = groups, set[str]()
         if self.test_fraction < 1:
-            test = draw_groups(groups, self.test_fraction, [self.split_seed, 0])
-        rest = [group for group in groups if group not in test]
+            test = draw_groups(groups, self.test_fraction, [self.split_seed, 0]) or groups
         if self.val_fraction:
-            held = draw_groups(rest, self.val_fraction, [self.split_seed, 1])
-        if not test or (rest and self.val_fraction and not held):
-            raise DataError(
-                self.root,
-                found=f"{len(set(groups))} rooms or homes to draw from",
-                expected="some for training, validation and test each",
-                remedy="data.test_fraction=1 takes all for test, data.val_fraction=0 none "
-                "for validation.",
-            )
-        return ["test" if g in test else "val" if g in held else "train" for g in groups]
+            held = draw_groups(groups - test, self.val_fraction, [self.split_seed, 1])
+        return {g: "test" if g in test else "val" if g in held else "train" for g in groups}
 
     def check_files(self, files: ImageFiles) -> None:
         """See `DataModule`: the layout is a room around the camera, too."""
@@ -172,28 +158,23 @@ class ZindPairs(PanoramaPairs):
         Raises:
             DataError: There are no pairs, or a file is broken.
         """
-        problems, root = Problems(), self.root
-        most_m = math.inf if self.max_distance_m is None else self.max_distance_m
-        listed = list_home_panoramas(root, problems)
-        problems.refuse(root)
+        problems = Problems()
+        listed = list_home_panoramas(self.root, problems)
+        problems.refuse(self.root)
         usable = [p for p in listed if p.record.layout_visible and p.record.is_inside and p.unit_m]
         location_m = {panorama.name: panorama.pose()[0].location_m for panorama in usable}
-        pairs = [
-            (
-                f"{one.room}/{one.name.rpartition('/')[2]} – {other.name.rpartition('/')[2]}",
-                one,
-                other,
-            )
-            for one, other in combinations(usable, 2)
-            if one.room == other.room
-            and math.dist(location_m[one.name], location_m[other.name]) <= most_m
-        ]
+        pairs = []
+        for one, other in combinations(usable, 2):
+            away_m = math.dist(location_m[one.name], location_m[other.name])
+            if one.room == other.room and away_m <= (self.max_distance_m or math.inf):
+                left, right = (panorama.name.rpartition("/")[2] for panorama in (one, other))
+                pairs.append((f"{one.room}/{left} – {right}", one, other))
         if not pairs:
             raise DataError(
-                root,
+                self.root,
                 found="no two panoramas of one room",
                 expected="layout_visible, is_inside and scale_meters_per_coordinate of some",
-                remedy="Set data.max_distance_m=null for any distance.",
+                remedy=f"Set data.max_distance_m=null for any distance. {GET_IT}",
             )
         return pairs
 
@@ -203,9 +184,9 @@ class ZindPairs(PanoramaPairs):
 
     def panorama(self, files: HomePanorama) -> PairedPanorama:
         """See `PanoramaPairs`."""
-        path = files.image
-        rgb = read_rgb(path)
-        shape = paired_shape(path, rgb, self.erp_height)
+        rgb = read_rgb(files.image)
+        shape = paired_shape(files.image, rgb, self.erp_height)
         pose, unit_m = files.pose()
         distance_m = (files.layout().distances(shape) * unit_m).astype(np.float32)
-        return PairedPanorama(files.name, resize(rgb, shape, "bilinear"), path, distance_m, pose)
+        small = resize(rgb, shape, "bilinear")
+        return PairedPanorama(files.name, small, files.image, distance_m, pose)

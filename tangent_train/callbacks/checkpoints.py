@@ -5,7 +5,6 @@ from __future__ import annotations
 import shlex
 import signal
 import threading
-from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
@@ -40,10 +39,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         with atomic_path(Path(path)) as temporary:
             torch.save(checkpoint, temporary)
 
-    def remove_checkpoint(self, path: str | Path) -> None:
-        """Remove a file; Lightning's method would also remove a whole folder."""
-        Path(path).unlink(missing_ok=True)
-
 
 class CheckpointContents(Callback):
     """Stores plain values, the random state and an early end of the training in checkpoints.
@@ -54,8 +49,7 @@ class CheckpointContents(Callback):
 
     def __init__(self, contents: dict[str, Any]) -> None:
         self.contents = contents | {"tangent_train_version": version("tangent-train")}
-        self._random_states: list[dict[str, Any]] | None = None
-        self._stopped = False
+        self._restored: dict[str, Any] = {}
 
     def on_save_checkpoint(
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
@@ -63,7 +57,7 @@ class CheckpointContents(Callback):
         """Add the contents, and under ``random`` the generators of every process."""
         checkpoint.update(self.contents)
         # A resumed run may have more time.
-        timers = [one for one in trainer.callbacks if isinstance(one, Timer)]  # type: ignore[attr-defined]
+        timers: Any = [c for c in trainer.callbacks if isinstance(c, Timer)]  # type: ignore[attr-defined]
         out_of_time = any((timer.time_remaining() or 0) <= 0 for timer in timers)
         checkpoint["stopped"] = trainer.should_stop and not out_of_time
         # Samples have separate generators, see `sample_rng`.
@@ -77,14 +71,13 @@ class CheckpointContents(Callback):
         self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Read the states of the generators, and if a callback had ended the training."""
-        self._random_states = checkpoint.get("random")
-        self._stopped = checkpoint.get("stopped") is True
+        self._restored = {name: checkpoint.get(name) for name in ("random", "stopped")}
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Restore the random state (dropout), if the number of processes is the same."""
-        trainer.should_stop |= self._stopped
-        states = self._random_states
-        if states is not None and len(states) == trainer.world_size:
+        trainer.should_stop |= bool(self._restored.get("stopped"))
+        states = self._restored.get("random") or ()
+        if len(states) == trainer.world_size:
             state = states[trainer.global_rank]
             torch.set_rng_state(state["cpu"])
             if torch.cuda.is_available() and state["cuda"]:
@@ -102,20 +95,12 @@ class LastCheckpoint(Checkpoint):
         folder: Folder of the checkpoints of a run.
         every_n_steps: Number of optimizer steps between checkpoints within an epoch; None for
             checkpoints at the end of epochs only.
-        overrides: Settings that the resuming command needs besides the folder.
-
-    Attributes:
-        has_begun: True if training has begun, with everything restored.
     """
 
-    def __init__(
-        self, folder: Path | str, every_n_steps: int | None = None, overrides: Sequence[str] = ()
-    ) -> None:
+    def __init__(self, folder: Path | str, every_n_steps: int | None = None) -> None:
         self.path = Path(folder) / "last.ckpt"
         self.every_n_steps = every_n_steps
-        self.overrides = overrides
-        self.has_begun = False
-        self._got_sigterm = False
+        self._has_begun = self._got_sigterm = False
         self._processes: Any = None
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -130,8 +115,7 @@ class LastCheckpoint(Checkpoint):
                 trainer.strategy.launcher.kill(number)
             self._got_sigterm = True
 
-        self.has_begun = True
-        self._got_sigterm = False
+        self._has_begun = True
         if trainer.world_size > 1:  # a separate group on the CPU, which does not wait for a GPU
             self._processes = torch.distributed.new_group(backend="gloo")
         if threading.current_thread() is threading.main_thread():
@@ -144,37 +128,33 @@ class LastCheckpoint(Checkpoint):
     ) -> None:
         is_step = (batch_idx + 1) % trainer.accumulate_grad_batches == 0
         is_last = batch_idx + 1 == trainer.num_training_batches  # saved at the end of the epoch
-        if not is_step or is_last:
-            return
-        is_due = self.every_n_steps and trainer.global_step % self.every_n_steps == 0
-        is_ending = self._is_any_ended(trainer)
-        if is_due or is_ending:
-            trainer.save_checkpoint(self.path, weights_only=False)
-        if is_ending:
-            raise SIGTERMException
+        if is_step and not is_last:
+            every = self.every_n_steps
+            self._save(trainer, is_due=every is not None and trainer.global_step % every == 0)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Save the state after every epoch."""
-        trainer.save_checkpoint(self.path, weights_only=False)
-        if self._is_any_ended(trainer):
+        self._save(trainer, is_due=True)
+
+    def _save(self, trainer: Trainer, *, is_due: bool) -> None:
+        """Save if it is due; if any process got SIGTERM, save and end all after the same step."""
+        ending = torch.tensor(int(self._got_sigterm))
+        if trainer.world_size > 1:
+            torch.distributed.all_reduce(ending, group=self._processes)
+        if is_due or ending:
+            trainer.save_checkpoint(self.path, weights_only=False)
+        if ending:
             raise SIGTERMException
 
     def on_exception(
         self, trainer: Trainer, pl_module: LightningModule, exception: BaseException
     ) -> None:
         """Print how to resume the run."""
-        if trainer.is_global_zero and self.has_begun and self.path.is_file():
+        if trainer.is_global_zero and self._has_begun and self.path.is_file():
             saved = "here" if isinstance(exception, SIGTERMException) else "the last checkpoint"
-            command = shlex.join([f"resume={self.path.parent.parent}", *self.overrides])
-            text = f"{self.path} contains all up to {saved}; resume with\n  tangent-train {command}"
+            command = f"tangent-train {shlex.quote(f'resume={self.path.parent.parent}')}"
+            text = f"{self.path} contains all up to {saved}; resume with\n  {command}"
             print_text(text, error=True)
-
-    def _is_any_ended(self, trainer: Trainer) -> bool:
-        """Return True if any process got SIGTERM, so that all end after the same step."""
-        count = torch.tensor(int(self._got_sigterm))
-        if trainer.world_size > 1:
-            torch.distributed.all_reduce(count, group=self._processes)
-        return bool(count)
 
 
 class BestCheckpoint(ModelCheckpoint):
@@ -186,9 +166,7 @@ class BestCheckpoint(ModelCheckpoint):
         mode: ``max`` if a larger score is better, ``min`` if a smaller one is.
     """
 
-    def __init__(
-        self, folder: Path | str, monitor: str = "val/miou", mode: Literal["max", "min"] = "max"
-    ) -> None:
+    def __init__(self, folder: Path | str, monitor: str, mode: Literal["max", "min"]) -> None:
         super().__init__(
             dirpath=folder,
             filename="best",
@@ -200,12 +178,10 @@ class BestCheckpoint(ModelCheckpoint):
         )
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the best score; the path of its checkpoint is not read from a file."""
+        """Restore the best score, also if the folder was moved."""
         score = state_dict["best_model_score"]
-        if score is None:
-            return
-        path = str(Path(self.dirpath or "") / "best.ckpt")
-        score = torch.as_tensor(score)
-        self.best_model_score = self.kth_value = self.current_score = score
-        self.best_model_path = self.kth_best_model_path = path
-        self.best_k_models = {path: score}
+        if score is not None:
+            self.best_model_score = self.kth_value = self.current_score = score
+            path = str(Path(self.dirpath or "") / "best.ckpt")
+            self.best_model_path = self.kth_best_model_path = path
+            self.best_k_models = {path: score}

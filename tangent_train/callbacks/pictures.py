@@ -54,32 +54,27 @@ class Pictures(Callback):
         is_logged = trainer.is_global_zero and not trainer.sanity_checking and trainer.loggers
         if not is_logged or batch_idx not in chosen:
             return
-        task: Any = pl_module
         source, index = _dataset(trainer, "val"), int(batch.index[0])
-        labels = batch.target[0], outputs[0]
-        panel = _panel(task, source.read(index), *labels, most_rows=_MOST_ROWS)
-        if panel is not None:
-            tag = f"val_images/{source.name(index).replace('/', '_')}"
-            # The step at which Lightning logs the validation, one less than `global_step`.
-            step = trainer.fit_loop.epoch_loop._batches_that_stepped
-            for logger in trainer.loggers:
-                log_image(logger, tag, panel, step)
+        panel = _panel(pl_module, source.read(index), batch.labels[0], outputs[0], _MOST_ROWS)
+        tag = f"val_images/{source.name(index).replace('/', '_')}"
+        # The step at which Lightning logs the validation, one less than `global_step`.
+        step = trainer.fit_loop.epoch_loop._batches_that_stepped
+        for logger in trainer.loggers if panel is not None else ():
+            log_image(logger, tag, panel, step)
 
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
-        task: Any = pl_module
         source = _dataset(trainer, "test")
         chosen = evenly_spread(self.test, len(source))
-        predictions = zip(batch.index.tolist(), batch.target, outputs, strict=True)
-        for index, *labels in predictions:
-            if index in chosen:
-                name, image = source.name(index), source.read(index)
-                panel = _panel(task, image, *labels)
-                if panel is not None:
-                    file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
-                    write_pixels(self.folder / file, panel)
-                    self._encoded[index] = _encoded(task, name, image, *labels)
+        for index, *labels in zip(batch.index.tolist(), batch.labels, outputs, strict=True):
+            name = source.name(index)
+            image = source.read(index) if index in chosen else None
+            panel = None if image is None else _panel(pl_module, image, *labels)
+            if panel is not None:
+                file = f"{index}_{name.replace('/', '_')}.png"  # unique, by the index
+                write_pixels(self.folder / file, panel)
+                self._encoded[index] = _encoded(pl_module, name, image, *labels)
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Gather the images of all processes."""
@@ -105,8 +100,9 @@ def _panel(
     if not target.ndim:
         return None
     truth = task.head.truth(target)
-    shown = shown_arrays(image, truth, prediction, task.representation, most_rows)
-    panel: RGB | None = task.head.panel(*shown)
+    panel: RGB | None = task.head.panel(
+        *shown_arrays(image, truth, prediction, task.representation, most_rows)
+    )
     return panel
 
 

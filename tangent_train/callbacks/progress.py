@@ -30,30 +30,28 @@ class ProgressBar(RichProgressBar):
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """Return the metrics that are printed after the bar."""
-        metrics = dict(super().get_metrics(trainer, pl_module))
-        metrics.pop("v_num", None)
-        return metrics
+        metrics = super().get_metrics(trainer, pl_module)
+        return {name: value for name, value in metrics.items() if name != "v_num"}
 
     def on_train_start(self, *args: Any) -> None:
         """Start to time the epochs."""
         super().on_train_start(*args)
         self._begun = time.monotonic()
 
-    def on_train_batch_end(self, *args: Any) -> None:
+    def on_train_batch_end(self, trainer: Any, *args: Any) -> None:
         """Print a line per minute."""
-        super().on_train_batch_end(*args)
-        trainer, step = args[0], args[4]
-        self._print(f"Epoch {trainer.current_epoch + 1}", step, trainer.num_training_batches)
+        super().on_train_batch_end(trainer, *args)
+        self._print(f"Epoch {trainer.current_epoch + 1}", args[3], trainer.num_training_batches)
 
-    def on_validation_batch_end(self, *args: Any) -> None:
+    def on_validation_batch_end(self, trainer: Any, *args: Any) -> None:
         """Print a line per minute."""
-        super().on_validation_batch_end(*args)
-        self._print("Validation", args[4], args[0].num_val_batches[0])
+        super().on_validation_batch_end(trainer, *args)
+        self._print("Validation", args[3], trainer.num_val_batches[0])
 
-    def on_test_batch_end(self, *args: Any) -> None:
+    def on_test_batch_end(self, trainer: Any, *args: Any) -> None:
         """Print a line per minute."""
-        super().on_test_batch_end(*args)
-        self._print("Test", args[4], args[0].num_test_batches[0])
+        super().on_test_batch_end(trainer, *args)
+        self._print("Test", args[3], trainer.num_test_batches[0])
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Print a line with the metrics and the time left."""
@@ -61,8 +59,7 @@ class ProgressBar(RichProgressBar):
         self._epochs += 1
         done, last = trainer.current_epoch + 1, trainer.max_epochs or -1
         parts = [f"Epoch {done} of {last}" if last > 0 else f"Epoch {done}"]
-        metrics = self.get_metrics(trainer, pl_module)
-        parts += [f"{name} {value:.3f}" for name, value in metrics.items()]
+        parts += [f"{k} {value:.3f}" for k, value in self.get_metrics(trainer, pl_module).items()]
         if last > done:
             seconds = (time.monotonic() - self._begun) / self._epochs * (last - done)
             parts.append(f"{timedelta(seconds=round(seconds))} left")

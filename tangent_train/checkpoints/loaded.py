@@ -19,12 +19,13 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from datamodules.core.inputs import Input, Normalization, channel_names
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.outputs import OutputNetwork
-from tangent_train.config.from_file import build_from_file
-from tangent_train.errors import DataError, SettingError, first_line
+from tangent_train.config.build import filled
+from tangent_train.config.from_file import build_from_file, without_weights
+from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import load_plain
 from tangent_train.io.gpano import Fill
 
@@ -34,9 +35,6 @@ and in the ``__metadata__`` of a safetensors file (as JSON)."""
 
 _PREFIX = "network."
 """Prefix of the names of the network's tensors in a checkpoint."""
-
-_PRETRAINED = ("weights", "weights_backbone", "encoder_weights", "pretrained")
-"""Settings that name trained weights, in models, torchvision, segmentation-models-pytorch, timm."""
 
 _FROM_DATA = ("num_classes", "classes", "in_channels")
 """Settings that are taken from the data."""
@@ -56,7 +54,7 @@ class NetworkDescription:
     """Everything that a file contains about its network, besides the tensors.
 
     Attributes:
-        predicts: Kind of labels that the network predicts, see `datamodules.core.labels`.
+        predicts: Kind of labels that the network predicts, see `datamodules.core.label_map`.
         class_names: Names of the K + 1 labels, the unknown class first; score k is that of label
             k + 1. Empty for depth networks.
         inputs: Inputs of the network, see `datamodules.core.inputs.Input`; empty for shapes.
@@ -106,7 +104,7 @@ class NetworkDescription:
         """Refuse networks with other predictions than needed.
 
         Args:
-            needed: Kind of labels, see `datamodules.core.labels`.
+            needed: Kind of labels, see `datamodules.core.label_map`.
             remedy: Remedy in the message.
 
         Raises:
@@ -140,7 +138,7 @@ class NetworkDescription:
 
     def trainable_settings(self) -> dict[str, Any] | None:
         """Return `settings` with null for those that depend on the data, and pretrained weights."""
-        return _without_data_settings(self.settings)
+        return _without_data_settings(without_weights(self.settings))
 
 
 @dataclass(frozen=True, kw_only=True, config=_CONFIG)
@@ -197,24 +195,14 @@ def completed_settings(
         restored: True if the tensors come from a checkpoint: pretrained weights are not fetched.
     """
     known = dict.fromkeys(_FROM_DATA, num_classes) | {"in_channels": in_channels}
-    unwanted = _PRETRAINED if restored else ()
-
-    def complete(value: Any) -> Any:
-        if not isinstance(value, Mapping):
-            return value
-        return {
-            name: known.get(name) if inner is None or name in unwanted else complete(inner)
-            for name, inner in value.items()
-        }
-
-    return complete(settings)
+    return filled(without_weights(settings) if restored else settings, known)
 
 
 def _without_data_settings(section: Any) -> Any:
     if not isinstance(section, Mapping) or "_target_" not in section:
         return section
     return {
-        name: None if name in (*_FROM_DATA, *_PRETRAINED) else _without_data_settings(value)
+        name: None if name in _FROM_DATA else _without_data_settings(value)
         for name, value in section.items()
     }
 
@@ -249,28 +237,27 @@ def load_network(path: Path, trust: Collection[str] = ()) -> LoadedNetwork:
         DataError: The file is missing, has other content, names classes that are not allowed, or
             its network cannot be built; or a package to read it is missing.
     """
-    module: nn.Module | None = None
-    if path.suffix.lower() == ".onnx":
-        module = OnnxNetwork(path)
-        described = _parsed(path, module.metadata.get(METADATA_KEY))
+    onnx = OnnxNetwork(path) if path.suffix.lower() == ".onnx" else None
+    if onnx is None:
+        described = read_description(path)
     else:
-        content = read_description(path)
-        if content is None:
-            raise DataError(path, found="no description of a network", expected=_EXPECTED)
-        described = content
+        described = _parsed(path, onnx.metadata.get(METADATA_KEY))
+    if described is None:
+        raise DataError(path, found="no description of a network", expected=_EXPECTED)
     # Built to refuse a representation that is not allowed or impossible.
     build_from_file(described.representation, "representation", path, trust)
-    module = module or _built(described, path, trust)
-    return LoadedNetwork(**vars(described), module=module, trust=tuple(trust))
-
-
-def _built(described: NetworkDescription, path: Path, trust: Collection[str]) -> nn.Module:
-    """Build a network with the tensors of its file."""
+    if onnx is not None:
+        return LoadedNetwork(**vars(described), module=onnx, trust=tuple(trust))
     classes, channels = len(described.class_names) - 1, described.in_channels
     settings = completed_settings(described.settings, channels, classes, restored=True)
     module: nn.Module = build_from_file(settings, "network", path, trust)
+    if path.suffix.lower() == ".safetensors":
+        tensors = load_file(path)
+    else:
+        stored = load_plain(path, _EXPECTED, mmap=True)["state_dict"].items()
+        tensors = {n.removeprefix(_PREFIX): t for n, t in stored if n.startswith(_PREFIX)}
     try:
-        module.load_state_dict(_tensors(path))
+        module.load_state_dict(tensors)
     except (RuntimeError, TypeError, AttributeError) as error:
         raise DataError(
             path,
@@ -278,15 +265,7 @@ def _built(described: NetworkDescription, path: Path, trust: Collection[str]) ->
             expected=f"the tensors of {settings['_target_']}",
             remedy="Install the version of the network's package that it was trained with.",
         ) from error
-    return module.eval()
-
-
-def _tensors(path: Path) -> dict[str, Tensor]:
-    if path.suffix.lower() == ".safetensors":
-        return dict(load_file(path))
-    tensors: Mapping[str, Tensor] = load_plain(path, _EXPECTED, mmap=True)["state_dict"]
-    start = len(_PREFIX)
-    return {name[start:]: t for name, t in tensors.items() if name.startswith(_PREFIX)}
+    return LoadedNetwork(**vars(described), module=module.eval(), trust=tuple(trust))
 
 
 def read_description(path: Path) -> NetworkDescription | None:
@@ -310,28 +289,25 @@ def read_description(path: Path) -> NetworkDescription | None:
     else:
         checkpoint = load_plain(path, _EXPECTED, mmap=True)
         content = checkpoint.get(METADATA_KEY) if isinstance(checkpoint, Mapping) else None
-    return None if content is None else _parsed(path, content)
+    return _parsed(path, content)
 
 
-def _parsed(path: Path, content: Any) -> NetworkDescription:
+def _parsed(path: Path, content: Any) -> NetworkDescription | None:
+    if content is None:
+        return None
     try:
-        fields = json.loads(content) if isinstance(content, str) else dict(content or {})
+        fields = json.loads(content) if isinstance(content, str) else dict(content)
         fields.pop("tangent_train_version", None)
         return NetworkDescription(**fields)
-    except (ValueError, TypeError, RecursionError) as error:  # pydantic's are ValueErrors
+    except (ValueError, TypeError, RecursionError) as error:
+        invalid = isinstance(error, pydantic.ValidationError)
+        reason = wrong_field(error) if invalid else first_line(error)
         raise DataError(
             path,
-            found=f"a description of the network that cannot be used ({_reason(error)})",
+            found=f"a description of the network that cannot be used ({reason})",
             expected=_EXPECTED,
             remedy="tangent-import describes a network of another program.",
         ) from error
-
-
-def _reason(error: Exception) -> str:
-    if isinstance(error, pydantic.ValidationError):
-        wrong = error.errors()[0]
-        return f"{'.'.join(map(str, wrong['loc']))}: {wrong['msg']}"
-    return first_line(error)
 
 
 def write_onnx_description(source: Path, path: Path, described: NetworkDescription) -> None:

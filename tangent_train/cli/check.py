@@ -7,7 +7,7 @@ from contextlib import redirect_stdout
 
 import numpy as np
 
-from datamodules.core.class_weights import label_doubts
+from datamodules.core.label_map import label_doubts
 from tangent_train.cli.run import open_data
 from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text

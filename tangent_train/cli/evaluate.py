@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -10,32 +11,32 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.cli.run import (
-    Run,
-    build_data,
-    build_head,
-    build_task,
-    check_fits,
-    inputs_and_classes,
-    write_settings,
-)
-from tangent_train.config.settings import EvaluateSettings
+from tangent_train.cli.run import Run, build_data, build_head, build_task
+from tangent_train.config.settings import EvaluateSettings, typed_names
 from tangent_train.errors import SettingError
 from tangent_train.inference.label_maps import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
+
+_OF_TRAINING = {
+    *("network", "optimizer", "scheduler", "callbacks", "ema", "checkpoint_every_n_steps"),
+    "validation_images",
+}
+"""Groups and settings that an evaluation does not read."""
 
 
 def evaluate(settings: EvaluateSettings) -> None:
     """Evaluate a network on the test fold of the data, and write the results.
 
     Raises:
-        SettingError: The network does not fit the data.
+        SettingError: The network does not fit the data, or nothing reads a typed setting.
     """
-    hydra = HydraConfig.get()
-    typed = [text for text in hydra.overrides.task if text.startswith(("data=", "experiment="))]
-    if "data" in hydra.runtime.choices and not typed:
+    hydra, typed = HydraConfig.get(), [re.split(r"[.@]", name)[0] for name in typed_names()]
+    if "data" in hydra.runtime.choices and not {"data", "experiment"}.intersection(typed):
         expected = "the data set of the evaluation, data=… or experiment=…"
         raise SettingError("data", found="nothing", expected=expected)
+    for name in _OF_TRAINING.intersection(typed):
+        expected = "no such setting: an evaluation does not read it"
+        raise SettingError(name, found="a value", expected=expected)
     folder = Path(hydra.runtime.output_dir)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
@@ -48,13 +49,19 @@ def evaluate(settings: EvaluateSettings) -> None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
         loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped}."]
-    check_fits(data, inputs_and_classes(loaded), settings.checkpoint)
+    if loaded.class_names != tuple(data.class_names):
+        raise SettingError(
+            f"data, for {settings.checkpoint}",
+            found=f"class names {list(data.class_names)}",
+            expected=f"{list(loaded.class_names)}, which the network was trained with",
+            remedy="Map classes with label_map=.",
+        )
     if loaded.inputs:  # images, not shapes
         check_size(loaded, data.representation.image_size)
     head = build_head(settings, data, loaded.depth_kind)
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
-    write_settings(folder, settings)
+    run.write_settings()
     run.test(run.trainer(), settings.checkpoint)
 
 

@@ -21,7 +21,7 @@ from tangent_train.files import write_bytes
 from tangent_train.io.pixel_files import read_image_size
 from tangent_train.keypoints.colmap import add_pair
 from tangent_train.keypoints.compare import AS_GIVEN, Comparer, Comparison
-from tangent_train.keypoints.report import KeypointReport, matches_png
+from tangent_train.keypoints.report import matches_png, write_report
 from tangent_train.keypoints.two_view import colmap
 from tangent_train.manifest import Manifest
 
@@ -59,9 +59,7 @@ def keypoints(settings: KeypointSettings) -> None:
         manifest.finish(name, rows=comparison.rows)
     rows = [row for name in pairs.names for row in finished.get(name, {}).get("rows", ())]
     if rows:
-        report = KeypointReport(rows, comparer.representations, content, pairs.published)
-        report.write(output)
-        for table in report.means():
+        for table in write_report(output, rows, content, pairs.published):
             table.print()
     print_text(f"Results are in {output}." if rows else "There are no results.")
     if settings.export:

@@ -14,7 +14,7 @@ from importlib import import_module
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
-from tangent_train.errors import DataError, SettingError, printable
+from tangent_train.errors import DataError, SettingError, nearest, printable
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -31,7 +31,10 @@ def _errors_as_messages(command: str) -> Iterator[None]:
     try:
         yield
     except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
-        sys.exit(printable(f"tangent-{command}: {error}"))
+        cause: Any = error.__cause__
+        known = getattr(cause, "parent_node", None)  # of an override without a setting
+        remedy = "" if known is None else nearest(str(cause.key), map(str, known))
+        sys.exit(printable(f"tangent-{command}: {error}\n{remedy}".rstrip()))
     except KeyboardInterrupt:
         sys.exit(130)
 

@@ -127,7 +127,11 @@ class _Prediction:
             loaded = mapped.loaded
         head: Any = head_of(loaded)
         kinds = head.file_kinds(settings.write)
-        of_head = {name for name, kind in head.predict_settings.items() if kind in ("", *kinds)}
+        of_head = {
+            name
+            for name, needed in head.predict_settings.items()
+            if needed in ("", *kinds) or (needed not in head.suffixes and getattr(settings, needed))
+        }
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
         self.folder = PredictionFolder(settings.output, head, kinds)

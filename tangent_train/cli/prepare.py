@@ -14,13 +14,11 @@ def prepare(settings: PrepareSettings) -> None:
     Args:
         settings: Settings of the command.
     """
-    data = open_data(settings)
+    data, shard = open_data(settings), Shard.parse(settings.shard)
+    data.refuse("cache", settings.shard and data.cache is None, "a folder that shard= fills partly")
+    count = data.prepare(shard)
     if settings.shard is not None:
-        shard = Shard.parse(settings.shard)
-        count = data.fill_cache(shard.part)
         print_text(f"Shard {shard}: {count} {data.noun} are in {data.cache}.")
     else:
-        data.prepare_data()
-        data.setup()
-        counts = ", ".join(f"{len(data.splits()[s])} {s}" for s in ("train", "val", "test"))
+        counts = ", ".join(f"{len(files)} {split}" for split, files in data.splits().items())
         print_text(f"{data.root} is ready. {data.noun.capitalize()}: {counts}.")

@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import lightning
+import yaml  # type: ignore[import-untyped]
 from hydra.utils import get_class
 from lightning.pytorch.callbacks import Callback, LearningRateMonitor
 from lightning.pytorch.utilities import rank_zero_only
 from torch import nn
 
-from datamodules.core.data_module import DataModule
 from datamodules.core.image_module import ImageDataModule
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.pictures import Pictures
@@ -29,7 +29,7 @@ from tangent_train.checkpoints.loaded import (
     completed_settings,
     declared_sizes,
 )
-from tangent_train.config.build import build_from_config
+from tangent_train.config.build import build_from_config, filled
 from tangent_train.config.from_file import build_from_file
 from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
@@ -37,7 +37,6 @@ from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.results.evaluation import (
-    EvaluationResult,
     confusion_table,
     evaluation_result,
     flat_settings,
@@ -76,41 +75,38 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
-        loggers = build_loggers(self.settings, self.folder)
+        settings, loggers = self.settings, build_loggers(self.settings, self.folder)
+        panels = self.folder / "panels", settings.panels, settings.validation_images
+        callbacks = [
+            *callbacks,
+            *build_callbacks(settings, self.task),
+            CheckpointContents(self.contents()),
+            ProgressBar(),
+            Pictures(*panels),
+            *[LearningRateMonitor()] * bool(loggers),
+        ]
         trainer: lightning.Trainer = build_from_config(
-            self.settings.trainer,
+            settings.trainer,
             "trainer",
             default_root_dir=str(self.folder),
-            callbacks=[
-                *callbacks,
-                *build_callbacks(self.settings, self.task),
-                CheckpointContents(self.contents()),
-                ProgressBar(),
-                Pictures(
-                    self.folder / "panels", self.settings.panels, self.settings.validation_images
-                ),
-                *[LearningRateMonitor()] * bool(loggers),
-            ],
+            callbacks=callbacks,
             logger=loggers,
             plugins=[AtomicCheckpointIO()],
             use_distributed_sampler=False,  # the samplers of the data count every image once
         )
         for logger in trainer.loggers:
-            logger.log_hyperparams(flat_settings(self.plain_settings()))
+            logger.log_hyperparams(flat_settings(settings.model_dump(mode="json")))
         return trainer
-
-    def plain_settings(self) -> dict[str, Any]:
-        """Return the settings as plain values."""
-        return self.settings.model_dump(mode="json")
 
     def contents(self) -> dict[str, Any]:
         """Return what checkpoints of the run store besides tensors: plain values."""
-        # Without loggers, whose settings may hold a server's address: checkpoints are passed on.
-        return {
-            METADATA_KEY: self.as_loaded().plain(),
-            "config": {name: v for name, v in self.plain_settings().items() if name != "logger"},
-            **inputs_and_classes(self.data),
-        }
+        return {METADATA_KEY: self.as_loaded().plain()}
+
+    def write_settings(self) -> None:
+        """Write ``config.yaml``, the settings, from which `config_name` resumes the run."""
+        content = self.settings.model_dump(mode="json")
+        text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True)
+        write_text(self.folder / "config.yaml", text)
 
     def test(self, trainer: lightning.Trainer, checkpoint: Path) -> None:
         """Evaluate the task on the test fold and write the results.
@@ -119,45 +115,33 @@ class Run:
             trainer: Trainer of the run.
             checkpoint: File of the network's weights, for the report.
         """
-        by_classes = self.task.head.kind == PIXEL_CLASSES  # else upright=auto is by the image alone
-        if getattr(self.data, "upright", None) == "auto" and by_classes:
-            self.data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
-        trainer.test(self.task, datamodule=self.data, verbose=False)
-        noun, total = self.data.noun, len(self.data.dataset("test"))
-        tested = sum(trainer.num_test_batches) > 0  # else `task.result` is that of a validation
-        of_task = self.task.head, self.task.result, noun, self.task.evaluated
-        result = evaluation_result(*of_task) if tested else None
-        if result and result.images == total:
-            result = replace(result, groups=self._groups(trainer.world_size))
-            self._report(result, checkpoint, trainer.callbacks)  # type: ignore[attr-defined]
+        head, data = self.task.head, self.data
+        # Of other networks, upright=auto estimates from the image alone.
+        if getattr(data, "upright", None) == "auto" and head.kind == PIXEL_CLASSES:
+            data.estimate_up(UpLikelihood(self.as_loaded(), trainer.strategy.root_device))
+        trainer.test(self.task, datamodule=data, verbose=False)
+        items, groups = data.splits()["test"], defaultdict(list)
+        # Without test batches, `task.result` is that of a validation.
+        tested = self.task.evaluated if sum(trainer.num_test_batches) else 0
+        if tested == len(items):
+            for place, index in enumerate(gathered_order(tested, trainer.world_size)):
+                for group in data.groups(items[index]):
+                    groups[group].append(place)
+            self._report(checkpoint, groups, trainer.callbacks)  # type: ignore[attr-defined]
             return
-        rank_zero_only(print_text)(
-            f"{result.images if result else 0} of {total} test {noun} were evaluated: no results "
-            "are written."
-        )
-
-    def _groups(self, world_size: int) -> list[dict[str, Any]]:
-        """Return the scores of each group of test images, see `LabeledData.groups`."""
-        items, places = self.data.splits()["test"], defaultdict(list)
-        for place, index in enumerate(gathered_order(len(items), world_size)):
-            for group in self.data.groups(items[index]):
-                places[group].append(place)
-        return [
-            {"group": group, "images": len(some)}
-            | plain_scores(self.task.head.scores_of(self.task.result, some))
-            for group, some in sorted(places.items())
-        ]
+        text = f"{tested} of {len(items)} test {data.noun} were evaluated: no results are written."
+        rank_zero_only(print_text)(text)
 
     def as_loaded(self) -> LoadedNetwork:
         """Return the network of the run with its inputs, classes and representation."""
         if self.loaded is not None:
             return self.loaded
-        data, module, settings = self.data, self.task.network, self.settings
-        channels, outputs = data.in_channels, self.task.head.num_outputs
-        multiple, fixed = declared_sizes(module)
+        data, head, settings = self.data, self.task.head, self.settings
+        multiple, fixed = declared_sizes(self.task.network)
+        sizes = data.in_channels, head.num_outputs
         return LoadedNetwork(
-            module=module,
-            predicts=self.task.head.kind,
+            module=self.task.network,
+            predicts=head.kind,
             class_names=data.class_names,
             inputs=getattr(data, "inputs", ()),
             normalization=data.normalization,
@@ -166,25 +150,32 @@ class Run:
             image_size=data.representation.image_size,
             size_multiple=multiple,
             fixed_size=fixed,
-            depth_kind=getattr(self.task.head, "depth_kind", None),
+            depth_kind=getattr(head, "depth_kind", None),
             fill=getattr(data, "fill", None) or "mean",
-            settings=completed_settings(settings.network, channels, outputs, restored=True),
+            settings=completed_settings(settings.network, *sizes, restored=True),
         )
 
     @rank_zero_only
     def _report(
-        self, result: EvaluationResult, checkpoint: Path, callbacks: Sequence[Callback]
+        self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
     ) -> None:
-        is_inside = checkpoint.is_relative_to(self.folder)
+        """Write the results, with the scores of each group of images (`LabeledData.groups`)."""
+        head, data, task = self.task.head, self.data, self.task
         # A relative path stays right when the folder is moved.
+        is_inside = checkpoint.is_relative_to(self.folder)
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         result = replace(
-            result,
-            protocol={**self.data.facts, **self.task.head.facts},
+            evaluation_result(head, task.result, data.noun, task.evaluated),
+            groups=[
+                {"group": group, "images": len(places)}
+                | plain_scores(head.scores_of(task.result, places))
+                for group, places in sorted(groups.items())
+            ],
+            protocol={**data.facts, **head.facts},
             checkpoint=name,
-            label_map=self.plain_settings().get("label_map"),
-            folds=self.data.folds,
-            settings=flat_settings(self.plain_settings()),
+            label_map=self.settings.model_dump(mode="json").get("label_map"),
+            folds=data.folds,
+            settings=flat_settings(self.settings.model_dump(mode="json")),
         )
         notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(result)
         summary, (rows, sources) = summary_lines(result), published_rows([result])
@@ -195,11 +186,10 @@ class Run:
             f"Evaluation of {checkpoint.name}",
             tables=[*tables, *([confusion_table(result)] if result.confusion else [])],
             images=[i for c in callbacks if isinstance(c, Pictures) for i in c.images],
-            class_names=self.task.head.class_names,
+            class_names=head.class_names,
             notes=[*summary, *notes],
         )
-        for line in (*self.notes, *summary):
-            print_text(line)
+        print_text("\n".join([*self.notes, *summary]))
         tables[0].print()
         print_text(f"Results, pictures and logs: {self.folder}; report.html opens in a browser.")
 
@@ -225,9 +215,8 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
     head = build_head(settings, data)
     # Pretrained weights are not fetched if a checkpoint replaces them.
     restored = getattr(settings, "resume", None) is not None
-    section = completed_settings(
-        settings.network, data.in_channels, head.num_outputs, restored=restored
-    )
+    sizes = data.in_channels, head.num_outputs
+    section = completed_settings(settings.network, *sizes, restored=restored)
     if file is None:
         network = build_from_config(section, "network")
     else:
@@ -239,24 +228,19 @@ def open_data(settings: RunSettings) -> Any:
     """Build the data module of a run; images have distances as labels if the task needs them."""
     representation = build_from_config(settings.representation, "representation")
     is_images = issubclass(get_class(settings.data["_target_"]), ImageDataModule)
-    has_distances = is_images and _head_class(settings).labels == DISTANCE
-    given = {"labels": DISTANCE} if has_distances else {}
+    needed = get_class(settings.task["head"]["_target_"]).labels  # type: ignore[attr-defined]
+    given = {"labels": DISTANCE} if is_images and needed == DISTANCE else {}
     return build_from_config(settings.data, "data", representation=representation, **given)
 
 
 def build_data(settings: RunSettings) -> Any:
     """Build the data module of a run, and check that it has the labels of the task."""
-    data = open_data(settings)
-    if not isinstance(data, DataModule):
-        expected = "labeled images or shapes; pairs are for tangent-keypoints"
-        raise SettingError("data", found=type(data).__name__, expected=expected)
-    needed = _head_class(settings).labels
-    if needed != data.labels:
-        raise SettingError(
-            "task",
-            found=f"a task for {needed}",
-            expected=f"a task for {data.labels}, the labels of {type(data).__name__}",
-        )
+    data: Any = open_data(settings)
+    needed = get_class(settings.task["head"]["_target_"]).labels  # type: ignore[attr-defined]
+    labels = getattr(data, "labels", "pairs, which is tangent-keypoints")
+    if needed != labels:
+        expected = f"a task for {labels}, the labels of {type(data).__name__}"
+        raise SettingError("task", found=f"a task for {needed}", expected=expected)
     return data
 
 
@@ -285,39 +269,6 @@ def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) 
     )
 
 
-def _head_class(settings: RunSettings) -> Any:
-    return get_class(settings.task["head"]["_target_"])
-
-
-def check_fits(data: Any, network: Mapping[str, Any], name: object) -> None:
-    """Refuse data whose inputs or classes differ from those of a network.
-
-    Args:
-        data: Data module.
-        network: `inputs_and_classes` of the network; further fields are ignored.
-        name: Name of the network, for the message.
-
-    Raises:
-        SettingError: Inputs or classes differ.
-    """
-    for field, value in inputs_and_classes(data).items():
-        if network[field] != value:
-            raise SettingError(
-                f"data, for {name}",
-                found=f"{field.replace('_', ' ')} {value}",
-                expected=f"{network[field]}, which the network was trained with",
-                remedy="Map classes with label_map=." if field == "class_names" else "",
-            )
-
-
-def inputs_and_classes(data: Any) -> dict[str, Any]:
-    """Return inputs and classes of a data module or a `LoadedNetwork` as plain values."""
-    mean, std = list(data.normalization.mean), list(data.normalization.std)
-    inputs = {"inputs": list(data.inputs)} if hasattr(data, "inputs") else {}
-    names = list(data.class_names)
-    return {"class_names": names, **inputs, "normalization": {"mean": mean, "std": std}}
-
-
 def build_loggers(settings: RunSettings, folder: Path) -> list[Any]:
     """Build the loggers; null folders and names are those of the run.
 
@@ -329,9 +280,7 @@ def build_loggers(settings: RunSettings, folder: Path) -> list[Any]:
     group = "/".join(part for part in parts[:-1] if not re.fullmatch(r"(fold|seed)_\d+", part))
     known = {"save_dir": str(folder), "name": name, "run_name": name, "group": group}
     sections = (settings.logger or {}).items()
-    return [
-        build_from_config(_filled(section, known), f"logger.{name}") for name, section in sections
-    ]
+    return [build_from_config(filled(s, known), f"logger.{name}") for name, s in sections]
 
 
 def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
@@ -340,23 +289,5 @@ def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:
     for name, section in (settings.callbacks or {}).items():
         monitor = section.get("monitor") or task.monitor
         known = {"monitor": monitor, "mode": task.head.mode_of(monitor)}
-        built.append(build_from_config(_filled(section, known), f"callbacks.{name}"))
+        built.append(build_from_config(filled(section, known), f"callbacks.{name}"))
     return built
-
-
-def _filled(section: Mapping[str, Any], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Replace null settings by known values, also in inner sections."""
-    return {
-        name: _filled(value, known)
-        if isinstance(value, Mapping)
-        else (known.get(name) if value is None else value)
-        for name, value in section.items()
-    }
-
-
-def write_settings(folder: Path, settings: RunSettings) -> None:
-    """Write ``config.yaml``, the settings of a run, from which `config_name` resumes it."""
-    import yaml  # type: ignore[import-untyped]
-
-    content = yaml.safe_dump(settings.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
-    write_text(folder / "config.yaml", content)

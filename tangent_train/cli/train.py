@@ -12,16 +12,16 @@ import warnings
 from pathlib import Path
 
 import lightning
+import torch
 from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.callbacks import EMAWeightAveraging
 from lightning.pytorch.utilities import rank_zero_only
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
-from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
-from tangent_train.cli.run import Run, build, write_settings
+from tangent_train.cli.run import Run, build
 from tangent_train.config.settings import TrainSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
@@ -48,7 +48,7 @@ def train(settings: TrainSettings) -> float | None:
     if resumed is None:
         _create_folder(folder)
         load_pretrained(run, settings.init_from)
-    rank_zero_only(write_settings)(folder, settings)
+    rank_zero_only(run.write_settings)()
     checkpoints = folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
@@ -61,7 +61,8 @@ def train(settings: TrainSettings) -> float | None:
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)
     if len(run.data.dataset("test")):
-        run.task.load_state_dict(read_checkpoint(tested, ["state_dict"])["state_dict"])
+        weights = torch.load(tested, map_location="cpu", weights_only=True, mmap=True)
+        run.task.load_state_dict(weights["state_dict"])
         run.test(trainer, tested)
     else:
         rank_zero_only(print_text)(f"No {run.data.noun} to test: no results are written.")

@@ -18,6 +18,7 @@ config of its command in ``stages/``.
 
 from __future__ import annotations
 
+import itertools
 import shlex
 import shutil
 import sys
@@ -25,7 +26,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
@@ -35,7 +36,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.cli.processes import command_line, quoted, run_process
 from tangent_train.cli.run import build_data
-from tangent_train.config.settings import SETTINGS, validate
+from tangent_train.config.settings import SETTINGS, typed_names, validate
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
@@ -82,33 +83,25 @@ def transfer(_: object) -> None:
         SettingError: A setting is invalid, or the transfer was begun with other settings.
     """
     # Composed again, because the stages need the settings with their references.
-    config = compose("transfer", [*_search_path(), *_typed()])
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    loaded = None
+    typed: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    config: Any = compose("transfer", [*_search_path(), *typed])
+    folder, loaded = Path(HydraConfig.get().runtime.output_dir), None
     if config.checkpoint is not None:
         loaded = load_network(Path(config.checkpoint), config.trust)
         _take_settings(config, loaded)
     content: Any = OmegaConf.to_container(config)
     content["fine_tuning"].pop("epochs")
-    content = {name: value for name, value in content.items() if name not in _NOT_CONTENT}
-    plan, stages = list(_plan(config, loaded)), []
-    for fold in config.folds or [config.data.get("fold")]:
-        for seed in config.seeds or [config.seed]:
-            stages += [_of_group(config, stage, fold, seed) for stage in plan]
-    manifest = Manifest.open(folder, content)
-    settings = {stage.path: stage_settings(config, folder, stage) for stage in stages}
-    _check_data([settings[s.path] for s in stages if str(s.path) not in manifest.finished])
+    folds, seeds = config.folds or [config.data.get("fold")], config.seeds or [config.seed]
+    groups, plan = itertools.product(folds, seeds), list(_plan(config, loaded))
+    stages = [_of_group(config, stage, *group) for group in groups for stage in plan]
+    manifest = Manifest.open(folder, {n: v for n, v in content.items() if n not in _NOT_CONTENT})
+    settings = {str(stage.path): stage_settings(config, folder, stage) for stage in stages}
+    _check_data([settings[name] for name in manifest.missing(settings)])
     manifest.finish("checks")  # an interrupted stage is resumed: other settings are refused
     for number, stage in enumerate(stages, start=1):
         heading = f"Stage {number} of {len(stages)}, {stage.name} in {folder / stage.path}"
-        _run(stage, settings[stage.path], manifest, heading)
+        _run(stage, settings[str(stage.path)], manifest, heading)
     _report(config, folder, stages)
-
-
-def _typed() -> list[str]:
-    """Return the overrides of the command line, with their references."""
-    overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
-    return list(overrides)
 
 
 def _search_path() -> list[str]:
@@ -117,16 +110,13 @@ def _search_path() -> list[str]:
 
 def _take_settings(config: Any, loaded: LoadedNetwork) -> None:
     """Set inputs and level to those of a network from a file, and the views of an imported one."""
-    typed = {text.lstrip("+~").partition("=")[0] for text in _typed()}
+    typed = typed_names()
     config.checkpoint = str(Path(config.checkpoint).absolute())
-    if "level" not in typed:
-        config.level = loaded.level
+    config.level = config.level if "level" in typed else loaded.level
     if _has_panorama_views(loaded) and "representation" not in typed:
+        views = panorama_settings(loaded, config.level if "level" in typed else None)
         rows = config.representation.get("erp_height")
-        level = config.level if "level" in typed else None
-        config.representation = panorama_settings(loaded, level) | (
-            {} if rows is None else {"erp_height": rows}
-        )
+        config.representation = views | ({} if rows is None else {"erp_height": rows})
     mean, std = map(list, (loaded.normalization.mean, loaded.normalization.std))
     of_network = {"inputs": list(loaded.inputs), "normalization": {"mean": mean, "std": std}}
     config.data = {**config.data, **of_network}
@@ -134,26 +124,26 @@ def _take_settings(config: Any, loaded: LoadedNetwork) -> None:
         config.task.eval_view_batch_size = views_per_forward(loaded.image_size)
 
 
-def _has_panorama_views(loaded: LoadedNetwork | None) -> TypeGuard[LoadedNetwork]:
+def _has_panorama_views(loaded: LoadedNetwork | None) -> bool:
     """Return True for a network from a file that names views of panoramas."""
     return loaded is not None and loaded.representation["_target_"] != PERSPECTIVE
 
 
 def _plan(config: Any, loaded: LoadedNetwork | None) -> Iterator[Stage]:
     """Yield the stages of one fold and seed."""
-    has_photos = "_target_" in config.photos.data
+    has_photos, study = "_target_" in config.photos.data, config.study_levels
     if loaded is None and not has_photos:
         expected = "the photos to train P on, or checkpoint=<a network trained on photos>"
         raise SettingError("data@photos.data", found="none", expected=expected)
-    if has_photos and not (config.study_levels and loaded):
+    if has_photos and not (study and loaded):
         yield Stage("P", "evaluate" if loaded else "train", {})
-    views = dict(_views(config, loaded))
-    for view, of_view in (views if config.study_levels else {"": {}, **views}).items():
+    views = _levels(config, loaded) if study else {"": {}, **_views(config, loaded)}
+    for view, of_view in views.items():
         for condition, changes in _named(config.conditions):
             of_data = {f"data.{name}": value for name, value in changes.items()}
             name = "-".join(filter(None, ("S", view, condition if of_data else "")))
             yield Stage(name, "evaluate", {**of_view, **of_data}, view, condition)
-    for epochs in () if config.study_levels else config.fine_tuning.epochs:
+    for epochs in () if study else config.fine_tuning.epochs:
         for name in "PS":
             yield Stage(f"{name}-FT-{epochs}", "train", _fine_tuning(config, epochs))
 
@@ -190,9 +180,7 @@ def _fine_tuning(config: Any, epochs: int) -> dict[str, Any]:
     """Return the changes of settings in fine-tuning."""
     tuning: Any = OmegaConf.to_container(config.fine_tuning)
     before: Any = OmegaConf.to_container(config.optimizer)
-    optimizer = (
-        tuning["optimizer"] if "_target_" in tuning["optimizer"] else before | tuning["optimizer"]
-    )
+    optimizer = before | tuning["optimizer"]
     if optimizer["lr"] is None:  # rounded: 3e-3 / 10 is 3.0000000000000003e-4
         optimizer["lr"] = float(f"{config.optimizer.lr / _SLOWER:.12g}")
     return {
@@ -211,34 +199,34 @@ def _named(entries: Sequence[Any]) -> Iterator[tuple[str, dict[str, Any]]]:
         yield settings.pop("name"), settings
 
 
-def _views(config: Any, loaded: LoadedNetwork | None) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield the views of ``compare`` or of the study by name, each as changes of settings.
+def _levels(config: Any, loaded: LoadedNetwork | None) -> dict[str, dict[str, Any]]:
+    """Return the views of the study of the resolution, as changes of settings by name."""
+    rows = {level: min(2 ** (level + 1), config.study_max_rows) for level in config.study_levels}
+    return {f"level-{n}": _view(config, loaded, level=n, erp_height=rows[n]) for n in rows}
+
+
+def _views(config: Any, loaded: LoadedNetwork | None) -> dict[str, dict[str, Any]]:
+    """Return the views of ``compare`` as changes of settings by name.
 
     A view is an option of ``representation`` (a name alone, or ``option``) with changed settings;
     without an option, it is the transfer's own representation with changed settings. ``level`` also
     sets the level of the stage; names such as ``task.head.align`` change the task. Distortion-aware
     views of a network that does not allow them are left out.
     """
-    if config.study_levels:
-        for level in config.study_levels:
-            rows = min(2 ** (level + 1), config.study_max_rows or 2 ** (level + 1))
-            yield f"level-{level}", _view(config, loaded, level=level, erp_height=rows)
-        return
+    views = {}
     for name, changes in _named(config.compare):
         view = _view(config, loaded, **(changes or {"option": name}))
         try:
             if loaded is not None:
                 is_aware = view["representation"].get("distortion_aware")
                 network_for_views(loaded.network, is_aware)
+            views[name] = view
         except SettingError as error:
             print_text(f"View {name} is left out: {error}")
-        else:
-            yield name, view
+    return views
 
 
-def _view(
-    config: Any, loaded: LoadedNetwork | None, option: str | None = None, **changes: Any
-) -> dict[str, Any]:
+def _view(config: Any, loaded: Any, option: str | None = None, **changes: Any) -> dict[str, Any]:
     """Return a view as changes of settings, see `_views`."""
     of_task = {name: changes.pop(name) for name in [*changes] if name.startswith("task.")}
     level, rows = changes.get("level"), config.representation.get("erp_height")
@@ -259,31 +247,31 @@ def _view(
 
 def _check_data(stages: Sequence[Mapping[str, Any]]) -> None:
     """Build the data of the photos and of the panoramas, before hours of training."""
-    built: dict[str, Any] = {}
-    for settings in stages:
-        target = settings["data"]["_target_"]
-        if target not in built:
-            of_run = {n: settings[n] for n in SETTINGS["check"].model_fields if n in settings}
-            built[target] = build_data(validate("check", of_run))
-            built[target].make_files()
-            built[target].setup()
-    names = {target: data.class_names for target, data in built.items()}
-    if len({tuple(classes) for classes in names.values()}) > 1:
-        raise SettingError("data", found=f"classes {names}", expected="the same of both data sets")
+    classes = {}
+    for target, settings in {stage["data"]["_target_"]: stage for stage in stages}.items():
+        of_run = {
+            name: settings[name] for name in SETTINGS["check"].model_fields if name in settings
+        }
+        data = build_data(validate("check", of_run))
+        data.make_files()
+        data.setup()
+        classes[target] = tuple(data.class_names)
+    if len({*classes.values()}) > 1:
+        raise SettingError(
+            "data", found=f"classes {classes}", expected="the same of both data sets"
+        )
 
 
 def _run(stage: Stage, settings: Mapping[str, Any], manifest: Manifest, heading: str) -> None:
     """Run a stage that is not finished, printing its command after a heading."""
-    run, arguments = manifest.folder / stage.path, []
-    before = manifest.finished.get(str(stage.path))
+    run, before = manifest.folder / stage.path, manifest.finished.get(str(stage.path))
     if before is not None and (run / "results.json").is_file():
         if before["changes"] != stage.changes:
             raise SettingError(stage.name, found=stage.changes, expected=before["changes"])
         print_text(f"{heading}: finished before.")
         return
-    if (run / "checkpoints" / "last.ckpt").is_file():
-        arguments = [f"resume={quoted(run)}"]
-    else:
+    arguments = [f"resume={quoted(run)}"]
+    if not (run / "checkpoints" / "last.ckpt").is_file():
         shutil.rmtree(run, ignore_errors=True)
         file = manifest.folder / "stages" / f"{'-'.join(stage.path.parts)}.yaml"
         write_text(file, OmegaConf.to_yaml(OmegaConf.create({**_HEAD, **settings})))
@@ -301,10 +289,10 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
     """Write and print the tables and the chart."""
     results: dict[Any, list[Any]] = defaultdict(list)
     for stage in stages:
-        if not config.study_levels or stage.view:
-            key = stage.changes["level"] if config.study_levels else stage.name
-            results[key].append(load_result(folder / stage.path))
+        key = stage.changes["level"] if config.study_levels and stage.view else stage.name
+        results[key].append(load_result(folder / stage.path))
     if config.study_levels:
+        results.pop("P", None)
         name, report = "angular_resolution", levels_report(results, config.level)
     else:
         cells = {s.name: (s.view or "S", s.condition) for s in stages if s.condition}

@@ -5,13 +5,16 @@ Sections of a file of somebody else are built by `tangent_train.config.from_file
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
+from inspect import signature
 from typing import Any
 
 from hydra.errors import InstantiationException
 from hydra.utils import instantiate
+from pydantic import ValidationError
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import SettingError
 
 
 def build_from_config(section: Any, place: str, **given: Any) -> Any:
@@ -33,16 +36,25 @@ def build_from_config(section: Any, place: str, **given: Any) -> Any:
     try:
         make = instantiate({"_convert_": "all", **section, "_partial_": True})
         make = partial(make.func, *make.args, **make.keywords | given)
-        return make if section.get("_partial_") else make()
-    except (DataError, SettingError):
-        raise
+        is_partial = section.get("_partial_") is True
+        if is_partial:  # other arguments are refused now, not when it is called
+            signature(make.func).bind_partial(*make.args, **make.keywords)
+        return make if is_partial else make()
     except Exception as error:
-        cause = error.__cause__ if isinstance(error, InstantiationException) else error
-        if isinstance(cause, DataError | SettingError):
-            raise cause from None
+        cause = (error.__cause__ or error) if isinstance(error, InstantiationException) else error
         is_call = isinstance(cause, TypeError) and "argument" in str(cause)
-        if cause is not None and not is_call and not isinstance(cause, ImportError):
+        unfit = ImportError, InstantiationException, ValidationError
+        if not is_call and not isinstance(cause, unfit):
             raise cause from None
-        reason = " ".join(str(cause or error).split())
-        found = f"{section['_target_']}, which cannot be built ({reason})"
+        found = f"{section['_target_']}, which cannot be built ({' '.join(str(cause).split())})"
         raise SettingError(place, found=found, expected="settings that it accepts") from error
+
+
+def filled(section: Any, known: Mapping[str, Any]) -> Any:
+    """Return a section in which null settings, also of inner sections, have known values."""
+    if not isinstance(section, Mapping):
+        return section
+    return {
+        name: known.get(name) if value is None else filled(value, known)
+        for name, value in section.items()
+    }

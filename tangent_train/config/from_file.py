@@ -32,6 +32,7 @@ _FUNCTIONS = (
 )
 """Functions that a file may name, besides torchvision's functions that build networks."""
 
+_OF_HYDRA = "_target_", "_partial_", "_convert_", "_recursive_"
 _WORD = re.compile(r"([A-Za-z0-9][\w.+ -]*)?", re.ASCII)
 _WEIGHTS = re.compile("weights|pretrained|checkpoint")
 
@@ -52,13 +53,14 @@ def build_from_file(section: Any, place: str, path: Path, trust: Collection[str]
     try:
         with offline():
             return _build(without_weights(section), place, tuple(trust))
-    except DataError as error:
-        raise DataError(
-            path, found=error.found, expected=error.expected, remedy=error.remedy
-        ) from error
-    except Exception as error:  # of the class, for arguments that it does not accept
+    except Exception as error:
+        # Other errors are those of the class, for arguments that it does not accept.
         found = f"{place} cannot be built ({type(error).__name__}: {error})"
-        raise DataError(path, found=found, expected="arguments that its class accepts") from error
+        reason: Any = error if isinstance(error, DataError) else None
+        reason = reason or DataError(path, found=found, expected="arguments that its class accepts")
+        raise DataError(
+            path, found=reason.found, expected=reason.expected, remedy=reason.remedy
+        ) from error
 
 
 def without_weights(section: Any) -> Any:
@@ -85,16 +87,23 @@ def classes_to_trust(section: Any) -> list[str]:
 
 
 def _build(section: Any, place: str, trust: tuple[str, ...]) -> Any:
-    target = section.get("_target_") if isinstance(section, Mapping) else None
-    if not isinstance(target, str):
-        raise DataError(place, found=f"{place}={section!r}", expected="a section with a _target_")
+    target = section["_target_"]
     is_trusted = _is_inside(target, trust)
     function = resolve_name(target) if is_trusted else _allowed(target, place)
-    arguments = {
-        name: _argument(value, f"{place}.{name}", trust, is_trusted=is_trusted)
-        for name, value in section.items()
-        if name not in ("_target_", "_partial_", "_convert_", "_recursive_")
-    }
+
+    def plain(value: Any, name: str) -> Any:
+        if isinstance(value, Mapping):
+            if "_target_" in value:
+                return _build(value, name, trust)
+            return {key: plain(inner, f"{name}.{key}") for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner, name) for inner in value]
+        is_text = isinstance(value, str) and (is_trusted or _WORD.fullmatch(value))
+        if is_text or value is None or isinstance(value, bool | int | float):
+            return value
+        raise DataError(name, found=f"{name}={value!r}", expected="numbers and words")
+
+    arguments = plain({key: section[key] for key in section if key not in _OF_HYDRA}, place)
     make = partial(function, **arguments)
     return make if section.get("_partial_") is True else make()
 
@@ -108,8 +117,8 @@ def _allowed(target: str, place: str) -> Any:
         if isinstance(named, type):
             from torch import nn
 
-            is_network = issubclass(named, nn.Module) and _is_inside(module, _PACKAGES)
-            if is_network or _is_inside(module, (_VIEWS,)):
+            packages = _PACKAGES if issubclass(named, nn.Module) else (_VIEWS,)
+            if _is_inside(module, packages):
                 return named
         elif f"{module}.{getattr(named, '__name__', '')}" in _FUNCTIONS or _is_builder(named):
             return named
@@ -131,19 +140,3 @@ def _is_builder(function: Any) -> bool:
 
 def _is_inside(name: str, packages: Collection[str]) -> bool:
     return any(name == package or name.startswith(f"{package}.") for package in packages)
-
-
-def _argument(value: Any, place: str, trust: tuple[str, ...], *, is_trusted: bool) -> Any:
-    if isinstance(value, Mapping) and "_target_" in value:
-        return _build(value, place, trust)
-    if isinstance(value, Mapping):
-        return {
-            name: _argument(inner, f"{place}.{name}", trust, is_trusted=is_trusted)
-            for name, inner in value.items()
-        }
-    if isinstance(value, list | tuple):
-        return [_argument(one, place, trust, is_trusted=is_trusted) for one in value]
-    is_plain = value is None or isinstance(value, bool | int | float)
-    if is_plain or (isinstance(value, str) and (is_trusted or _WORD.fullmatch(value))):
-        return value
-    raise DataError(place, found=f"{place}={value!r}", expected="numbers and words")

@@ -12,20 +12,26 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from hydra.core.config_store import ConfigStore
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
-from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    DirectoryPath,
+    Field,
+    FilePath,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    ValidationError,
+)
 from pydantic.fields import FieldInfo
 
 from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, wrong_setting
 from tangent_train.files import config_folder
-
-
-def _existing(path: Path) -> Path:
-    if not path.exists():
-        raise ValueError("an existing file or folder")
-    return path
 
 
 def _as_list(value: Any) -> Any:
@@ -36,13 +42,14 @@ _Item = TypeVar("_Item")
 OneOrMore = Annotated[tuple[_Item, ...], BeforeValidator(_as_list)]
 """A list; a single value is a list of it."""
 
-ExistingPath = Annotated[Path, AfterValidator(_existing)]
+ExistingPath = FilePath | DirectoryPath
+FieldOfView = Annotated[float, Field(gt=0, lt=180)]
+Share = Annotated[float, Field(ge=0, le=1)]
 Section = dict[str, Any]
 """Settings of an option of a group."""
 
 Views = str | Section | None
 Blend = Literal["feather", "nearest"]
-Unmapped = Literal["unknown", "never"]
 
 
 class Settings(BaseModel):
@@ -51,43 +58,58 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
+class TrustSettings(Settings):
+    """Settings of commands that may load a network from a file."""
+
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
+
+
+class NetworkSettings(TrustSettings):
+    """Settings of commands that load a network from a file."""
+
+    checkpoint: ExistingPath
+    """network, written by tangent-train, tangent-import or tangent-export"""
+
+
+class LabelMapSettings(TrustSettings):
+    """Settings of commands that map the classes of a network."""
+
+    label_map: str | Path | None = None
+    """maps the classes of the network to those of another data set: ade20k_to_stanford2d3ds, …, or
+    a JSON file; null = same classes"""
+    unmapped: Literal["unknown", "never"] = "unknown"
+    """pixels where a class without a mapping wins: unknown (label 0, wrong in an evaluation) |
+    never (the best mapped class)"""
+
+
 class ImageSettings(Settings):
     """Settings of commands that read images and videos."""
 
-    input: str | Path | None
-    """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
-    every: int = 1
+    every: PositiveInt = 1
     """videos: use the first and then every n-th frame"""
     area: tuple[float, float, float, float] | None = None
     """partial panoramas: [west, east, south, north] in degrees; null = GPano tags, or the whole
     sphere"""
 
 
-class PredictSettings(ImageSettings):
+class PredictSettings(ImageSettings, NetworkSettings, LabelMapSettings):
     """Settings of tangent-predict."""
 
-    checkpoint: ExistingPath
-    """network, written by tangent-train, tangent-import or tangent-export"""
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
     output: Path
     """folder for the results"""
-    label_map: str | Path | None = None
-    """maps the classes to those of another data set: ade20k_to_stanford2d3ds, …, or a JSON file;
-    null = off"""
-    unmapped: Unmapped = "unknown"
-    """pixels where a class without a mapping wins: unknown (label 0) | never (the best mapped
-    class)"""
     depth: ExistingPath | None = None
     """folder of depth images with the names of the inputs, for networks with depth"""
-    depth_scale: float = 1000
+    depth_scale: PositiveFloat = 1000
     """units per meter in depth files of integers, read or written"""
     projection: Literal["equirectangular", "perspective"] = "equirectangular"
     """equirectangular | perspective (photos)"""
     fill: Literal["black", "mean", "edge", "reflect"] | None = None
     """colors outside the area, in views that leave it: black | mean (color) | edge (nearest pixel)
     | reflect; null: as trained"""
-    fov: float | None = None
+    fov: FieldOfView | None = None
     """photos: horizontal field of view in degrees; null = from EXIF"""
     views: Views = None
     """views of panoramas: tangent | horizontal_wide | horizontal | horizontal_economy | erp |
@@ -100,7 +122,7 @@ class PredictSettings(ImageSettings):
     """base level b: 20·4^b images; null = that of the checkpoint, 0 for imported networks"""
     blend: Blend = "feather"
     """joins overlapping images: feather (weighted mean) | nearest"""
-    rotations: int = 1
+    rotations: PositiveInt = 1
     """number of rotations about the vertical to average over"""
     upright: Literal["pose", "auto"] | None = None
     """align with gravity: pose (GPano tags) | auto (the same, else estimated); null = off"""
@@ -109,9 +131,9 @@ class PredictSettings(ImageSettings):
     mask: float | ExistingPath | None = None
     """panoramas: pixels that become unknown (0): a latitude (-60: below it), a PNG file (black) or
     a folder of them; null = none"""
-    min_confidence: float = 0
+    min_confidence: Share = 0
     """pixels with a lower confidence (0 to 1) become unknown (0)"""
-    min_share: float = 0
+    min_share: Share = 0
     """keep at least this share of each class's pixels, the most confident, below min_confidence
     too; found on up to 32 images"""
     align: Align | None = None
@@ -119,21 +141,19 @@ class PredictSettings(ImageSettings):
     view); null: by the network's kind of depth"""
     depth_format: Literal["png", "npy", "exr"] | None = None
     """depth files: png (16 bits) | npy | exr (float32 meters); null = png"""
-    points: int | None = None
+    points: PositiveInt | None = None
     """depth, write=[points]: points of an image, at most; null = 500000"""
     write: OneOrMore[str] | None = None
     """files to write: labels, color, overlay, probabilities (float16), or depth, color, points
     (PLY); null = all but the last of either; color and overlay of a video are videos"""
-    report: int = 12
+    report: NonNegativeInt = 12
     """images to show in report.html; 0 = no report"""
     shard: str | int | None = None
     """part of the images to predict, e.g. 3/16, for several machines; null = all"""
-    view_batch_size: int | None = None
+    view_batch_size: PositiveInt | None = None
     """images per forward pass; null = as many as have 2^20 pixels"""
     device: str = "auto"
     """auto | cpu | cuda | cuda:1 | mps"""
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
 class RenderSettings(ImageSettings):
@@ -182,7 +202,7 @@ class RenderSettings(ImageSettings):
     blend: Blend = "feather"
     """joins overlapping images: feather (weighted mean) | nearest; labels and depth are not
     averaged"""
-    height: int | None = None
+    height: PositiveInt | None = None
     """rows of the panorama; null = those of the original"""
     kind: Literal["auto", "color", "labels", "depth", "features"] = "auto"
     """kind of the results: auto | color | labels | depth | features"""
@@ -190,11 +210,9 @@ class RenderSettings(ImageSettings):
     """true: convert z-depth to distance from the center"""
 
 
-class ExportSettings(Settings):
+class ExportSettings(NetworkSettings):
     """Settings of tangent-export."""
 
-    checkpoint: ExistingPath
-    """network, written by tangent-train, tangent-import or this command (.safetensors)"""
     output: Path
     """file: .onnx or .safetensors"""
     image_size: tuple[int, int] | None = None
@@ -203,8 +221,6 @@ class ExportSettings(Settings):
     """ONNX operator set; null = default of the exporter"""
     overwrite: bool = False
     """true: replace an existing file"""
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
 class ImportSettings(Settings):
@@ -246,7 +262,7 @@ class ImportSettings(Settings):
     tangent images two, e.g. [9, 8]"""
     base_level: int | None = None
     """base level b: 20·4^b tangent images; null = the fewest, 0 for wide ones"""
-    fov: float = 60
+    fov: FieldOfView = 60
     """horizontal field of view of its photos in degrees; predictions on photos use it"""
     output: Path
     """file: .ckpt, or .onnx for library=onnx"""
@@ -274,23 +290,23 @@ class KeypointSettings(Settings):
     """base levels b to compare, e.g. 1 or [0,1]: 20·4^b images each"""
     level: int | None = None
     """level s, the angular resolution, at most that of the panorama; null = from its rows"""
-    margin: int = 32
+    margin: NonNegativeInt = 32
     """pixels added around tangent images, so that keypoints at borders are found"""
-    ratio: float = 0.8
+    ratio: PositiveFloat = 0.8
     """ratio test: largest distance to the nearest neighbor over that to the second nearest; 1 =
     off"""
     mutual: bool = True
     """true: mutual nearest neighbors only"""
-    max_error_deg: float = 1
+    max_error_deg: PositiveFloat = 1
     """largest error of inliers of the two-view geometry, in degrees"""
-    seed: int = 0
+    seed: NonNegativeInt = 0
     """seed of random samples and rotations"""
     controls: bool = True
     """true: also the panorama at the resolution of the tangent images, a cube map, and the right
     panorama rotated"""
-    max_pairs: int | None = None
+    max_pairs: PositiveInt | None = None
     """compare the first pairs only; null = all"""
-    pictures: int = 2
+    pictures: NonNegativeInt = 2
     """pairs whose matches are drawn"""
     export: bool = False
     """true: write keypoints and matches as COLMAP databases"""
@@ -319,22 +335,22 @@ class RunSettings(Settings):
     """early_stopping | model_summary; null = none"""
     name: str = "run"
     """first folder below runs/"""
-    seed: int = 0
+    seed: NonNegativeInt = 0
     """seed of initial weights, order, images and augmentation"""
     level: int = 5
     """level s, the angular resolution: panoramas of 2^(s+1) rows"""
-    panels: int = 6
+    panels: NonNegativeInt = 6
     """test images drawn as panels and shown in report.html (segmentation and depth)"""
-    validation_images: int = 4
+    validation_images: NonNegativeInt = 4
     """validation images shown by loggers that can show images (segmentation and depth)"""
-    checkpoint_every_n_steps: int | None = 500
+    checkpoint_every_n_steps: PositiveInt | None = 500
     """training steps between checkpoints, besides those of every epoch; null = every epoch only"""
-    ema: float | None = None
+    ema: Share | None = None
     """decay of the average of the weights, e.g. 0.999; the average is evaluated and stored; null =
     off"""
 
 
-class TrainSettings(RunSettings):
+class TrainSettings(RunSettings, TrustSettings):
     """Settings of tangent-train."""
 
     init_from: Path | None = None
@@ -342,27 +358,15 @@ class TrainSettings(RunSettings):
     weights"""
     resume: Path | None = None
     """folder of an interrupted run, which is continued with its settings"""
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
-class EvaluateSettings(RunSettings):
+class EvaluateSettings(RunSettings, NetworkSettings, LabelMapSettings):
     """Settings of tangent-evaluate."""
 
-    checkpoint: ExistingPath
-    """network, written by tangent-train, tangent-import or tangent-export"""
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network is given; null = those of the checkpoint"""
     level: int | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = that of the checkpoint"""
-    label_map: str | Path | None = None
-    """maps the classes of the network to those of the data: ade20k_to_stanford2d3ds, …, or a JSON
-    file; null = same classes"""
-    unmapped: Unmapped = "unknown"
-    """pixels where a class without a mapping wins: unknown (counted as wrong) | never (the best
-    mapped class)"""
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
 class PrepareSettings(RunSettings):
@@ -399,7 +403,7 @@ class FineTuningSettings(Settings):
     """schedule of the learning rate in fine-tuning"""
 
 
-class TransferSettings(RunSettings):
+class TransferSettings(RunSettings, LabelMapSettings):
     """Settings of tangent-transfer."""
 
     name: str = "transfer"
@@ -412,14 +416,6 @@ class TransferSettings(RunSettings):
     """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, or no folds"""
     checkpoint: ExistingPath | None = None
     """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
-    label_map: str | Path | None = None
-    """maps the classes of such a file to those of the data: ade20k_to_stanford2d3ds, …, or a JSON
-    file; null = same"""
-    unmapped: Unmapped = "unknown"
-    """pixels where a class without a mapping wins: unknown (counted as wrong) | never (the best
-    mapped class)"""
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
     compare: OneOrMore[str | Section] = ("erp", "cubemap")
     """further views to evaluate P on: names of representations, or settings, e.g. {name: fine,
     option: erp, rows: 1024}"""
@@ -430,7 +426,7 @@ class TransferSettings(RunSettings):
     """fine-tuning of P on photos (P-FT) and on panoramas (S-FT)"""
     study_levels: OneOrMore[int] | None = None
     """evaluate P only, on panoramas of these levels, e.g. [5, 6, 7, 8, 9, 10]; null = off"""
-    study_max_rows: int = 512
+    study_max_rows: PositiveInt = 512
     """rows of the stored panoramas; finer levels are rendered from them"""
     photos: PhotoSettings
     """the photos"""
@@ -508,14 +504,10 @@ def check_read(settings: Settings, read: Collection[str]) -> None:
     Raises:
         SettingError: Another setting has not its default.
     """
-    for name in settings.model_dump(exclude_defaults=True):
-        if name not in read:
-            default = type(settings).model_fields[name].default
-            raise SettingError(
-                name,
-                found=getattr(settings, name),
-                expected=f"{'null' if default is None else default}: nothing reads it here",
-            )
+    for name in settings.model_dump(exclude_defaults=True, exclude={*read}):
+        default = type(settings).model_fields[name].default
+        expected = f"{'null' if default is None else default}: nothing reads it here"
+        raise SettingError(name, found=getattr(settings, name), expected=expected)
 
 
 def plain(value: Any) -> Any:
@@ -534,20 +526,15 @@ def validate(command: str, config: Any) -> Any:
         SettingError: A setting is missing, unknown, or of another type.
     """
     values: Any = OmegaConf.to_container(OmegaConf.create(config), resolve=True)
+    kind = SETTINGS[command]
     try:
-        return SETTINGS[command].model_validate({n: v for n, v in values.items() if v != "???"})
+        return kind.model_validate({name: v for name, v in values.items() if v != "???"})
     except ValidationError as error:
-        first, *_ = errors = error.errors(include_url=False)
-    name, fields, value = "", SETTINGS[command].model_fields, values
-    for part in first["loc"]:
-        if not isinstance(value, Mapping) or (part not in value and first["type"] != "missing"):
-            break
-        name, value = f"{name}.{part}".lstrip("."), value.get(str(part))
-    if first["type"] == "missing":
-        raise SettingError(name, found="nothing", expected=comment_of(fields[name]))
-    of_setting = [e for e in errors if e["loc"][: name.count(".") + 1] == tuple(name.split("."))]
-    expected = dict.fromkeys(str(e.get("ctx", {}).get("error") or e["msg"]) for e in of_setting)
-    kinds = [text.removeprefix("Input should be ") for text in expected]
-    if first["type"] == "extra_forbidden":
-        kinds = ["a setting that something reads"]
-    raise SettingError(name, found="null" if value is None else value, expected=" or ".join(kinds))
+        known = {name: comment_of(field) for name, field in kind.model_fields.items()}
+        raise wrong_setting(error, known) from error
+
+
+def typed_names() -> list[str]:
+    """Return the names of the settings on the command line, such as ``network.widths``."""
+    overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    return [text.lstrip("+~").partition("=")[0] for text in overrides]

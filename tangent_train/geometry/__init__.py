@@ -14,68 +14,31 @@ Convention, stated here once and used everywhere:
 * Angles are in radians unless a name ends in ``deg``.
 """
 
-from tangent_train.geometry.camera import (
-    camera_matrix_from_fov,
-    is_camera_matrix,
-    lengths_of_rays,
-    perspective_directions,
-    ray_lengths,
-    shift_range,
-)
-from tangent_train.geometry.cube import CubeGrid
-from tangent_train.geometry.equirect import (
-    equirect_directions,
-    equirect_elevations,
-    equirect_latitudes,
-    equirect_longitudes,
-    equirect_shape,
-    equirect_solid_angles,
-    equirect_to_lonlat,
-    lonlat_to_equirect,
-    nearest_level,
-)
-from tangent_train.geometry.grid import TangentGrid
-from tangent_train.geometry.horizontal import RingGrid
-from tangent_train.geometry.icosphere import Icosphere, icosphere, vertex_resolution
-from tangent_train.geometry.panorama_pose import PanoramaPose
-from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import (
-    checked_rotation,
-    lonlat_to_xyz,
-    random_rotation,
-    rotation_about,
-    to_right_handed,
-    xyz_to_lonlat,
-)
-
-__all__ = [
-    "CubeGrid",
-    "Icosphere",
-    "PanoramaPose",
-    "PinholeGrid",
-    "RingGrid",
-    "TangentGrid",
-    "camera_matrix_from_fov",
-    "checked_rotation",
-    "equirect_directions",
-    "equirect_elevations",
-    "equirect_latitudes",
-    "equirect_longitudes",
-    "equirect_shape",
-    "equirect_solid_angles",
-    "equirect_to_lonlat",
-    "icosphere",
-    "is_camera_matrix",
-    "lengths_of_rays",
-    "lonlat_to_equirect",
-    "lonlat_to_xyz",
-    "nearest_level",
-    "perspective_directions",
-    "random_rotation",
-    "ray_lengths",
-    "rotation_about",
-    "shift_range",
-    "to_right_handed",
-    "vertex_resolution",
-    "xyz_to_lonlat",
-]
+from tangent_train.geometry.camera import camera_matrix_from_fov as camera_matrix_from_fov
+from tangent_train.geometry.camera import is_camera_matrix as is_camera_matrix
+from tangent_train.geometry.camera import lengths_of_rays as lengths_of_rays
+from tangent_train.geometry.camera import perspective_directions as perspective_directions
+from tangent_train.geometry.camera import ray_lengths as ray_lengths
+from tangent_train.geometry.camera import shift_range as shift_range
+from tangent_train.geometry.grids import CubeGrid as CubeGrid
+from tangent_train.geometry.grids import PinholeGrid as PinholeGrid
+from tangent_train.geometry.grids import RingGrid as RingGrid
+from tangent_train.geometry.grids import TangentGrid as TangentGrid
+from tangent_train.geometry.icosphere import icosphere as icosphere
+from tangent_train.geometry.icosphere import vertex_resolution as vertex_resolution
+from tangent_train.geometry.sphere import PanoramaPose as PanoramaPose
+from tangent_train.geometry.sphere import checked_rotation as checked_rotation
+from tangent_train.geometry.sphere import equirect_directions as equirect_directions
+from tangent_train.geometry.sphere import equirect_elevations as equirect_elevations
+from tangent_train.geometry.sphere import equirect_latitudes as equirect_latitudes
+from tangent_train.geometry.sphere import equirect_longitudes as equirect_longitudes
+from tangent_train.geometry.sphere import equirect_shape as equirect_shape
+from tangent_train.geometry.sphere import equirect_solid_angles as equirect_solid_angles
+from tangent_train.geometry.sphere import equirect_to_lonlat as equirect_to_lonlat
+from tangent_train.geometry.sphere import lonlat_to_equirect as lonlat_to_equirect
+from tangent_train.geometry.sphere import lonlat_to_xyz as lonlat_to_xyz
+from tangent_train.geometry.sphere import nearest_level as nearest_level
+from tangent_train.geometry.sphere import random_rotation as random_rotation
+from tangent_train.geometry.sphere import rotation_about as rotation_about
+from tangent_train.geometry.sphere import to_right_handed as to_right_handed
+from tangent_train.geometry.sphere import xyz_to_lonlat as xyz_to_lonlat

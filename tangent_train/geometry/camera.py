@@ -10,6 +10,17 @@ from numpy.typing import ArrayLike, NDArray
 from tangent_train.errors import SettingError
 
 
+def half_width(fov_deg: float) -> float:
+    """Return half the width of an image in focal lengths, given its field of view.
+
+    Raises:
+        SettingError: The field of view is not between 0° and 180°.
+    """
+    if not 0 < fov_deg < 180:
+        raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
+    return math.tan(math.radians(fov_deg) / 2)
+
+
 def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.float64]:
     """Return a pinhole matrix with square pixels and the center in the middle of the image.
 
@@ -24,10 +35,8 @@ def camera_matrix_from_fov(fov_deg: float, size: tuple[int, int]) -> NDArray[np.
     Raises:
         SettingError: The field of view is not between 0° and 180°.
     """
-    if not 0 < fov_deg < 180:
-        raise SettingError("fov", found=fov_deg, expected="more than 0 and less than 180 degrees")
     height, width = size
-    focal = width / (2 * math.tan(math.radians(fov_deg) / 2))
+    focal = width / (2 * half_width(fov_deg))
     return np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
 
 
@@ -35,8 +44,8 @@ def is_camera_matrix(matrix: NDArray[np.float64]) -> bool:
     """Return True for a ``(3, 3)`` K without skew and with focal lengths above 0."""
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
         return False
-    plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0
-    return bool(plain and np.diag(matrix).min() > 0)
+    is_plain = matrix[2].tolist() == [0, 0, 1] and matrix[0, 1] == matrix[1, 0] == 0
+    return bool(is_plain and np.diag(matrix).min() > 0)
 
 
 def perspective_directions(camera_matrix: ArrayLike, size: tuple[int, int]) -> NDArray[np.float64]:
@@ -102,20 +111,17 @@ def shift_range(
     matrix = np.asarray(camera_matrix, np.float64)
     focal, center = np.diag(matrix)[:2], matrix[:2, 2]
     half_sides = np.array(crop[::-1]) / 2
-    extent = focal * math.tan(math.radians(fov_deg) / 2) * half_sides / half_sides[0]
+    extent = focal * half_width(fov_deg) * half_sides / half_sides[0]
     least = extent - center - 0.5
     greatest = np.array(size[::-1]) - 0.5 - extent - center
     if np.any(least > greatest + 1e-9):
-        wanted = np.degrees(2 * np.arctan(extent / focal))
-        widest = np.degrees(2 * np.arctan(np.array(size[::-1]) / (2 * focal)))
+        wanted, widest = np.degrees(
+            2 * np.arctan([extent / focal, np.array(size[::-1]) / (2 * focal)])
+        ).round(2)
         raise SettingError(
             "field of view",
-            found=f"{_degrees(wanted)} for an image that spans {_degrees(widest)}",
+            found=f"{wanted.tolist()}° for an image that spans {widest.tolist()}°",
             expected="a field of view inside the image",
             remedy="Choose a smaller one, or leave the image out.",
         )
     return least, np.maximum(least, greatest)
-
-
-def _degrees(width_height: NDArray[np.float64]) -> str:
-    return f"{width_height[0]:.4g}° × {width_height[1]:.4g}°"

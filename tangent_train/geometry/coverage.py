@@ -5,21 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry.equirect import equirect_directions, equirect_solid_angles
-from tangent_train.geometry.pinhole_grid import PinholeGrid
-from tangent_train.geometry.sphere import lonlat_to_xyz, xyz_to_lonlat
+from tangent_train.geometry.sphere import (
+    equirect_directions,
+    equirect_solid_angles,
+    lonlat_to_xyz,
+    xyz_to_lonlat,
+)
+
+if TYPE_CHECKING:
+    from tangent_train.geometry.grids import PinholeGrid
 
 _ROWS = 180
 _COARSE_ROWS = 60
 _STEP_DEG = 0.5
 """Distance of the directions in which images are tested to cover the whole sphere."""
 
-_TOGETHER = 2**15
 _ROUNDING = 1e-6
 
 _Mask = tuple[tuple[int, int], bytes] | None
@@ -44,17 +50,16 @@ def check_coverage(
         SettingError: A direction is more than half a pixel outside the outermost pixel centers.
     """
     missed = _missed((*grids,), _mask(valid), by_owners, -_ROUNDING)
-    if missed is None:
-        return
-    longitude, latitude = (f"{round(math.degrees(angle))}°" for angle in xyz_to_lonlat(missed))
-    condition = ", each direction by the view with the nearest center (blend=nearest)" * by_owners
-    raise SettingError(
-        "views",
-        found=f"{sum(grid.num_images for grid in grids)} views that miss longitude {longitude}, "
-        f"latitude {latitude}",
-        expected=f"views that cover {'the sphere' if valid is None else 'the area'}{condition}",
-        remedy="Use a larger fov or more views, or limit the views to an area.",
-    )
+    if missed is not None:
+        longitude, latitude = np.degrees(xyz_to_lonlat(missed))
+        count = sum(grid.num_images for grid in grids)
+        owners = ", each direction by the view with the nearest center (blend=nearest)" * by_owners
+        raise SettingError(
+            "views",
+            found=f"{count} views that miss longitude {longitude:.0f}°, latitude {latitude:.0f}°",
+            expected=f"views that cover {'the sphere' if valid is None else 'the area'}{owners}",
+            remedy="Use a larger fov or more views, or limit the views to an area.",
+        )
 
 
 def overlaps(grid: PinholeGrid, valid: NDArray[np.bool_] | None = None) -> bool:
@@ -72,24 +77,17 @@ def _missed(
     grids: tuple[PinholeGrid, ...], mask: _Mask, by_owners: bool, least: float
 ) -> NDArray[np.float64] | None:
     """Return a direction that is not inside any image by at least a sine; None if all are."""
+    directions = _cells(mask)[1]
     if mask is None:
         angles = np.meshgrid(np.arange(-180, 180, _STEP_DEG), np.arange(-90, 91, _STEP_DEG))
         directions = lonlat_to_xyz(np.radians(np.stack(angles, axis=-1))).reshape(-1, 3)
         if least > 0:  # views that meet at a pole overlap around it
             directions = directions[np.abs(directions[:, 2]) < 1]
-    else:
-        directions = equirect_directions(mask[0])[np.frombuffer(mask[1], np.bool_).reshape(mask[0])]
-    for tested in np.split(directions, range(_TOGETHER, len(directions), _TOGETHER)):
-        insets = np.concatenate([grid.insets(tested) for grid in grids])
-        if by_owners:
-            inset = np.take_along_axis(insets, grids[0].owners(tested)[None], axis=0)[0]
-        else:
-            inset = insets.max(axis=0)
-        missed = np.flatnonzero(inset < least)
-        if len(missed):
-            # The middle of the missed ones lies well inside the gap.
-            return np.asarray(tested[missed[len(missed) // 2]])
-    return None
+    insets = np.concatenate([grid.insets(directions) for grid in grids])
+    owner = grids[0].owners(directions) if by_owners else insets.argmax(axis=0)
+    missed = np.flatnonzero(np.take_along_axis(insets, owner[None], axis=0)[0] < least)
+    # The middle of the missed ones lies well inside the gap.
+    return directions[missed[len(missed) // 2]] if len(missed) else None
 
 
 def _mask(valid: NDArray[np.bool_] | None, rows: int = 2 * _ROWS) -> _Mask:

@@ -1,16 +1,30 @@
-"""Icosahedron with vertices at both poles, and its Loop subdivisions."""
+"""Icosahedron with vertices at both poles, its Loop subdivisions, and signals on them.
+
+The vertices of `icosphere` are not normalized between subdivisions. Signals have values in the
+directions of vertices, unit vectors, or on faces: the planar triangles of three unit vectors.
+"""
 
 from __future__ import annotations
 
-from functools import lru_cache
-from typing import NamedTuple
+from functools import cache, lru_cache
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import SettingError
+from tangent_train.geometry.sphere import lonlat_to_xyz
 
-MAX_LEVEL = 8
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+IcosphereElements = Literal["vertices", "faces"]
+"""A signal has a value at every vertex or on every face."""
+
+_CHUNK = 2**16
+"""Number of directions that are located at once."""
+
+_KEPT = 2
+"""Number of signals whose sampling points are kept in memory; 190 MB each at level 8."""
 
 
 class Icosphere(NamedTuple):
@@ -27,22 +41,19 @@ class Icosphere(NamedTuple):
 
 def _icosahedron() -> Icosphere:
     """Return two poles and two rings of five vertices at latitudes ±atan ½."""
-    lat = np.arctan(0.5)
-    lon = 2 * np.pi / 5 * (np.arange(10) % 5 + np.repeat([0.0, 0.5], 5))
-    z = np.repeat([np.sin(lat), -np.sin(lat)], 5)
-    rings = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), z], axis=-1)
+    k, steps = np.arange(10), 2 * np.pi / 5 * np.array([0, 1, 2, 3, 4, 0.5, 1.5, 2.5, 3.5, 4.5])
+    rings = lonlat_to_xyz(np.stack([steps, np.arctan(0.5) * np.where(k < 5, 1, -1)], axis=-1))
     vertices = np.concatenate([[[0.0, 0.0, 1.0]], rings, [[0.0, 0.0, -1.0]]])
-    k = np.arange(5)
-    upper, upper_next, lower, lower_next = 1 + k, 1 + (k + 1) % 5, 6 + k, 6 + (k + 1) % 5
-    north, south = np.zeros_like(k), np.full_like(k, 11)
+    upper, lower = 1 + k[:5], 6 + k[:5]
+    upper_next, lower_next = np.roll(upper, -1), np.roll(lower, -1)
+    north, south = np.zeros(5, np.int64), np.full(5, 11)
     triangles = [
         (north, upper, upper_next),
         (upper, lower, upper_next),
         (upper_next, lower, lower_next),
         (south, lower_next, lower),
     ]
-    faces = np.concatenate([np.stack(triangle, axis=-1) for triangle in triangles])
-    return Icosphere(vertices, faces.astype(np.int64))
+    return Icosphere(vertices, np.concatenate([np.stack(t, axis=-1) for t in triangles]))
 
 
 def _edges(faces: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -74,7 +85,7 @@ def _subdivide(mesh: Icosphere) -> Icosphere:
     return Icosphere(np.concatenate([kept, on_edges]), refined)
 
 
-@lru_cache(maxsize=MAX_LEVEL + 1)
+@cache
 def icosphere(level: int) -> Icosphere:
     """Return the icosahedron after `level` Loop subdivisions, not normalized in between.
 
@@ -84,21 +95,16 @@ def icosphere(level: int) -> Icosphere:
     Returns:
         10·4^level + 2 vertices and 20·4^level faces; children of face f are 4f … 4f+3. Read-only.
 
-    Raises:
-        SettingError: The level is out of range.
-
     >>> icosphere(1).faces.shape
     (80, 3)
     """
-    if not 0 <= level <= MAX_LEVEL:
-        raise SettingError("icosphere level", found=level, expected=f"0 to {MAX_LEVEL}")
     mesh = _icosahedron() if level == 0 else _subdivide(icosphere(level - 1))
     for array in mesh:
         array.setflags(write=False)
     return mesh
 
 
-@lru_cache(maxsize=MAX_LEVEL + 2)
+@cache
 def vertex_resolution(base_level: int) -> float:
     """Return R_v: the mean over vertices of the mean angle to their neighbors (section 3.2).
 
@@ -108,17 +114,146 @@ def vertex_resolution(base_level: int) -> float:
     Returns:
         Radians.
 
-    Raises:
-        SettingError: The level is out of range.
-
     >>> round(vertex_resolution(0), 7)
     1.1071487
     """
     if base_level == -1:
         return 2 * vertex_resolution(0)
-    vertices, faces = icosphere(base_level)
-    edges, _ = _edges(faces)
-    a, b = np.moveaxis(vertices[edges], 1, 0)
-    angles = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), (a * b).sum(axis=1))
-    total = np.bincount(edges.ravel(), np.repeat(angles, 2), minlength=len(vertices))
-    return float(np.mean(total / np.bincount(edges.ravel(), minlength=len(vertices))))
+    edges, _ = _edges(icosphere(base_level).faces)
+    a, b = np.moveaxis(icosphere_directions(base_level)[edges], 1, 0)
+    angles = 2 * np.arcsin(np.linalg.norm(a - b, axis=1) / 2)
+    total = np.bincount(edges.ravel(), np.repeat(angles, 2))
+    return float(np.mean(total / np.bincount(edges.ravel())))
+
+
+def icosphere_count(level: int, elements: IcosphereElements = "vertices") -> int:
+    """Return the number of values of a signal.
+
+    >>> icosphere_count(5), icosphere_count(5, "faces")
+    (10242, 20480)
+    """
+    return 10 * 4**level + 2 if elements == "vertices" else 20 * 4**level
+
+
+@lru_cache(maxsize=4)
+def icosphere_directions(
+    level: int, elements: IcosphereElements = "vertices"
+) -> NDArray[np.float64]:
+    """Return the directions of the vertices or of the faces' centers.
+
+    The order is that of `icosphere`: the first vertices are those of the level below, and the
+    children of face f are 4f … 4f+3.
+
+    Args:
+        level: Level s, 0 to 8.
+        elements: ``vertices`` or ``faces``.
+
+    Returns:
+        ``(V, 3)`` unit vectors, read-only.
+    """
+    vertices, faces = icosphere(level)
+    if elements == "faces":
+        vertices = icosphere_directions(level)[faces].mean(axis=1)
+    directions = vertices / np.linalg.norm(vertices, axis=-1, keepdims=True)
+    directions.setflags(write=False)
+    return directions
+
+
+@lru_cache(maxsize=4)
+def faces_of_vertices(level: int) -> NDArray[np.int64]:
+    """Return ``(V, 6)`` faces that meet at each vertex; −1 for the sixth at the 12 corners."""
+    faces = icosphere(level).faces
+    corners = faces.ravel().argsort(kind="stable")
+    counts = np.bincount(faces.ravel())
+    around = np.full((len(counts), 6), -1)
+    around[np.arange(6) < counts[:, None]] = corners // 3
+    around.setflags(write=False)
+    return around
+
+
+@lru_cache(maxsize=2)
+def _vertex_tree(level: int) -> cKDTree:
+    from scipy.spatial import cKDTree  # slow to import
+
+    return cKDTree(icosphere_directions(level))
+
+
+def nearest_vertices(level: int, directions_xyz: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the vertex ``(P,)`` nearest to each direction ``(P, 3)``, a unit vector."""
+    return np.asarray(_vertex_tree(level).query(directions_xyz)[1], np.int64)
+
+
+def locate(
+    level: int, directions_xyz: NDArray[np.float64]
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Find the face that contains each direction, and barycentric weights of its vertices.
+
+    Linear interpolation of values v at the vertices is ``(weights * v[faces[found]]).sum(1)``. As
+    all angles are acute, the face is one of those at the nearest vertex.
+
+    Args:
+        level: Level s, 0 to 8.
+        directions_xyz: ``(P, 3)`` unit vectors.
+
+    Returns:
+        ``(P,)`` faces and ``(P, 3)`` weights of their vertices, 0 or more, which sum to 1. On an
+        edge, any of its faces is returned.
+    """
+    around = faces_of_vertices(level)
+    a, b, c = np.moveaxis(icosphere_directions(level)[icosphere(level).faces], 1, 0)
+    normals = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    found = np.empty(len(directions_xyz), np.int64)
+    weights = np.empty((len(directions_xyz), 3))
+    for start in range(0, len(found), _CHUNK):
+        points = directions_xyz[start : start + _CHUNK]
+        candidates = around[nearest_vertices(level, points)]
+        candidates = np.where(candidates < 0, candidates[:, :1], candidates)
+        shares = (normals[candidates] @ points[:, None, :, None])[..., 0]
+        shares /= shares.sum(axis=2, keepdims=True)
+        best = shares.min(axis=2).argmax(axis=1)[:, None]
+        found[start : start + _CHUNK] = np.take_along_axis(candidates, best, 1)[:, 0]
+        chosen = np.take_along_axis(shares, best[..., None], 1)[:, 0].clip(0)
+        weights[start : start + _CHUNK] = chosen / chosen.sum(axis=1, keepdims=True)
+    return found, weights
+
+
+@lru_cache(maxsize=_KEPT)
+def sampling_points(
+    level: int, elements: IcosphereElements = "vertices"
+) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+    """Return points at which an image is averaged over each cell, weighted by solid angle.
+
+    The three medians divide a face into six triangles of nearly equal area, with a point in the
+    middle of each. The cell of a face is the face: 6 points. The cell of a vertex consists of the
+    two triangles at it in each of its faces: 12 points, 10 at the 12 corners.
+
+    Args:
+        level: Level s, 0 to 8.
+        elements: ``vertices`` or ``faces``.
+
+    Returns:
+        Directions ``(P, 3)`` of the points; the points ``(T, V)`` in each cell, point 0 where a
+        cell has fewer than T; and their weights ``(T, V)``, which sum to 1, 0 for these.
+    """
+    faces = icosphere(level).faces
+    corners = icosphere_directions(level)[faces]
+    center = corners.mean(axis=1)
+    points, areas = np.empty((len(faces), 3, 2, 3), np.float32), np.empty((len(faces), 3, 2))
+    for corner, side in np.ndindex(3, 2):
+        a = corners[:, corner]
+        middle = (a + corners[:, (corner + 1 + side) % 3]) / 2
+        point = (a + middle + center) / 3
+        length = np.linalg.norm(point, axis=1, keepdims=True)
+        points[:, corner, side] = point / length
+        # The solid angle of a small triangle: twice its area, seen from its middle.
+        volume = np.abs(np.einsum("pc,pc->p", a, np.cross(middle, center)))
+        areas[:, corner, side] = volume / length[:, 0] ** 3
+    cells = np.arange(len(faces))[:, None] if elements == "faces" else faces
+    cell = np.broadcast_to(cells[..., None], areas.shape).ravel()
+    order, counts = cell.argsort(kind="stable"), np.bincount(cell)
+    slots = np.arange(len(cell)) - (counts.cumsum() - counts).repeat(counts)
+    source = np.zeros((counts.max(), len(counts)), np.int64)
+    weight = np.zeros(source.shape, np.float32)
+    source[slots, cell[order]] = order
+    weight[slots, cell[order]] = (areas.ravel() / np.bincount(cell, areas.ravel())[cell])[order]
+    return points.reshape(-1, 3), source, weight

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from tangent_train.heads.base import Head, PredictedImage, Scores
-from tangent_train.heads.classes import ClassesHead
+from tangent_train.heads.classes import ClassesHead, ImageClassHead
 from tangent_train.heads.distance import DistanceHead
-from tangent_train.heads.image_class import ImageClassHead
 
 __all__ = [
-    "HEADS",
     "ClassesHead",
     "DistanceHead",
     "Head",
@@ -19,12 +17,6 @@ __all__ = [
     "Scores",
     "head_of",
 ]
-
-
-HEADS: dict[str, type[ClassesHead | DistanceHead]] = {
-    head.kind: head for head in (ClassesHead, DistanceHead)
-}
-"""Heads of networks from files, by the kind of labels that these predict."""
 
 
 def head_of(loaded: Any, **settings: Any) -> ClassesHead | DistanceHead:

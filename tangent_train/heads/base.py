@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +15,17 @@ from torchmetrics import Metric
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
-from tangent_train.metrics.score_columns import ScoreColumn
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.io.pixel_files import write_pixels
+from tangent_train.metrics.scores import Interval, ScoreColumn
 from tangent_train.rendering import Blend
-from tangent_train.rendering.representations.views import Views
 
 RGB = NDArray[np.uint8]
 """A picture ``(H, W, 3)``."""
 
-Painter = Callable[[RGB, NDArray[Any]], RGB]
-"""Returns a picture ``(h, w, 3)`` of an RGB frame and its predicted pixels."""
+PICTURES = ("color", "overlay")
+"""Kinds of output that are pictures; those of the frames of a video become videos."""
+
+NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 class Scores(NamedTuple):
@@ -38,7 +39,7 @@ class Scores(NamedTuple):
     """
 
     means: Mapping[str, float]
-    of_classes: Mapping[str, NDArray[Any]] = MappingProxyType({})
+    of_classes: Mapping[str, NDArray[Any]] = NOTHING
     bands: Sequence[Mapping[str, float]] = ()
     confusion: NDArray[np.int64] | None = None
 
@@ -54,35 +55,21 @@ class PredictedImage(NamedTuple):
 
     image: Any
     pixels: NDArray[Any]
-    facts: Mapping[str, Any] = MappingProxyType({})
-
-
-class SummaryTable(NamedTuple):
-    """Cells of a table of predictions.
-
-    Attributes:
-        title: Text above the table.
-        header: Name of each column.
-        rows: Cells of each row.
-    """
-
-    title: str
-    header: Sequence[str]
-    rows: Sequence[Sequence[str]]
-
-
-class HeadMosaic(Protocol):
-    """A panorama or photo that is put together from the outputs of its views."""
+    facts: Mapping[str, Any] = NOTHING
 
     @property
-    def facts(self) -> Mapping[str, Any]:
-        """Facts for the summary of a prediction, after `pixels`."""
+    def solid_angles(self) -> NDArray[np.floating]:
+        """Relative solid angles ``(h, w)`` of the pixels.
 
-    def add(self, outputs: Tensor, views: Views) -> None:
-        """Add the outputs ``(n, C, h, w)`` of some views."""
-
-    def pixels(self) -> Tensor:
-        """Return the prediction ``(H, W)``, see `Head`."""
+        A photo's pixel at (x, y) on the plane at distance 1 has the angle (1 + x² + y²)^(−3/2).
+        """
+        image, shape = self.image, self.pixels.shape
+        if image.camera_matrix is not None:
+            return ray_lengths(image.camera_matrix, shape) ** -3.0
+        of_rows = equirect_solid_angles(image.shape)[:, None]
+        if image.area is not None:
+            of_rows = of_rows[image.area.places()[0]]
+        return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory
 
 
 class Head(nn.Module, ABC):
@@ -90,23 +77,22 @@ class Head(nn.Module, ABC):
 
     A head trains a network (loss and norm), scores it, puts the outputs of views together to a
     panorama, draws the result, and writes and reads its files. Tasks, the engine and the commands
-    are the same for all heads.
+    are the same for all heads. A head without files needs only the first two parts.
 
     Args:
         class_names: Names of the labels of the data; empty without classes.
 
     Attributes:
         kind: Kind of the predictions, by which files and commands select the head.
-        labels: Kind of labels that a data set must have, see `datamodules.core.labels`.
+        labels: Kind of labels that a data set must have, see `datamodules.core.label_map`.
         columns: Names and units of the scores over a split, in the order of the tables.
         main_score: Score that selects the best epoch.
-        takes: Input and output of a network for this head, for messages.
         num_outputs: Number of channels of the network's output.
         predict_settings: Settings of ``tangent-predict`` that are arguments of the head, each with
-            the kind of output that reads it; "" for all.
+            the kind of output, or the other setting, without which nothing reads it; "" for none.
         is_metric: False for distances that are known up to a scale.
-        suffixes: Suffixes of the files of an image, by kind of output. The first kind holds the
-            predicted pixels, from which pictures are made. All but the last are usual.
+        suffixes: Suffixes of the files of an image, by kind of output. The first kind (`source`)
+            holds the predicted pixels, from which pictures are made. All but the last are usual.
         summary: Name of the summary of an image in the summary file.
         summary_columns: Names in the summary of an image that ``summary.csv`` lists.
         unknown: Value of unknown pixels.
@@ -116,13 +102,12 @@ class Head(nn.Module, ABC):
     labels: ClassVar[str]
     columns: ClassVar[Mapping[str, ScoreColumn]]
     main_score: ClassVar[str]
-    takes: ClassVar[str]
-    predict_settings: ClassVar[Mapping[str, str]] = MappingProxyType({})
+    predict_settings: ClassVar[Mapping[str, str]] = NOTHING
     summary: ClassVar[str] = ""
     unknown: ClassVar[float] = 0
     num_outputs: int
     is_metric: bool = True
-    suffixes: Mapping[str, str] = MappingProxyType({})
+    suffixes: Mapping[str, str] = NOTHING
     summary_columns: Sequence[str] = ()
 
     def __init__(self, class_names: Sequence[str] = ()) -> None:
@@ -204,36 +189,29 @@ class Head(nn.Module, ABC):
 
     # From views to a panorama
 
-    def mosaic(
-        self,
-        shape: tuple[int, int],
-        blend: Blend,
-        *,
-        averaged: bool = False,
-        device: Any = "cpu",
-        valid: NDArray[np.bool_] | None = None,
-        camera_matrix: NDArray[np.float64] | None = None,
-    ) -> HeadMosaic:
+    def mosaic(self, shape: tuple[int, int], blend: Blend, **settings: Any) -> Any:
         """Return an empty panorama or photo.
 
         Args:
             shape: ``(H, W)`` of the panorama or photo.
             blend: Blend of the views.
-            averaged: True if several sets of views are averaged, or more than the pixels is needed.
-            device: Device of the outputs.
-            valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
-            camera_matrix: ``(3, 3)`` K of a photo; None for a panorama.
-        """
-        raise NotImplementedError
+            **settings: ``averaged`` is True if several sets of views are averaged, or more than the
+                pixels is needed; ``device`` is the device of the outputs; ``valid`` is a mask
+                ``(H, W)`` of a partial panorama, else None; ``camera_matrix`` is K of a photo, else
+                None.
 
-    def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
+        Returns:
+            An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
+            views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
+        """
+
+    def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:
         """Return the prediction ``(n, h, w)`` of single crops of a photo.
 
         Args:
             outputs: Outputs of the network ``(n, C, h, w)``.
             ray_lengths: See `targets`.
         """
-        raise NotImplementedError
 
     def comparable(
         self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None
@@ -264,11 +242,8 @@ class Head(nn.Module, ABC):
             SettingError: A kind belongs to other networks.
         """
         if foreign := set(write or ()).difference(self.suffixes):
-            raise SettingError(
-                "write",
-                found=", ".join(sorted(foreign)),
-                expected=f"{', '.join(self.suffixes)} for a network that predicts {self.source}",
-            )
+            expected = f"{', '.join(self.suffixes)} for a network that predicts {self.source}"
+            raise SettingError("write", found=", ".join(sorted(foreign)), expected=expected)
         return list(self.suffixes)[:-1] if write is None else write
 
     @property
@@ -276,12 +251,12 @@ class Head(nn.Module, ABC):
         """Kind of output that holds the predicted pixels."""
         return next(iter(self.suffixes))
 
-    def count(self, mosaics: Iterable[HeadMosaic]) -> str:
+    def count(self, mosaics: Iterable[Any]) -> str:
         """Prepare for predictions by those of some images; return a line to print, or ""."""
         return ""
 
     def predicted(
-        self, mosaic: HeadMosaic, image: Any, files: Mapping[str, Path] = MappingProxyType({})
+        self, mosaic: Any, image: Any, files: Mapping[str, Path] = NOTHING
     ) -> PredictedImage:
         """Return the predicted pixels of an image.
 
@@ -290,25 +265,40 @@ class Head(nn.Module, ABC):
             image: Panorama or photo.
             files: Files of the image by kind. Those that need the mosaic are written at once.
         """
-        pixels = mosaic.pixels().cpu().numpy()
-        return PredictedImage(image, image.cut(pixels), mosaic.facts)
+        return PredictedImage(image, image.cut(mosaic.pixels().cpu().numpy()), mosaic.facts)
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
-        """Write the files of one image by kind, except for those that `predicted` has written."""
-        raise NotImplementedError
+        """Write the predicted pixels and the pictures of one image, by kind."""
+        image, pixels, _ = predicted
+        for kind, file in files.items():
+            if kind == self.source:
+                self.write_source(file, pixels)
+            elif kind in PICTURES:
+                write_pixels(file, self.picture(kind, image.cut(image.rgb), pixels))
 
-    def read(self, file: Path) -> NDArray[Any]:
-        """Read the predicted pixels from a file that `write` wrote."""
-        raise NotImplementedError
+    def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
+        """Write predicted pixels."""
+        write_pixels(file, pixels)
 
-    def painter(self, kind: str, summaries: Sequence[Any]) -> Painter:
-        """Return a function that paints the frames of a video.
+    def read(self, file: Path) -> Any:
+        """Read predicted pixels ``(h, w)`` from a file of `write_source`."""
+
+    def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> Any:
+        """Return the picture ``(h, w, 3)`` of an RGB image and its predicted pixels.
 
         Args:
             kind: Kind of output, e.g. ``color``.
-            summaries: Summaries of all frames of the video.
+            rgb: RGB image ``(h, w, 3)``.
+            pixels: Predicted pixels ``(h, w)``.
+            limits: Result of `limits` for frames of a video; None for a single image.
         """
-        raise NotImplementedError
+
+    def limits(self, summaries: Sequence[Any]) -> Any:
+        """Return the ends of the color scale of a video, given the summaries of its frames."""
+
+    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> Any:
+        """Return the picture of a single image with its legend, see `paint`."""
+        return self.paint(kind, rgb, pixels)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the summary of one image.
@@ -319,20 +309,6 @@ class Head(nn.Module, ABC):
         """
         return {}
 
-    def table(self, summaries: Sequence[Any]) -> SummaryTable:
-        """Return a table of the summaries of all images."""
-        return SummaryTable("", (), ())
-
-
-def solid_angles(predicted: PredictedImage) -> NDArray[np.floating]:
-    """Return the relative solid angles ``(h, w)`` of the pixels.
-
-    A photo's pixel at (x, y) on the plane at distance 1 has the solid angle (1 + x² + y²)^(−3/2).
-    """
-    image, shape = predicted.image, predicted.pixels.shape
-    if image.camera_matrix is not None:
-        return ray_lengths(image.camera_matrix, shape) ** -3.0
-    of_rows = equirect_solid_angles(image.shape)[:, None]
-    if image.area is not None:
-        of_rows = of_rows[image.area.places()[0]]
-    return np.broadcast_to(of_rows, shape)  # one number of a row, which saves memory
+    def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], Sequence[Sequence[str]]]:
+        """Return title, header and rows of a table of the summaries of all images."""
+        return "", (), ()

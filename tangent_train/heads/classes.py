@@ -1,53 +1,38 @@
-"""Head for classes: a class for every pixel."""
+"""Heads for classes: a class for every pixel, or one for a whole shape."""
 
 from __future__ import annotations
 
 import weakref
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
+from pydantic import validate_call
 from torch import Tensor
+from torch.nn.functional import cross_entropy, pad
 
-from datamodules.core.class_weights import ClassWeights
-from datamodules.core.labels import PIXEL_CLASSES
-from tangent_train.errors import SettingError
-from tangent_train.heads.base import (
-    RGB,
-    Head,
-    Painter,
-    PredictedImage,
-    Scores,
-    SummaryTable,
-    solid_angles,
-)
-from tangent_train.heads.losses import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
-from tangent_train.heads.pictures import (
-    colorize,
-    mixed_picture,
-    overlay_picture,
-    prediction_panel,
-)
-from tangent_train.io.pixel_files import array_file, read_pixels, write_pixels
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
-from tangent_train.metrics.segmentation import (
-    AbsentClass,
+from datamodules.core.label_map import IMAGE_CLASS, PIXEL_CLASSES, ClassWeights
+from tangent_train.heads import pictures
+from tangent_train.heads.base import NOTHING, RGB, Head, PredictedImage, Scores
+from tangent_train.io.palette import class_colors
+from tangent_train.io.pixel_files import array_file, read_pixels
+from tangent_train.metrics import segmentation
+from tangent_train.metrics.scores import (
     Interval,
-    SegmentationCounts,
-    SegmentationMetric,
-    bootstrap_intervals,
-    count_image,
-    mean_scores,
-    segmentation_scores,
+    ScoreColumn,
+    bootstrap,
+    by_solid_angle,
+    with_solid_angle,
 )
+from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
 from tangent_train.rendering import Blend
-from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.mosaic import ScoreMosaic
 
 _ROWS_AT_ONCE = 64
@@ -69,9 +54,6 @@ class ClassesHead(Head):
         min_confidence: Predicted pixels with a lower confidence, from 0 to 1, are unknown.
         min_share: Share of the pixels of each class that is kept at least: lowers
             `min_confidence` for single classes, see `count`. 0 for the same confidence for all.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
     kind: ClassVar[str] = PIXEL_CLASSES
@@ -83,14 +65,14 @@ class ClassesHead(Head):
         }
     )
     main_score: ClassVar[str] = "miou"
-    takes: ClassVar[str] = "images (n, C, h, w) to logits of every pixel (n, K, h, w)"
-    predict_settings: ClassVar[Mapping[str, str]] = {"min_confidence": "", "min_share": ""}
+    predict_settings = MappingProxyType({"min_confidence": "", "min_share": "min_confidence"})
     summary: ClassVar[str] = "classes"
     suffixes = MappingProxyType(
         dict.fromkeys(("labels", "color", "overlay"), ".png") | {"probabilities": ".npy"}
     )
     class_weights: Tensor
 
+    @validate_call
     def __init__(
         self,
         class_names: Sequence[str],
@@ -101,26 +83,14 @@ class ClassesHead(Head):
         min_share: float = 0.0,
     ) -> None:
         super().__init__(class_names)
-        check_choice("task.head.absent_class", absent_class, get_args(AbsentClass))
-        names, classes = get_args(ClassWeights), self.class_names[1:]
-        is_name = isinstance(class_weights, str)
-        if not (class_weights in names if is_name else len(class_weights) == len(classes)):
-            expected = f"{', '.join(names)}; or {len(classes)} numbers, for {', '.join(classes)}"
-            raise SettingError("task.head.class_weights", found=class_weights, expected=expected)
-        if not 0 <= min_confidence <= 1:
-            raise SettingError("min_confidence", found=min_confidence, expected="0 to 1")
-        if not 0 <= min_share < 1 or (min_share and not min_confidence):
-            expected = "0 to below 1, with min_confidence, which it lowers for single classes"
-            raise SettingError("min_share", found=min_share, expected=expected)
         self.summary_columns = self.class_names
-        self.num_outputs = len(classes)
-        self.weighting = class_weights
-        self.label_smoothing = label_smoothing
+        self.num_outputs = len(self.class_names) - 1
+        self.weighting, self.label_smoothing = class_weights, label_smoothing
         self.absent_class: AbsentClass = absent_class
         self.min_confidence, self.min_share = min_confidence, min_share
         self.thresholds: NDArray[np.float64] | None = None
         self._spare: deque[NDArray[np.float32]] = deque(maxlen=1)
-        self.register_buffer("class_weights", torch.ones(len(classes)))
+        self.register_buffer("class_weights", torch.ones(self.num_outputs))
 
     # Training
 
@@ -128,7 +98,7 @@ class ClassesHead(Head):
         """Set the class weights."""
         named = isinstance(self.weighting, str)
         weights: Any = data.class_weights(self.weighting) if named else self.weighting
-        self.class_weights.copy_(torch.as_tensor(weights, dtype=torch.float32))
+        self.class_weights = torch.as_tensor(weights).to(self.class_weights)
 
     def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
         """Return the weighted cross-entropy, summed over pixels."""
@@ -139,49 +109,47 @@ class ClassesHead(Head):
         return cross_entropy_norm(targets, self.class_weights)
 
     def auxiliary_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
-        """Return the cross-entropy of coarser logits, see `losses.auxiliary_sum`."""
+        """Return the cross-entropy of coarser logits, see `auxiliary_sum`."""
         return auxiliary_sum(outputs, targets, self.class_weights)
 
     # Scores
 
-    def build_metric(self) -> SegmentationMetric:
+    def build_metric(self) -> segmentation.SegmentationMetric:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
-        return SegmentationMetric(len(self.class_names))
+        return segmentation.SegmentationMetric(len(self.class_names))
+
+    def _both(self, pixels: Any, angles: Any, compute: Callable[[Any], Any]) -> dict[str, Any]:
+        """Return scores by pixels; for panoramas, which have solid angles, by these too."""
+        by_angle = by_solid_angle(compute(angles)) if angles.any() else {}
+        return {**compute(pixels), **by_angle}
 
     def scores(self, result: SegmentationCounts) -> Scores:
         """Return scores by pixels; for panoramas, also by solid angle and latitude."""
-        is_panorama, for_angles = self._absent_by_angle(result)
-        pixels = segmentation_scores(result.pixels, self.absent_class)
-        angles = segmentation_scores(result.solid_angle, for_angles)
+        score = partial(segmentation.segmentation_scores, absent_class=self.absent_class)
+        given = result.pixels, result.solid_angle
         bands = [
-            segmentation_scores(band, self.absent_class if band.any() else "skip").means
+            (score(band) if band.any() else score(band, absent_class="skip")).means
             for band in result.bands
         ]
+        of_classes = self._both(*given, lambda counts: score(counts).of_classes)
         return Scores(
-            pixels.means | (by_solid_angle(angles.means) if is_panorama else {}),
-            pixels.of_classes | by_solid_angle(angles.of_classes) | {"share": pixels.share},
-            bands if is_panorama else (),
+            self._both(*given, lambda counts: score(counts).means),
+            of_classes | {"share": score(result.pixels).share},
+            bands if result.solid_angle.any() else (),
             result.pixels,
         )
 
     def intervals(self, result: SegmentationCounts) -> dict[str, Interval]:
         """Return intervals of the means."""
+        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
         pixels, angles = result.of_images.swapaxes(0, 1)
-        of_angles = bootstrap_intervals(angles, self._absent_by_angle(result)[1])
-        return bootstrap_intervals(pixels, self.absent_class) | by_solid_angle(of_angles)
+        return self._both(pixels, angles, lambda images: bootstrap(images, score))
 
     def scores_of(self, result: SegmentationCounts, places: Sequence[int]) -> dict[str, float]:
         """Return mIoU and mAcc, of panoramas also by solid angle."""
-        is_panorama, for_angles = self._absent_by_angle(result)
+        score = partial(segmentation.mean_scores, absent_class=self.absent_class)
         pixels, angles = result.of_images[list(places)].sum(axis=0)
-        scores = mean_scores(pixels, self.absent_class)
-        scores |= by_solid_angle(mean_scores(angles, for_angles)) if is_panorama else {}
-        return {name: float(score) for name, score in scores.items()}
-
-    def _absent_by_angle(self, result: SegmentationCounts) -> tuple[bool, AbsentClass]:
-        """Return True for panoramas, and the treatment of absent classes by solid angle."""
-        is_panorama = bool(result.solid_angle.any())
-        return is_panorama, self.absent_class if is_panorama else "skip"
+        return {name: float(mean) for name, mean in self._both(pixels, angles, score).items()}
 
     @property
     def facts(self) -> dict[str, str]:
@@ -191,23 +159,13 @@ class ClassesHead(Head):
     # From views to a panorama
 
     def mosaic(
-        self,
-        shape: tuple[int, int],
-        blend: Blend,
-        *,
-        averaged: bool = False,
-        device: Any = "cpu",
-        valid: NDArray[np.bool_] | None = None,
-        camera_matrix: NDArray[np.float64] | None = None,
+        self, shape: tuple[int, int], blend: Blend, *, averaged: bool = False, **settings: Any
     ) -> LabelMosaic:
         """Return a mosaic of probabilities, which reuses the memory of an earlier one."""
-        spare = None
-        with suppress(IndexError):
-            spare = self._spare.pop()
+        spare = self._spare.pop() if self._spare else None
         mosaic = LabelMosaic(
-            self, shape, blend, averaged=averaged or self.min_share > 0, device=device, spare=spare
+            self, shape, blend, averaged=averaged or self.min_share > 0, spare=spare, **settings
         )
-        mosaic.valid = valid
         if not isinstance(mosaic.sums, np.memmap):  # space on the disk is released at once
             weakref.finalize(mosaic, self._spare.append, mosaic.sums).atexit = False
         return mosaic
@@ -218,24 +176,25 @@ class ClassesHead(Head):
 
     def labels_of(self, best: Tensor) -> Tensor:
         """Return the labels of outputs: 0 where the best one belongs to none of the K classes."""
-        if best.dtype == torch.uint16:  # torch has few operations on it
-            return self.labels_of(best.int()).to(torch.uint16)
-        return (best + 1).where(best < len(self.class_names) - 1, 0)
+        # torch has few operations on uint16.
+        labels = (best.int() if best.dtype == torch.uint16 else best) + 1
+        return labels.where(labels < len(self.class_names), 0).to(best.dtype)
 
     # Pictures and files
 
     def panel(self, rgb: RGB, truth: NDArray[Any], prediction: NDArray[Any]) -> RGB:
         """Draw input, ground truth, prediction and error in a 2 × 2 grid above a legend."""
-        return prediction_panel(rgb, truth, prediction, self.class_names)
+        return pictures.prediction_panel(rgb, truth, prediction, self.class_names)
 
     def note(self, prediction: Tensor, truth: Tensor) -> str:
         """Return the mIoU of one image; "" without labeled pixels."""
         if not truth.any():
             return ""
-        counts = count_image(prediction.cpu(), truth.cpu(), len(self.class_names)).pixels
-        return f"mIoU {100 * segmentation_scores(counts).miou:.1f}\u00a0%"
+        count = len(self.class_names)
+        counts = segmentation.count_image(prediction.cpu(), truth.cpu(), count).pixels
+        return f"mIoU {100 * segmentation.segmentation_scores(counts).means['miou']:.1f}\u00a0%"
 
-    def count(self, mosaics: Iterable[Any]) -> str:
+    def count(self, mosaics: Iterable[LabelMosaic]) -> str:
         """Find the confidence that pixels of each class need for `min_share`.
 
         One threshold for all classes keeps few pixels of rare classes, whose confidence is lower.
@@ -244,19 +203,19 @@ class ClassesHead(Head):
         """
         if not self.min_share:
             return ""
-        counts = np.zeros((len(self.class_names), _BINS), np.int64)
+        count = len(self.class_names)
+        counts = np.zeros((count, _BINS), np.int64)
         for mosaic in mosaics:
             valid = ... if mosaic.valid is None else mosaic.valid
             labels, confidences = mosaic.pixels().cpu().numpy(), mosaic.confidences()
-            count = len(self.class_names) - 1
-            counts += count_confidences(labels[valid], confidences[valid], count)
+            counts += count_confidences(labels[valid], confidences[valid], count - 1)
         self.thresholds = class_thresholds(counts, self.min_confidence, self.min_share)
         least = zip(self.class_names[1:], self.thresholds[1:], strict=True)
         listed = ", ".join(f"{name} {confidence:.2f}" for name, confidence in least)
         return f"Smallest confidence of each class: {listed}."
 
     def predicted(
-        self, mosaic: Any, image: Any, files: Mapping[str, Path] = MappingProxyType({})
+        self, mosaic: Any, image: Any, files: Mapping[str, Path] = NOTHING
     ) -> PredictedImage:
         """Return the labels of an image; write the probabilities, which take much memory."""
         if "probabilities" in files:
@@ -270,46 +229,41 @@ class ClassesHead(Head):
                     array[part] = probabilities[:, columns, : shape[-1]]
         return super().predicted(mosaic, image, files)
 
-    def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
-        """Write labels and pictures."""
-        image, labels, _ = predicted
-        if "labels" in files:
-            write_pixels(files["labels"], labels)
-        if "color" in files:
-            write_pixels(files["color"], colorize(labels, len(self.class_names)))
-        if "overlay" in files:
-            picture = overlay_picture(image.cut(image.rgb), labels, self.class_names)
-            write_pixels(files["overlay"], picture)
-
     def read(self, file: Path) -> NDArray[Any]:
         """Read labels."""
         return read_pixels(file, indices=True)
 
-    def painter(self, kind: str, summaries: Sequence[Any]) -> Painter:
-        """Color the labels, or overlay the frame with them."""
-        count = len(self.class_names)
+    def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
+        """Color the labels, or overlay the image with them."""
         if kind == "color":
-            return lambda rgb, labels: colorize(labels, count)
-        return lambda rgb, labels: mixed_picture(rgb, labels, count)
+            return class_colors(len(self.class_names))[pixels]
+        return pictures.mixed_picture(rgb, pixels, len(self.class_names))
+
+    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
+        """Return a picture; an overlay has a legend of the classes."""
+        painted = self.paint(kind, rgb, pixels)
+        if kind == "color":
+            return painted
+        return pictures.with_class_legend(painted, pixels[pixels > 0], self.class_names)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return the share of the solid angle of each class; 0 if everything is masked."""
         labels, count = predicted.pixels, len(self.class_names)
         total, mask = np.zeros(count), np.broadcast_to(is_counted, labels.shape)
-        for line, weights, counted in zip(labels, solid_angles(predicted), mask, strict=True):
+        for line, weights, counted in zip(labels, predicted.solid_angles, mask, strict=True):
             total += np.bincount(line, weights * counted, minlength=count)
         shares = dict.fromkeys(self.class_names, 0.0)  # another class may be called unknown too
         for name, share in zip(self.class_names, total / (total.sum() or 1), strict=True):
             shares[name] += float(share)
         return shares
 
-    def table(self, summaries: Sequence[Any]) -> SummaryTable:
+    def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], list[list[str]]]:
         """Return the mean shares of the classes that occur, sorted."""
         count = max(1, len(summaries))
         mean = {name: sum(of[name] for of in summaries) / count for name in self.class_names}
         seen = sorted(filter(mean.get, mean), key=mean.__getitem__, reverse=True)
         rows = [[name, f"{100 * mean[name]:.1f}"] for name in seen]
-        return SummaryTable("Mean over the images", ["class", "solid angle, %"], rows)
+        return "Mean over the images", ["class", "solid angle, %"], rows
 
 
 class LabelMosaic(ScoreMosaic):
@@ -319,21 +273,25 @@ class LabelMosaic(ScoreMosaic):
         head: Classes, and the confidence that their pixels need.
         shape: See `ScoreMosaic`.
         blend: See `ScoreMosaic`.
-        **settings: See `ScoreMosaic`.
-
-    Attributes:
         valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
+        camera_matrix: Not used.
+        **settings: See `ScoreMosaic`.
     """
 
-    facts: Mapping[str, Any] = MappingProxyType({})
-    valid: NDArray[np.bool_] | None = None
+    facts: Mapping[str, Any] = NOTHING
 
     def __init__(
-        self, head: ClassesHead, shape: tuple[int, int], blend: Blend, **settings: Any
+        self,
+        head: ClassesHead,
+        shape: tuple[int, int],
+        blend: Blend,
+        valid: NDArray[np.bool_] | None = None,
+        camera_matrix: Any = None,
+        **settings: Any,
     ) -> None:
         least = 0.0 if head.min_share else head.min_confidence
         super().__init__(shape, head.num_outputs, blend, min_confidence=least, **settings)
-        self._head = head
+        self._head, self.valid = head, valid
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
@@ -342,6 +300,117 @@ class LabelMosaic(ScoreMosaic):
             return labels
         is_sure = self.confidences() >= thresholds[labels.cpu().numpy()]
         return labels.where(torch.from_numpy(is_sure).to(labels.device), 0)
+
+
+class ImageClassHead(Head):
+    """One of K classes for a shape; output k of the network ``(n, K)`` is the logit of label k.
+
+    Args:
+        class_names: Names of the K classes.
+        label_smoothing: Fraction of the target that is spread over all classes.
+    """
+
+    kind: ClassVar[str] = IMAGE_CLASS
+    labels: ClassVar[str] = IMAGE_CLASS
+    columns: ClassVar[Mapping[str, ScoreColumn]] = {
+        "accuracy": ScoreColumn("accuracy"),
+        "class_accuracy": ScoreColumn("mean over classes", "%", "accuracy", "accuracy"),
+    }
+    main_score: ClassVar[str] = "accuracy"
+
+    def __init__(self, class_names: Sequence[str], label_smoothing: float = 0.0) -> None:
+        super().__init__(class_names)
+        self.num_outputs = len(self.class_names)
+        self.label_smoothing = label_smoothing
+
+    def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        """Return the cross-entropy, summed over the shapes."""
+        smoothing = self.label_smoothing
+        return cross_entropy(exact(outputs), targets, reduction="sum", label_smoothing=smoothing)
+
+    def loss_norm(self, targets: Tensor) -> Tensor:
+        """Return the number of shapes."""
+        return torch.full((), float(len(targets)), device=targets.device)
+
+    def build_metric(self) -> segmentation.ClassificationMetric:
+        """Build the confusion matrix of whole shapes."""
+        return segmentation.ClassificationMetric(len(self.class_names))
+
+    def scores(self, result: Any) -> Scores:
+        """Return the accuracy over shapes, its mean over classes, and that of every class."""
+        found = segmentation.classification_scores(result)
+        means = {"accuracy": found.accuracy, "class_accuracy": found.class_accuracy}
+        return Scores(means, {"images": found.counts, "accuracy": found.of_class}, confusion=result)
+
+
+def cross_entropy_sum(
+    scores: Float[Tensor, "images classes height width"],
+    labels: UInt8[Tensor, "images height width"],
+    class_weights: Float[Tensor, " classes"],
+    label_smoothing: float = 0.0,
+) -> Tensor:
+    """Sum the weighted cross-entropy of pixels; unknown pixels (label 0) are ignored.
+
+    Divided by the `cross_entropy_norm` of the same images, it is torch's weighted mean. Divided by
+    the norm of *all* images, chunks and processes, it is the share of these images in one mean.
+
+    Args:
+        scores: Scores of the K classes, before a softmax.
+        labels: Labels from 1 to K; 0 is unknown.
+        class_weights: Weight of each class.
+        label_smoothing: Fraction of the target that is spread evenly over the classes.
+    """
+    logits, targets = exact(scores), labels.long() - 1
+    how: dict[str, Any] = {"reduction": "sum", "label_smoothing": label_smoothing}
+    return cross_entropy(logits, targets, class_weights.to(logits), ignore_index=-1, **how)
+
+
+def cross_entropy_norm(
+    labels: UInt8[Tensor, "images height width"], class_weights: Float[Tensor, " classes"]
+) -> Tensor:
+    """Sum the class weights of the labeled pixels, which needs no forward pass."""
+    # Not with torch.bincount, for which the host waits for a GPU.
+    label_weights = pad(exact(class_weights), (1, 0))
+    return label_weights.index_select(0, labels.flatten().int()).sum()
+
+
+def auxiliary_sum(
+    scores: Float[Tensor, "images classes rows columns"],
+    labels: UInt8[Tensor, "images height width"],
+    class_weights: Float[Tensor, " classes"],
+) -> Tensor:
+    """Sum the weighted cross-entropy of pixels, with scores of a coarser stage of a network.
+
+    Each cell is compared with the class histogram of the pixels whose centers lie in it. This is
+    the cross-entropy of the pixels, each with the scores of its cell, without upsampling the
+    scores; its norm is the `cross_entropy_norm` of the pixels.
+
+    Args:
+        scores: Scores of the cells, before a softmax; their size may differ from that of the
+            labels.
+        labels: Labels of the pixels from 1 to K; 0 is unknown and ignored.
+        class_weights: Weight of each class.
+    """
+    logits = exact(scores)
+    images, classes, *size = scores.shape
+    rows, columns = (
+        # The cell of every pixel center along a side.
+        (2 * torch.arange(side, device=labels.device) + 1) * cells // (2 * side)
+        for side, cells in zip(labels.shape[1:], size, strict=True)
+    )
+    image = torch.arange(images, device=labels.device)[:, None, None]
+    cell = (image * size[0] + rows[:, None]) * size[1] + columns
+    bins = (cell * (classes + 1) + labels).flatten()
+    counts = logits.new_zeros(images * size[0] * size[1] * (classes + 1))
+    counts.scatter_add_(0, bins, counts.new_ones(()).expand(bins.numel()))
+    histograms = counts.view(images, *size, classes + 1)[..., 1:].movedim(-1, 1)
+    # Counts instead of probabilities: pixels weigh the same in cells with few and many of them.
+    return cross_entropy(logits, histograms, class_weights.to(logits), reduction="sum")
+
+
+def exact(values: Tensor) -> Tensor:
+    """Convert to at least float32, for sums over millions of pixels."""
+    return values.to(torch.promote_types(values.dtype, torch.float32))
 
 
 def count_confidences(

@@ -5,60 +5,33 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, get_args
+from types import MappingProxyType
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from pydantic import Field, validate_call
 from torch import Tensor
 
-from datamodules.core.images import STEPS_PER_M
-from datamodules.core.labels import DISTANCE
+from datamodules.core.depth import STEPS_PER_M
+from datamodules.core.label_map import DISTANCE
 from tangent_train.checkpoints.kinds import Align, DepthKind
-from tangent_train.errors import SettingError, at_least, of_extra
+from tangent_train.errors import SettingError, of_extra
 from tangent_train.files import write_bytes
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
-from tangent_train.heads.alignment import (
-    AlignedMosaic,
-    along_rays,
-    depth_of_output,
-    distance_of,
-    from_distance,
-    is_disparity,
-    is_metric,
-)
-from tangent_train.heads.base import (
-    RGB,
-    Head,
-    Painter,
-    PredictedImage,
-    Scores,
-    SummaryTable,
-    solid_angles,
-)
-from tangent_train.heads.losses import DepthLoss, log_error_sum
-from tangent_train.heads.pictures import (
-    colorize_distance,
-    distance_limits,
-    distance_panel,
-    distance_picture,
-)
-from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m, write_pixels
-from tangent_train.metrics.depth import (
-    Alignment,
-    DepthMetric,
-    DepthProtocol,
-    Quantity,
-    depth_intervals,
-    error_sums,
-    mean_depth_scores,
-    scaled_and_shifted,
-)
-from tangent_train.metrics.score_columns import ScoreColumn, by_solid_angle, with_solid_angle
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.heads import alignment as views
+from tangent_train.heads import pictures
+from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
+from tangent_train.heads.classes import exact
+from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
+from tangent_train.metrics import depth as metrics
+from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering import Blend
-from tangent_train.rendering.checks import check_choice
+
+DepthLoss = Literal["log_l1", "scale_invariant"]
+"""Loss of predicted distances, see `log_error_sum`."""
 
 _LEAST = 1e-3
 """Smallest depth, in meters, or disparity whose logarithm is taken in the loss."""
@@ -96,17 +69,15 @@ class DistanceHead(Head):
         scale_invariance: λ of the loss `scale_invariant`.
         align: Alignment of the views of a panorama with each other, see `heads.alignment`; None for
             the usual one of `depth_kind`.
-        alignment: See `DepthProtocol`.
         alignment_in: See `DepthProtocol`; None for the quantity in which the network predicts.
-        min_distance: See `DepthProtocol`; pixels beyond the limits are ignored in training too.
-        max_distance: See `DepthProtocol`.
-        clip: See `DepthProtocol`.
         depth_format: Suffix of the depth files without dot: png, npy or exr; None for png.
         depth_scale: Units per meter in PNG files.
         points: Number of points of an image, at most; None for 500 000.
+        **protocol: Further settings of `DepthProtocol`. Pixels beyond its limits are ignored in
+            training too.
 
     Raises:
-        SettingError: A setting is invalid, or a package for the format is missing.
+        SettingError: A package for the format is missing.
     """
 
     kind: ClassVar[str] = DISTANCE
@@ -125,18 +96,15 @@ class DistanceHead(Head):
         }
     )
     main_score: ClassVar[str] = "absrel"
-    takes: ClassVar[str] = "images (n, C, h, w) to one number for every pixel (n, 1, h, w)"
-    predict_settings: ClassVar[Mapping[str, str]] = {
-        "align": "",
-        "depth_format": "depth",
-        "depth_scale": "depth",
-        "points": "points",
-    }
+    predict_settings = MappingProxyType(
+        {"align": "", "depth_format": "depth", "depth_scale": "depth", "points": "points"}
+    )
     num_outputs = 1
     summary: ClassVar[str] = "depth"
     unknown: ClassVar[float] = math.nan
     summary_columns = ("unit", *_ROWS)
 
+    @validate_call
     def __init__(
         self,
         class_names: Sequence[str] = (),
@@ -144,36 +112,27 @@ class DistanceHead(Head):
         loss: DepthLoss = "log_l1",
         scale_invariance: float = 0.5,
         align: Align | None = None,
-        alignment: Alignment = "none",
-        alignment_in: Quantity | None = None,
-        min_distance: float = 0.0,
-        max_distance: float | None = None,
-        clip: bool = False,
+        alignment_in: metrics.Quantity | None = None,
         depth_format: str | None = None,
-        depth_scale: float = 1000.0,
+        depth_scale: Annotated[float, Field(gt=0)] = 1000.0,
         points: int | None = None,
+        **protocol: Any,
     ) -> None:
         super().__init__()
         self.depth_kind: DepthKind = depth_kind or "log_distance"
-        check_choice("task.head.depth_kind", self.depth_kind, get_args(DepthKind))
-        check_choice("task.head.loss", loss, get_args(DepthLoss))
-        check_choice("align", align or "none", get_args(Align))
-        quantity = alignment_in or ("disparity" if is_disparity(self.depth_kind) else "distance")
-        self.protocol = DepthProtocol(alignment, quantity, min_distance, max_distance, clip)
+        usual: metrics.Quantity = "disparity" if views.is_disparity(self.depth_kind) else "distance"
+        self.protocol = metrics.DepthProtocol(alignment_in=alignment_in or usual, **protocol)
         self.loss: DepthLoss = loss
-        self.scale_invariance = scale_invariance
-        self.align = align
-        self.is_metric = is_metric(self.depth_kind)
+        self.scale_invariance, self.align = scale_invariance, align
+        self.is_metric = views.is_metric(self.depth_kind)
         suffix = f".{depth_format or 'png'}"
         if suffix == ".exr":
             with of_extra("exr", "depth_format"):
                 import OpenEXR  # noqa: F401
-        if not 0 < depth_scale < math.inf:
-            raise SettingError("depth_scale", found=depth_scale, expected="more than 0")
         self._units_per_m, self._most = depth_scale, most_depth_m(suffix, depth_scale)
-        self._points = 500_000 if points is None else at_least("points", points, 1)
+        self._points = 500_000 if points is None else points
         self.suffixes = {"depth": suffix, "color": ".png", "points": ".ply"}
-        self._aligned: AlignedMosaic | None = None
+        self._views_aligned: views.AlignedMosaic | None = None
 
     # Training
 
@@ -187,7 +146,7 @@ class DistanceHead(Head):
 
     def targets(self, truth: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return the output that would be correct, see `Head`."""
-        return from_distance(truth, self.depth_kind, ray_lengths)
+        return views.from_distance(truth, self.depth_kind, ray_lengths)
 
     def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
         """Return the loss of outputs ``(n, 1, h, w)``, given the correct ones ``(n, h, w)``."""
@@ -208,7 +167,7 @@ class DistanceHead(Head):
         if self.depth_kind == "log_distance":
             return values - targets
         if not self.is_metric:
-            values = scaled_and_shifted(values, targets)
+            values = metrics.scaled_and_shifted(values, targets)
         return values.clamp(min=_LEAST).log() - targets.log()
 
     def loss_norm(self, targets: Tensor) -> Tensor:
@@ -217,20 +176,17 @@ class DistanceHead(Head):
 
     # Scores
 
-    def build_metric(self) -> DepthMetric:
+    def build_metric(self) -> metrics.DepthMetric:
         """Build the metric, which keeps the sums of the errors of each image.
 
         Raises:
             SettingError: The predictions have no scale, and are not aligned with the truth.
         """
         if self.protocol.alignment == "none" and not self.is_metric:
-            raise SettingError(
-                "task.head.alignment",
-                found=f"none, for a network that predicts {self.depth_kind}",
-                expected="median, scale or affine: the scale of its distances is unknown",
-                remedy="task.head.alignment=affine",
-            )
-        return DepthMetric()
+            found = f"none, for a network that predicts {self.depth_kind}"
+            expected = "median, scale or affine: the scale of its distances is unknown"
+            raise SettingError("task.head.alignment", found=found, expected=expected)
+        return metrics.DepthMetric()
 
     def scores(self, result: NDArray[np.float64]) -> Scores:
         """Return means over images; for panoramas, also by solid angle and latitude.
@@ -238,15 +194,15 @@ class DistanceHead(Head):
         Args:
             result: Sums ``(images, 8, 10)``, see `error_sums`.
         """
-        pixels, angles = (mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
+        pixels, angles = (metrics.mean_depth_scores(result[:, weighting]) for weighting in (0, 1))
         if not result[:, 1].any():
             return Scores(pixels)
-        bands = map(mean_depth_scores, result[:, 2:].swapaxes(0, 1))
+        bands = map(metrics.mean_depth_scores, result[:, 2:].swapaxes(0, 1))
         return Scores(pixels | by_solid_angle(angles), bands=list(bands))
 
     def intervals(self, result: NDArray[np.float64]) -> dict[str, Interval]:
         """Return intervals of the means."""
-        pixels, angles = (depth_intervals(result[:, weighting]) for weighting in (0, 1))
+        pixels, angles = (metrics.depth_intervals(result[:, weighting]) for weighting in (0, 1))
         return pixels | by_solid_angle(angles)
 
     def scores_of(self, result: NDArray[np.float64], places: Sequence[int]) -> dict[str, float]:
@@ -260,8 +216,9 @@ class DistanceHead(Head):
 
         The alignment of views is known after an evaluation on panoramas.
         """
-        views = {} if self._aligned is None else {"views_aligned": self._aligned.facts["mode"]}
-        return {"weighting": "pixels, then images", **self.protocol.facts, **views}
+        facts = {"weighting": "pixels, then images", **self.protocol.facts}
+        mosaic = self._views_aligned
+        return facts if mosaic is None else facts | {"views_aligned": mosaic.facts["mode"]}
 
     def comparable(
         self, prediction: Tensor, truth: Tensor, ray_lengths: Tensor | None = None
@@ -279,41 +236,37 @@ class DistanceHead(Head):
         shape: tuple[int, int],
         blend: Blend,
         *,
-        averaged: bool = False,
-        device: Any = "cpu",
         valid: NDArray[np.bool_] | None = None,
         camera_matrix: NDArray[np.float64] | None = None,
-    ) -> AlignedMosaic:
+        **_: Any,
+    ) -> views.AlignedMosaic:
         """Return a mosaic that keeps all views until they are aligned."""
         given = shape, self.depth_kind, blend, self.align
-        self._aligned = AlignedMosaic(*given, valid=valid, camera_matrix=camera_matrix)
-        return self._aligned
+        mosaic = views.AlignedMosaic(*given, valid=valid, camera_matrix=camera_matrix)
+        self._views_aligned = mosaic
+        return mosaic
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
         """Return distances along the rays of single crops."""
         lengths = ray_lengths[:, None]
-        values, kind = depth_of_output(outputs, self.depth_kind, lengths)
-        return distance_of(along_rays(values, kind, lengths), kind)[:, 0]
+        values, kind = views.depth_of_output(outputs, self.depth_kind, lengths)
+        return views.distance_of(views.along_rays(values, kind, lengths), kind)[:, 0]
 
     # Pictures and files
 
     def panel(self, rgb: RGB, truth: NDArray[Any], prediction: NDArray[Any]) -> RGB:
         """Draw input, true and predicted distance, and error in a 2 × 2 grid."""
-        return distance_panel(rgb, truth, prediction)
+        return pictures.distance_panel(rgb, truth, prediction)
 
     def note(self, prediction: Tensor, truth: Tensor) -> str:
         """Return AbsRel of one image; "" without known distances."""
-        sums = error_sums(prediction, truth)[:1].cpu().numpy()
-        absrel = mean_depth_scores(sums)["absrel"]
+        sums = metrics.error_sums(prediction, truth)[:1].cpu().numpy()
+        absrel = metrics.mean_depth_scores(sums)["absrel"]
         return "" if np.isnan(absrel) else f"AbsRel {absrel:.3g}"
 
     def write(self, files: Mapping[str, Path], predicted: PredictedImage) -> None:
         """Write depth, a colored picture and points."""
-        if "depth" in files:
-            write_depth_m(files["depth"], predicted.pixels, self._units_per_m)
-        if "color" in files:
-            picture = distance_picture(predicted.pixels, "m" if self.is_metric else "relative")
-            write_pixels(files["color"], picture)
+        super().write(files, predicted)
         if "points" in files:
             from trimesh import PointCloud  # half a second
 
@@ -321,21 +274,33 @@ class DistanceHead(Head):
             content: Any = PointCloud(points.astype(np.float32), colors).export(file_type="ply")
             write_bytes(files["points"], content)
 
+    def write_source(self, file: Path, pixels: NDArray[Any]) -> None:
+        """Write depth."""
+        write_depth_m(file, pixels, self._units_per_m)
+
     def read(self, file: Path) -> NDArray[Any]:
         """Read depth."""
         depth = read_depth_m(file, self._units_per_m)
         return np.where(depth > 0, depth, np.float32(np.nan))
 
-    def painter(self, kind: str, summaries: Sequence[Any]) -> Painter:
-        """Color depth by the range of all frames of the video."""
+    def paint(self, kind: str, rgb: RGB, pixels: NDArray[Any], limits: Any = None) -> RGB:
+        """Color depth."""
+        return pictures.colorize_distance(pixels, limits)
+
+    def limits(self, summaries: Sequence[Any]) -> tuple[float, float]:
+        """Return the range of the colors of all frames of a video."""
         ranges = [colors for summary in summaries if (colors := summary.get("colors"))]
         near, far = zip(*ranges, strict=True) if ranges else ([1.0], [2.0])
-        limits = min(near), max(far)
-        return lambda rgb, depth: colorize_distance(depth, limits)
+        return min(near), max(far)
+
+    def picture(self, kind: str, rgb: RGB, pixels: NDArray[Any]) -> RGB:
+        """Return the colored depth with a bar of its colors."""
+        limits, unit = pictures.distance_limits(pixels), "m" if self.is_metric else "relative"
+        return pictures.with_distance_legend(self.paint(kind, rgb, pixels, limits), limits, unit)
 
     def summarize(self, predicted: PredictedImage, is_counted: NDArray[np.bool_]) -> Any:
         """Return unit, shares of the solid angle, distances, range of the colors, alignment."""
-        depth, angles = predicted.pixels, solid_angles(predicted)
+        depth, angles = predicted.pixels, predicted.solid_angles
         total = np.sum(angles, where=is_counted) or 1
         known, too_far = (
             np.sum(angles, where=mask) / total for mask in (np.isfinite(depth), depth > self._most)
@@ -345,13 +310,13 @@ class DistanceHead(Head):
         if known:
             median = np.median(depth[tuple(spread_pixels(predicted, _SAMPLES))])
             facts |= {"nearest": np.nanmin(depth), "median": median, "farthest": np.nanmax(depth)}
-            summary["colors"] = [float(f"{limit:.4g}") for limit in distance_limits(depth)]
+            summary["colors"] = [float(f"{limit:.4g}") for limit in pictures.distance_limits(depth)]
         return summary | {
             name: float(f"{value:.4g}") if isinstance(value, float | np.floating) else value
             for name, value in facts.items()
         }
 
-    def table(self, summaries: Sequence[Any]) -> SummaryTable:
+    def table(self, summaries: Sequence[Any]) -> tuple[str, Sequence[str], list[list[str]]]:
         """Return the means of the summaries over the images."""
         rows, unit = [], ", m" if self.is_metric else ""
         for name, title in _ROWS.items():
@@ -365,7 +330,31 @@ class DistanceHead(Head):
                 ["images whose views agree less than before: try another align", str(worse)]
             )
         kind = "depth in meters" if self.is_metric else "relative: median distance 1"
-        return SummaryTable(f"Mean over the images ({kind})", ["quantity", "mean"], rows)
+        return f"Mean over the images ({kind})", ["quantity", "mean"], rows
+
+
+def log_error_sum(
+    errors: Float[Tensor, "images height width"], kind: DepthLoss, scale_invariance: float
+) -> Tensor:
+    """Sum the loss of logarithmic errors e = ln d − ln g; divide it by the number of known pixels.
+
+    * `log_l1`: ``Σ |e|``.
+    * `scale_invariant`: ``Σᵢ (Σ e² − λ (Σ e)² / nᵢ)`` over the images i of the network with nᵢ
+      known pixels each (Eigen, Puhrsch and Fergus, NeurIPS 2014, equation 4). A chunk contains
+      whole images, so that the sum is exact for all divisions of a step.
+
+    Args:
+        errors: Errors; NaN where the true distance is unknown.
+        kind: Kind of the loss.
+        scale_invariance: λ from 0 to 1: 1 ignores a common scale of each image.
+    """
+    known = ~errors.isnan()
+    values = exact(errors).where(known, 0)
+    if kind == "log_l1":
+        return values.abs().sum()
+    counts = known.flatten(1).sum(dim=1).clamp(min=1)
+    common = values.flatten(1).sum(dim=1).square() / counts
+    return values.square().sum() - scale_invariance * common.sum()
 
 
 def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
@@ -381,7 +370,7 @@ def spread_pixels(predicted: PredictedImage, count: int) -> NDArray[np.intp]:
     Returns:
         ``(2, n)`` rows and columns of the depth map.
     """
-    grown = np.where(np.isfinite(predicted.pixels), solid_angles(predicted), 0).ravel()
+    grown = np.where(np.isfinite(predicted.pixels), predicted.solid_angles, 0).ravel()
     np.cumsum(grown, out=grown)  # in place, which saves memory
     grown *= count / (grown[-1] or 1)
     np.floor(grown, out=grown)

@@ -15,9 +15,10 @@ from tangent_train.metrics.segmentation import UNKNOWN
 
 _Image = NDArray[np.uint8]
 _MARGIN = 8
+_LINE = 22
 _LEAST_ROWS = 256
-_PANORAMA_DIMENSIONS = 2
 _LARGEST_ERROR = 0.5
+_WRONG, _GRAY = (214, 39, 40), 160
 _LEGEND_WIDTH = 1200
 """Width of a picture, in pixels, per step of its legend's size."""
 
@@ -25,16 +26,6 @@ _LEGEND_WIDTH = 1200
 def evenly_spread(count: int, total: int) -> NDArray[np.intp]:
     """Return at most `count` numbers from 0 to ``total - 1``, including the first and the last."""
     return np.linspace(0, total - 1, min(count, total)).round().astype(np.intp)
-
-
-def colorize(labels: NDArray[np.integer], num_classes: int) -> _Image:
-    """Color labels ``(H, W)`` as RGB ``(H, W, 3)``.
-
-    Args:
-        labels: Labels from 0 to K.
-        num_classes: Number of labels, K + 1.
-    """
-    return class_colors(num_classes)[labels]
 
 
 def distance_limits(*distances: NDArray[np.floating]) -> tuple[float, float]:
@@ -66,6 +57,69 @@ def colorize_distance(
     return np.asarray(colors * is_known[..., None], np.uint8)
 
 
+def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
+    """Overlay the lightness of a picture with its labels.
+
+    The colors of the picture would change those of the classes and are left out. Class colors are
+    not mixed along the borders between classes.
+
+    Args:
+        rgb: RGB picture ``(H, W, 3)``.
+        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
+        num_classes: Number of labels, K + 1.
+    """
+    light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
+    colors = class_colors(num_classes)[labels]
+    mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
+    for axis in (0, 1):
+        is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
+        mixed[is_border] = colors[is_border]
+    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
+    return mixed
+
+
+def with_class_legend(
+    picture: _Image, labels: NDArray[np.integer], class_names: Sequence[str]
+) -> _Image:
+    """Return a picture above a legend of the classes that occur, whose text grows with the width.
+
+    Args:
+        picture: RGB ``(H, W, 3)``.
+        labels: Labels of any shape.
+        class_names: Names of the K + 1 labels.
+    """
+    width, seen = picture.shape[1], np.unique(labels)
+    scale = max(1, round(width / _LEGEND_WIDTH))
+    longest = max((len(class_names[index]) for index in seen), default=0)
+    cell, line, side = max(104, 30 + 9 * longest) * scale, _LINE * scale, 14 * scale
+    per_row = max(1, width // cell)
+    rows = -(-len(seen) // per_row)
+    legend = np.full((rows * line + _MARGIN * scale, width, 3), 255, np.uint8)
+    for k, index in enumerate(seen):
+        x, y = k % per_row * cell + 2 * scale, k // per_row * line + _MARGIN * scale
+        legend[y : y + side, x : x + side] = class_colors(len(class_names))[index]
+        _write(legend, class_names[index], (x + 19 * scale, y + 12 * scale), scale)
+    return np.concatenate([picture, legend])
+
+
+def with_distance_legend(picture: _Image, limits: tuple[float, float], unit: str) -> _Image:
+    """Return a picture above a bar of the colors with the first and the last distance.
+
+    Args:
+        picture: RGB ``(H, W, 3)``.
+        limits: See `colorize_distance`.
+        unit: Unit, e.g. m, or relative; it is printed after the last distance.
+    """
+    width = picture.shape[1]
+    scale = max(1, round(width / _LEGEND_WIDTH))
+    colors = distance_colors()[np.linspace(0, 255, width).astype(np.uint8)]
+    bar = np.tile(colors, (_LINE * scale, 1, 1))
+    near, far = f"{limits[0]:.3g}", f"{limits[1]:.3g} {unit}"
+    _write(bar, near, (4 * scale, 16 * scale), scale)
+    _write(bar, far, (width - (8 + 9 * len(far)) * scale, 16 * scale), scale, (255, 255, 255))
+    return np.concatenate([picture, bar])
+
+
 def prediction_panel(
     rgb: _Image,
     truth: NDArray[np.integer],
@@ -84,19 +138,13 @@ def prediction_panel(
         RGB image of about 2W × 2H; panoramas with less than 256 rows are enlarged by a whole
         factor. Errors are red, unlabeled pixels are gray.
     """
-    count = len(class_names)
+    colors = class_colors(len(class_names))
     error = np.full((*truth.shape, 3), 255, np.uint8)
-    error[prediction != truth] = (214, 39, 40)
-    error[truth == UNKNOWN] = (160, 160, 160)
-    tiles = {
-        "input": rgb,
-        "truth": colorize(truth, count),
-        "prediction": colorize(prediction, count),
-        "error": error,
-    }
-    grid = _grid(tiles)
-    seen = np.union1d(np.unique(truth), np.unique(prediction))
-    return np.concatenate([grid, _legend(grid.shape[1], seen, class_names)])
+    error[prediction != truth] = _WRONG
+    error[truth == UNKNOWN] = _GRAY
+    truths, predictions = colors[truth], colors[prediction]
+    grid = _grid({"input": rgb, "truth": truths, "prediction": predictions, "error": error})
+    return with_class_legend(grid, np.stack([truth, prediction]), class_names)
 
 
 def distance_panel(
@@ -113,18 +161,17 @@ def distance_panel(
         RGB image as of `prediction_panel`. Relative errors are white to red, from 0 to 50 %; pixels
         without a true distance are gray, those without a prediction are black.
     """
-    near, far = distance_limits(truth)
+    limits = distance_limits(truth)
     share = np.abs(prediction - truth) / (_LARGEST_ERROR * truth)
-    red = np.array((214, 39, 40))
-    error = 255 + np.nan_to_num(share, posinf=1)[..., None].clip(0, 1) * (red - 255)
+    error = 255 + np.nan_to_num(share, posinf=1)[..., None].clip(0, 1) * (np.array(_WRONG) - 255)
     error[np.isnan(prediction)] = 0
-    error[np.isnan(truth)] = 160
-    scale = f"{near:.2g} to {far:.2g} m"
+    error[np.isnan(truth)] = _GRAY
+    scale = f"{limits[0]:.2g} to {limits[1]:.2g} m"
     return _grid(
         {
             "input": rgb,
-            f"truth, {scale}": colorize_distance(truth, (near, far)),
-            f"prediction, {scale}": colorize_distance(prediction, (near, far)),
+            f"truth, {scale}": colorize_distance(truth, limits),
+            f"prediction, {scale}": colorize_distance(prediction, limits),
             "error, 0 to 50 %": error.round().astype(np.uint8),
         }
     )
@@ -132,13 +179,26 @@ def distance_panel(
 
 def _grid(tiles: Mapping[str, _Image]) -> _Image:
     """Draw four images in a 2 × 2 grid, below their titles; small ones are enlarged."""
-    scale = max(1, _LEAST_ROWS // len(next(iter(tiles.values()))))
-    titled = [
-        _titled(image.repeat(scale, axis=0).repeat(scale, axis=1), title)
-        for title, image in tiles.items()
-    ]
-    gap = np.full((titled[0].shape[0], _MARGIN, 3), 255, np.uint8)
+    titled = []
+    for title, image in tiles.items():
+        scale = max(1, _LEAST_ROWS // len(image))
+        enlarged = image.repeat(scale, axis=0).repeat(scale, axis=1)
+        strip = np.full((_LINE, enlarged.shape[1], 3), 255, np.uint8)
+        titled.append(np.concatenate([_write(strip, title, (2, 16)), enlarged]))
+    gap = np.full((len(titled[0]), _MARGIN, 3), 255, np.uint8)
     return np.concatenate([np.concatenate([titled[k], gap, titled[k + 1]], axis=1) for k in (0, 2)])
+
+
+def _write(
+    image: _Image,
+    text: str,
+    origin: tuple[int, int],
+    scale: int = 1,
+    color: tuple[int, int, int] = (0, 0, 0),
+) -> _Image:
+    font = cv2.FONT_HERSHEY_SIMPLEX
+    cv2.putText(image, text, origin, font, 0.45 * scale, color, scale, cv2.LINE_AA)
+    return image
 
 
 def shown_arrays(
@@ -164,15 +224,13 @@ def shown_arrays(
     Returns:
         RGB ``(H, W, 3)``, true and predicted labels ``(H, W)``; for crops, W is n·w.
     """
-    truth, labels = (tensor.cpu().numpy() for tensor in (target, prediction))
-    rgb = image.rgb
-    if truth.ndim != _PANORAMA_DIMENSIONS:
+    shown = image.rgb, target.cpu().numpy(), prediction.cpu().numpy()
+    if target.ndim == 3:
         (crops,) = image.sampler(representation).view_sets()
-        shown = crops.render(image.rgb, "bilinear")
-        rgb, truth, labels = map(np.hstack, (shown, truth, labels))
-    elif image.valid is not None:
-        rgb, truth, labels = (black_outside(a, image.valid) for a in (rgb, truth, labels))
-        if cut:
+        rgb, truth, labels = map(np.hstack, (crops.render(image.rgb, "bilinear"), *shown[1:]))
+    else:
+        rgb, truth, labels = (black_outside(array, image.valid) for array in shown)
+        if cut and image.valid is not None:
             box = _box(image.valid)
             rgb, truth, labels = (array[box] for array in (rgb, truth, labels))
     step = 1 if most_rows is None else -(-truth.shape[0] // most_rows)
@@ -187,91 +245,3 @@ def _box(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     first = columns[(gaps.argmax() + 1) % len(columns)]
     across = (first + np.arange(valid.shape[1] - gaps.max() + 1)) % valid.shape[1]
     return np.arange(rows[0], rows[-1] + 1)[:, None], across
-
-
-def _titled(image: _Image, title: str) -> _Image:
-    strip = np.full((22, image.shape[1], 3), 255, np.uint8)
-    return np.concatenate([_text(strip, title, (2, 16)), image])
-
-
-def overlay_picture(rgb: _Image, labels: NDArray[np.integer], class_names: Sequence[str]) -> _Image:
-    """Overlay a picture with its labels, above a legend of its classes.
-
-    Args:
-        rgb: RGB picture ``(H, W, 3)``.
-        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
-        class_names: Names of the K + 1 labels, the unknown class first.
-
-    Returns:
-        RGB image of the same width, higher by the legend, whose text grows with the width.
-    """
-    mixed = mixed_picture(rgb, labels, len(class_names))
-    scale = max(1, round(rgb.shape[1] / _LEGEND_WIDTH))
-    seen = np.setdiff1d(np.unique(labels), [UNKNOWN])
-    return np.concatenate([mixed, _legend(rgb.shape[1], seen, class_names, scale)])
-
-
-def distance_picture(distance: NDArray[np.floating], unit: str) -> _Image:
-    """Color distances above a bar of the colors with the first and the last distance.
-
-    Args:
-        distance: Distances ``(H, W)``, see `colorize_distance`.
-        unit: Unit, e.g. m, or relative; it is printed after the last distance.
-
-    Returns:
-        RGB image of the same width, higher by the bar, whose text grows with the width.
-    """
-    limits = distance_limits(distance)
-    width = distance.shape[1]
-    scale = max(1, round(width / _LEGEND_WIDTH))
-    bar = np.full((22 * scale, width, 3), 255, np.uint8)
-    near, far = f"{limits[0]:.3g}", f"{limits[1]:.3g} {unit}"
-    left, right = ((16 + 9 * len(text)) * scale for text in (near, far))
-    ramp = np.linspace(0, 255, max(0, width - left - right)).astype(np.uint8)
-    bar[4 * scale : 18 * scale, left : left + len(ramp)] = distance_colors()[ramp]
-    _text(bar, near, (4 * scale, 16 * scale), scale)
-    _text(bar, far, (width - right + 8 * scale, 16 * scale), scale)
-    return np.concatenate([colorize_distance(distance, limits), bar])
-
-
-def mixed_picture(rgb: _Image, labels: NDArray[np.integer], num_classes: int) -> _Image:
-    """Overlay the lightness of a picture with its labels.
-
-    The colors of the picture would change those of the classes and are left out. Class colors are
-    not mixed along the borders between classes.
-
-    Args:
-        rgb: RGB picture ``(H, W, 3)``.
-        labels: Labels ``(H, W)``; unknown pixels (0) show the picture.
-        num_classes: Number of labels, K + 1.
-    """
-    light = cv2.cvtColor(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), cv2.COLOR_GRAY2RGB)
-    colors = colorize(labels, num_classes)
-    mixed = cv2.addWeighted(light, 0.5, colors, 0.5, 0)
-    for axis in (0, 1):
-        is_border = np.diff(labels, axis=axis, prepend=labels.take([0], axis)) != 0
-        mixed[is_border] = colors[is_border]
-    mixed[labels == UNKNOWN] = rgb[labels == UNKNOWN]
-    return mixed
-
-
-def _legend(
-    width: int, classes: NDArray[np.integer], class_names: Sequence[str], scale: int = 1
-) -> _Image:
-    longest = max((len(class_names[index]) for index in classes), default=0)
-    cell, line = max(104, 30 + 9 * longest) * scale, 22 * scale
-    per_row = max(1, width // cell)
-    rows = -(-len(classes) // per_row)
-    legend = np.full((rows * line + _MARGIN * scale, width, 3), 255, np.uint8)
-    colors = class_colors(len(class_names))
-    for k, index in enumerate(classes):
-        x, y = k % per_row * cell + 2 * scale, k // per_row * line + _MARGIN * scale
-        legend[y : y + 14 * scale, x : x + 14 * scale] = colors[index]
-        _text(legend, class_names[index], (x + 19 * scale, y + 12 * scale), scale)
-    return legend
-
-
-def _text(image: _Image, text: str, origin: tuple[int, int], scale: int = 1) -> _Image:
-    font, black = cv2.FONT_HERSHEY_SIMPLEX, (0, 0, 0)
-    cv2.putText(image, text, origin, font, 0.45 * scale, black, scale, cv2.LINE_AA)
-    return image

@@ -12,9 +12,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from datamodules.core.images import meters_to_steps
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.core.panorama_module import Upright
+from datamodules.core.depth import meters_to_steps
+from datamodules.core.image_module import Upright
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from tangent_train.checkpoints.kinds import Align
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError, width_height

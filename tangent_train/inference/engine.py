@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from datamodules.core.images import STEPS_PER_M, resize_depth
+from datamodules.core.dataset import render_inputs
+from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
-from datamodules.core.samples import render_inputs
 from tangent_train.checkpoints.outputs import OutputNetwork, network_for_views, plain_output
 from tangent_train.errors import SettingError, at_least
 from tangent_train.rendering.resampling import resize

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from torch import Tensor
 
-from datamodules.core.images import meters_to_steps, resize_depth
+from datamodules.core.depth import meters_to_steps, resize_depth
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.gpano import PanoramaArea, read_area, read_up
@@ -24,7 +24,7 @@ from tangent_train.rendering.resampling import resize
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from datamodules.core.panorama_module import Upright
+    from datamodules.core.image_module import Upright
     from tangent_train.inference.up_likelihood import UpLikelihood
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]

@@ -19,8 +19,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from datamodules.core.label_map import LabelMap, plain_name, read_label_map
-from datamodules.core.labels import PIXEL_CLASSES
+from datamodules.core.label_map import PIXEL_CLASSES, LabelMap, plain_name, read_label_map
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
 

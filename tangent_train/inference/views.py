@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from omegaconf import OmegaConf
 
-from datamodules.core.images import distance_from_z_depth, resize_depth
+from datamodules.core.depth import distance_from_z_depth, resize_depth
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder

@@ -106,7 +106,8 @@ class _CamerasJson(BaseModel):
 
     @model_validator(mode="after")
     def _check_faces(self) -> Self:
-        self.grid.face_indices(self.faces)
+        if not set(self.faces) <= set(range(self.grid.num_images)):
+            raise ValueError(f"face {max(self.faces)} of {self.grid.num_images} images")
         return self
 
     @property

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry.equirect import check_area
+from tangent_train.geometry.sphere import check_area
 from tangent_train.io.pixel_files import read_xmp
 from tangent_train.orientation.gravity import up_from_pose
 from tangent_train.rendering.resampling import resize

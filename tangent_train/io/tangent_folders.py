@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import PinholeGrid, equirect_shape, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile
@@ -189,21 +189,23 @@ class TangentResults:
                 bits or floats are depth.
 
         Raises:
-            DataError: A file cannot be read, differs from the others, or cannot be of this kind.
-            SettingError: The files have another ratio of sides than the images.
+            DataError: A file cannot be read, differs from the others, cannot be of this kind, or
+                has another ratio of sides than the images.
         """
         arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
         first = arrays[0]
         decided = _kind_of(files[0], first) if kind == "auto" else kind
         channels = _CHANNELS.get(decided, (first.shape[2:],))
         is_usable = first.dtype.kind in _TYPES[decided] and first.shape[2:] in channels
+        is_usable &= first.shape[0] * grid.size[1] == first.shape[1] * grid.size[0]
         for file, array in zip(files, arrays, strict=True):
             if not is_usable or (array.shape, array.dtype) != (first.shape, first.dtype):
                 raise DataError(
                     file,
                     found=f"{array.dtype} of shape {array.shape}",
-                    expected=f"{decided} of one type and shape in all files; labels and depth have "
-                    "one channel, colors one or three",
+                    expected=f"{decided} of one type and shape in all files, in the ratio of "
+                    f"{width_height(grid.size)}; labels and depth have one channel, colors one or "
+                    "three",
                     remedy=f"Choose kind={', '.join(get_args(ResultKind))}.",
                 )
         size = first.shape[0], first.shape[1]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import DataError
 from tangent_train.geometry import PanoramaPose, to_right_handed
 from tangent_train.io.camera_files import RigFile
-from tangent_train.keypoints.spherical import SphericalKeypoints
+from tangent_train.keypoints.features import SphericalKeypoints
 from tangent_train.keypoints.two_view import TwoView, colmap, rigid_matrix
 
 
@@ -56,13 +56,24 @@ def add_pair(
 def _image_id(
     database: Any, name: str, shape: tuple[int, int], keypoints: SphericalKeypoints
 ) -> int:
+    """Return the image of a name; add it, with its keypoints and descriptors, if missing."""
     if database.exists_image(name):
         return int(database.read_image_with_name(name).image_id)
     pycolmap = colmap()
-    camera_id = _camera_id(database, shape)
-    image_id: int = database.write_image(pycolmap.Image(name=name, camera_id=camera_id))
-    frame = pycolmap.Frame(rig_id=camera_id)
-    frame.add_data_id(pycolmap.Image(camera_id=camera_id, image_id=image_id).data_id)
+    cameras = database.read_all_cameras()
+    sizes = {(camera.height, camera.width): camera.camera_id for camera in cameras}
+    number = sizes.get(shape, len(sizes) + 1)
+    if shape not in sizes:  # a camera, and a rig of this camera
+        # EQUIRECTANGULAR has no focal length; the argument is for other models.
+        model = ("EQUIRECTANGULAR", 1.0, shape[1], shape[0])
+        camera = pycolmap.Camera.create_from_model_name(number, *model)
+        database.write_camera(camera, use_camera_id=True)
+        rig = pycolmap.Rig(rig_id=number)
+        rig.add_ref_sensor(camera.sensor_id)
+        database.write_rig(rig, use_rig_id=True)
+    image_id: int = database.write_image(pycolmap.Image(name=name, camera_id=number))
+    frame = pycolmap.Frame(rig_id=number)
+    frame.add_data_id(pycolmap.Image(camera_id=number, image_id=image_id).data_id)
     database.write_frame(frame)
     pixels = keypoints.equirect_pixels(shape) + 0.5
     database.write_keypoints(image_id, pixels.astype(np.float32))
@@ -70,24 +81,6 @@ def _image_id(
     kind = pycolmap.FeatureExtractorType.SIFT
     database.write_descriptors(image_id, pycolmap.FeatureDescriptors(kind, numbers))
     return image_id
-
-
-def _camera_id(database: Any, shape: tuple[int, int]) -> int:
-    """Return the camera for panoramas of a size; add it, with a rig of this camera, if missing."""
-    pycolmap = colmap()
-    height, width = shape
-    cameras = database.read_all_cameras()
-    for camera in cameras:
-        if (camera.height, camera.width) == shape:
-            return int(camera.camera_id)
-    number = len(cameras) + 1
-    # EQUIRECTANGULAR has no focal length; the argument is for other models.
-    camera = pycolmap.Camera.create_from_model_name(number, "EQUIRECTANGULAR", 1.0, width, height)
-    database.write_camera(camera, use_camera_id=True)
-    rig = pycolmap.Rig(rig_id=number)
-    rig.add_ref_sensor(camera.sensor_id)
-    database.write_rig(rig, use_rig_id=True)
-    return number
 
 
 def _geometry(pairs: NDArray[np.uint32], found: TwoView) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.panorama_pairs import PanoramaPair
+from tangent_train.errors import SettingError
 from tangent_train.geometry import (
     CubeGrid,
     PanoramaPose,
@@ -21,21 +22,20 @@ from tangent_train.geometry import (
     random_rotation,
 )
 from tangent_train.geometry.coverage import is_valid
-from tangent_train.keypoints import (
-    SphericalKeypoints,
-    TwoView,
-    detect_on_equirect,
-    detect_on_tangent_images,
-    estimate_two_view,
-    match,
-)
 from tangent_train.keypoints.covisibility import (
     DepthView,
     correct_matches,
     fov_overlap,
     visible_from,
 )
-from tangent_train.keypoints.spherical import Floats
+from tangent_train.keypoints.features import (
+    Floats,
+    SphericalKeypoints,
+    detect_on_equirect,
+    detect_on_tangent_images,
+    match,
+)
+from tangent_train.keypoints.two_view import TwoView, estimate_two_view
 from tangent_train.rendering import rotate_equirect
 
 Row = dict[str, Any]
@@ -43,9 +43,6 @@ Row = dict[str, Any]
 
 _Views = tuple[DepthView, DepthView]
 """Depth and pose of the left and of the right panorama."""
-
-_Keypoints = dict[tuple[str, int], dict[str, SphericalKeypoints]]
-"""Keypoints by representation, for a panorama's name and level."""
 
 AS_GIVEN, ROTATED = "as_given", "rotated"
 """Conditions: both panoramas unchanged; the right panorama randomly rotated."""
@@ -58,6 +55,12 @@ CUBE = "cube"
 
 AUC_DEG = (5, 10, 20)
 """Upper limits of the pose error for the area under the recall curve."""
+
+_TRUTH = (
+    *("rotation_error_deg", "translation_error_deg", *(f"pose_auc_{d}" for d in AUC_DEG)),
+    *("verifiable", "correct", "correct_share"),
+)
+"""Scores that need depth and pose."""
 
 
 class MatchedPair(NamedTuple):
@@ -90,7 +93,7 @@ class Comparer:
     Attributes:
         base_level: Base levels of the tangent images.
         margin: Number of pixels added around every tangent image.
-        level: Largest level s; None for the level nearest to the larger panorama.
+        level: Level s; None for the level nearest to the larger panorama, the largest.
         ratio: Largest ratio of descriptor distances, see `match`.
         mutual: True to keep mutual matches only, see `match`.
         max_error_deg: Largest error of an inlier, see `estimate_two_view`; at most 20.
@@ -108,13 +111,7 @@ class Comparer:
     controls: bool = True
 
     def __post_init__(self) -> None:
-        self._cache: _Keypoints = {}
-
-    @property
-    def representations(self) -> list[str]:
-        """Names: ``ERP``; with controls, shrunk ERP and cube; ``L0``, ``L1`` … for base levels."""
-        controls = [SHRUNK, CUBE] if self.controls else []
-        return ["ERP", *controls, *(f"L{b}" for b in self.base_level)]
+        self._cache: dict[tuple[str, int], dict[str, SphericalKeypoints]] = {}
 
     def compare(self, pair: PanoramaPair) -> Comparison:
         """Compare all representations on one pair.
@@ -128,10 +125,14 @@ class Comparer:
             and pose, they have the errors of the estimated motion, the area under the recall curve
             of the pair, and the number of ``correct`` matches among the ``verifiable`` ones.
             Undefined scores are None.
+
+        Raises:
+            SettingError: The level is above that of the panoramas.
         """
         sides = (pair.left, pair.right)
-        nearest = nearest_level(max(side.rgb.shape[0] for side in sides))
-        level = nearest if self.level is None else min(self.level, nearest)
+        level = nearest = nearest_level(max(side.rgb.shape[0] for side in sides))
+        if self.level is not None and (level := self.level) > nearest:
+            raise SettingError("level", found=level, expected=f"{nearest} or less for {pair.name}")
         images = [_shrunk(side.rgb, equirect_shape(level)[0]) for side in sides]
         # Keypoints of a panorama of the previous pair are used again.
         self._cache = {
@@ -148,41 +149,43 @@ class Comparer:
                 valid = rotate_equirect(valid.astype(np.uint8), rotation, "nearest") > 0
             image = rotate_equirect(images[1], rotation)
             conditions[ROTATED] = rotation, image, self._detect(image, level, valid)
-        views: Any = None
-        if all(side.distance_m is not None and side.pose is not None for side in sides):
-            views = [DepthView(side.distance_m, side.pose) for side in sides]  # type: ignore[arg-type]
+        views: Any = [
+            DepthView(side.distance_m, side.pose)
+            for side in sides
+            if side.distance_m is not None and side.pose is not None
+        ]
+        has_depth = len(views) == 2
         common = {
             "pair": pair.name,
             "split": pair.split,
             "left": pair.left.name,
             "right": pair.right.name,
             "level": level,
-            "fov_overlap": None if views is None else _defined(fov_overlap(*views)),
-            "visible_by": "all keypoints" if views is None else "depth",
+            "fov_overlap": _defined(fov_overlap(*views)) if has_depth else None,
+            "visible_by": "depth" if has_depth else "all keypoints",
         }
         comparison = Comparison([], {}, {})
         for condition, (rotation, image, right) in conditions.items():
             matched = {name: self._match(left[name], right[name]) for name in left}
             comparison.images[condition] = (images[0], image)
             comparison.matched[condition] = matched
-            for name, one in matched.items():
+            for name, found in matched.items():
                 row = {**common, "condition": condition, "representation": name}
-                comparison.rows.append(row | self._scores(one, rotation, views))
+                row |= self._scores(found, rotation, views if has_depth else None)
+                comparison.rows.append(row)
         return comparison
 
     def _detect(
         self, rgb: NDArray[np.uint8], level: int, valid: NDArray[np.bool_] | None
     ) -> dict[str, SphericalKeypoints]:
-        """Return the keypoints at valid pixels, in the order of `representations`."""
+        """Return the keypoints at valid pixels by representation, in the order of the tables."""
         found = {"ERP": detect_on_equirect(rgb)}
-        grids: dict[str, TangentGrid | CubeGrid] = {}
+        grids: dict[str, Any] = {f"L{b}": TangentGrid(b, level) for b in self.base_level}
         if self.controls:
             found[SHRUNK] = detect_on_equirect(_shrunk(rgb, shrunk_rows(level)))
-            grids[CUBE] = CubeGrid(2**level)
-        grids |= {f"L{b}": TangentGrid(b, level) for b in self.base_level}
-        found |= {
-            name: detect_on_tangent_images(rgb, grid, self.margin) for name, grid in grids.items()
-        }
+            grids = {CUBE: CubeGrid(2**level), **grids}
+        for name, grid in grids.items():
+            found[name] = detect_on_tangent_images(rgb, grid, self.margin)
         if valid is None:
             return found
         return {name: k.select(is_valid(valid, k.directions_xyz)) for name, k in found.items()}
@@ -194,53 +197,42 @@ class Comparer:
         return MatchedPair(left, right, matches, geometry)
 
     def _scores(self, pair: MatchedPair, rotation: Floats, views: _Views | None) -> Row:
-        keypoints = visible = len(pair.left), len(pair.right)
-        truth: Row = dict.fromkeys(_TRUTH)
+        counts = {"left": len(pair.left), "right": len(pair.right)}
+        row: Row = {f"keypoints_{side}": count for side, count in counts.items()}
+        row |= {f"visible_{side}": count for side, count in counts.items()}
+        row |= dict.fromkeys(("putative", "inliers", "pmr", "ms", "p", "geometry", *_TRUTH))
         if views is not None:
-            visible, truth = _truth(pair, rotation, views, self.max_error_deg)
-        putative, inliers = len(pair.matches), int(pair.geometry.inliers.sum())
-        share = sum(1 / n for n in visible) / 2 if all(visible) else None
-        return {
-            "keypoints_left": keypoints[0],
-            "keypoints_right": keypoints[1],
-            "visible_left": visible[0],
-            "visible_right": visible[1],
-            "putative": putative,
-            "inliers": inliers,
-            "pmr": share and putative * share,
-            "ms": share and inliers * share,
-            "p": inliers / putative if putative else None,
-            "geometry": pair.geometry.kind,
-            **truth,
+            row |= self._truth(pair, rotation, views)
+        row["putative"] = putative = len(pair.matches)
+        row["inliers"] = inliers = int(pair.geometry.inliers.sum())
+        row["geometry"] = pair.geometry.kind
+        visible = row["visible_left"], row["visible_right"]
+        if all(visible):
+            share = sum(1 / n for n in visible) / 2
+            row |= {"pmr": putative * share, "ms": inliers * share}
+        row["p"] = inliers / putative if putative else None
+        return row
+
+    def _truth(self, pair: MatchedPair, rotation: Floats, views: _Views) -> Row:
+        """Return the numbers of visible keypoints, and the scores that need depth and pose."""
+        (left, right), left_xyz = views, pair.left.directions_xyz
+        # In the unrotated right panorama, whose depth needs no resampling.
+        right_xyz = pair.right.directions_xyz @ rotation
+        rays = left_xyz[pair.matches[:, 0]], right_xyz[pair.matches[:, 1]]
+        is_correct, is_known = correct_matches(*rays, left, right, self.max_error_deg)
+        correct, known = int(is_correct.sum()), int(is_known.sum())
+        rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
+        errors = pair.geometry.pose_error_deg(left.pose, rotated)
+        # The recall of one pair is a step from 0 to 1 at its error; without an estimate it stays 0.
+        worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
+        moved = not np.array_equal(left.pose.location_m, right.pose.location_m)
+        areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)
+        share = correct / known if known else None
+        scores = (*map(_defined, errors), *areas, known, correct, share)
+        return dict(zip(_TRUTH, scores, strict=True)) | {
+            "visible_left": int(visible_from(left_xyz, left, right).sum()),
+            "visible_right": int(visible_from(right_xyz, right, left).sum()),
         }
-
-
-_TRUTH = (
-    *("rotation_error_deg", "translation_error_deg", *(f"pose_auc_{d}" for d in AUC_DEG)),
-    *("verifiable", "correct", "correct_share"),
-)
-
-
-def _truth(
-    pair: MatchedPair, rotation: Floats, views: _Views, max_error_deg: float
-) -> tuple[tuple[int, int], Row]:
-    """Return the numbers of visible keypoints, and the scores that need depth and pose."""
-    (left, right), left_xyz = views, pair.left.directions_xyz
-    # In the unrotated right panorama, whose depth needs no resampling.
-    right_xyz = pair.right.directions_xyz @ rotation
-    visible = visible_from(left_xyz, left, right), visible_from(right_xyz, right, left)
-    first, second = pair.matches.T
-    truth = correct_matches(left_xyz[first], right_xyz[second], left, right, max_error_deg)
-    rotated = PanoramaPose(right.pose.world_from_panorama @ rotation.T, right.pose.location_m)
-    errors = pair.geometry.pose_error_deg(left.pose, rotated)
-    known, correct = int(truth.known.sum()), int(truth.correct.sum())
-    # The recall of one pair is a step from 0 to 1 at its error; without an estimate it stays 0.
-    worst = max(errors) if all(map(math.isfinite, errors)) else math.inf
-    moved = not np.array_equal(left.pose.location_m, right.pose.location_m)
-    areas = (max(0.0, 1 - worst / limit) if moved else None for limit in AUC_DEG)
-    scores = (*map(_defined, errors), *areas, known, correct, correct / known if known else None)
-    counts = int(visible[0].sum()), int(visible[1].sum())
-    return counts, dict(zip(_TRUTH, scores, strict=True))
 
 
 def _defined(value: float) -> float | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +15,7 @@ from tangent_train.geometry import (
     lonlat_to_xyz,
     xyz_to_lonlat,
 )
-from tangent_train.keypoints.spherical import Floats, angles_between
+from tangent_train.keypoints.features import Floats, angles_between
 
 _TOLERANCE, _TOLERANCE_M = 0.03, 0.03
 """Occlusion tolerance behind a surface: share of the distance, and meters."""
@@ -56,8 +55,14 @@ class DepthView:
             all four pixels are missing.
         """
         height, width = self.distance_m.shape
-        pixels = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width))
-        index, weight = _four_pixels(pixels, (height, width))
+        u, v = lonlat_to_equirect(xyz_to_lonlat(directions_xyz), (height, width)).T
+        rows = np.floor(v) + np.array([[0], [0], [1], [1]])
+        inside = rows.clip(0, height - 1)
+        # Beyond a pole the row reflects, rotated by half a revolution.
+        u = np.where(inside == rows, u, u + width / 2)
+        columns = np.floor(u) + np.array([[0], [1], [0], [1]])
+        weight = (1 - np.abs(rows - v)) * (1 - np.abs(columns - u))
+        index = (inside * width + columns % width).astype(np.int64)
         four = self.distance_m.reshape(-1)[index].astype(np.float64)
         touched = weight > 1e-6  # rounding may include pixels without weight
         there = touched & ~np.isnan(four)
@@ -69,23 +74,6 @@ class DepthView:
         distance[smooth] = 1 / np.where(there, weight / four, 0.0).sum(axis=0)[smooth]
         distance[~there.any(axis=0)] = np.nan
         return distance, distance * np.where(smooth, 1.0, _SMOOTH)
-
-
-def _four_pixels(pixels_xy: Floats, shape: tuple[int, int]) -> tuple[NDArray[np.int64], Floats]:
-    """Return flat indices and bilinear weights ``(4, n)`` of the pixels around positions."""
-    (u, v), (height, width) = pixels_xy.T, shape
-    indices, weights = [], []
-    for row, row_weight in ((np.floor(v), 1 - v % 1), (np.floor(v) + 1, v % 1)):
-        inside = row.clip(0, height - 1)
-        # Beyond a pole the row reflects, rotated by half a revolution.
-        column = np.where(inside == row, u, u + width / 2)
-        for nearest, weight in (
-            (np.floor(column), 1 - column % 1),
-            (np.floor(column) + 1, column % 1),
-        ):
-            indices.append((inside * width + nearest % width).astype(np.int64))
-            weights.append(row_weight * weight)
-    return np.stack(indices), np.stack(weights)
 
 
 def visible_from(directions_xyz: Floats, source: DepthView, target: DepthView) -> NDArray[np.bool_]:
@@ -130,9 +118,7 @@ def fov_overlap(left: DepthView, right: DepthView) -> float:
 
 def _seen_share(source: DepthView, target: DepthView) -> float:
     height, width = source.distance_m.shape
-    across, down = (
-        max(1, round(size / most)) for size, most in ((width, 2 * _ROWS), (height, _ROWS))
-    )
+    across, down = max(1, round(width / _ROWS / 2)), max(1, round(height / _ROWS))
     rows, columns = np.mgrid[down // 2 : height : down, across // 2 : width : across]
     there = ~np.isnan(source.distance_m[rows, columns])
     if not there.any():
@@ -142,25 +128,13 @@ def _seen_share(source: DepthView, target: DepthView) -> float:
     return float(visible_from(directions, source, target).mean())
 
 
-class MatchTruth(NamedTuple):
-    """Matches verified against depth and pose.
-
-    Attributes:
-        correct: ``(m,)`` bool.
-        known: ``(m,)`` bool, True if at least one of the two panoramas has a distance.
-    """
-
-    correct: NDArray[np.bool_]
-    known: NDArray[np.bool_]
-
-
 def correct_matches(
     left_xyz: Floats,
     right_xyz: Floats,
     left: DepthView,
     right: DepthView,
     max_error_deg: float = 1.0,
-) -> MatchTruth:
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
     """Verify matches by depth and pose, independently of estimated geometry.
 
     The left point is placed at its distance and projected into the right panorama, and vice versa.
@@ -174,11 +148,15 @@ def correct_matches(
         left: Depth and pose of the left panorama.
         right: Depth and pose of the right panorama.
         max_error_deg: Largest angle of a correct match.
+
+    Returns:
+        ``(m,)`` correct matches, and ``(m,)`` matches for which at least one panorama has a
+        distance.
     """
     there = _transfer_errors_deg(left_xyz, right_xyz, left, right)
     back = _transfer_errors_deg(right_xyz, left_xyz, right, left)
     correct = (there <= max_error_deg) | (back <= max_error_deg)
-    return MatchTruth(correct, ~(np.isnan(there) & np.isnan(back)))
+    return correct, ~(np.isnan(there) & np.isnan(back))
 
 
 def _transfer_errors_deg(

@@ -6,11 +6,12 @@ import csv
 import io
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
 
 from datamodules.core.panorama_pairs import PublishedPair
 from tangent_train.files import csv_text, write_text
@@ -18,9 +19,11 @@ from tangent_train.keypoints.compare import AS_GIVEN, AUC_DEG, ROTATED, Comparis
 from tangent_train.results.tables import Table, percent
 
 _CONDITIONS = {AS_GIVEN: "As they are", ROTATED: "Right panorama randomly rotated"}
-_SCORES = {"PMR %": "pmr", "MS %": "ms", "P %": "p"}
+_SCORES = ("pmr", "ms", "p")
 _METRICS = {
-    **_SCORES,
+    "PMR %": "pmr",
+    "MS %": "ms",
+    "P %": "p",
     "right matches %": "correct_share",
     "keypoints, left": "keypoints_left",
     "inliers": "inliers",
@@ -42,93 +45,87 @@ _VISIBLE = {
 _MOST_LINES = 150
 
 
-@dataclass(frozen=True)
-class KeypointReport:
-    """All tables over the pairs of one data set.
+def write_report(
+    folder: Path,
+    rows: Sequence[Row],
+    settings: Mapping[str, Any],
+    published: Mapping[str, PublishedPair],
+) -> list[Table]:
+    """Write ``results.json``, ``pairs.csv`` and ``keypoints.md`` of the pairs of one data set.
 
-    Attributes:
+    Args:
+        folder: Output folder.
         rows: Rows of `Comparer.compare` for all pairs.
-        representations: Representations in the order of the columns.
         settings: Settings that affect the scores.
         published: The paper's pairs by name; empty for other data.
+
+    Returns:
+        Tables of the means over the pairs of each split, one per condition.
     """
+    content = {"settings": settings, "rows": rows}
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    write_text(folder / "results.json", text)
+    rows = with_splits(rows)
+    write_text(folder / "pairs.csv", csv_text(list(rows[0]), rows))
+    shown = ", ".join(f"{k} {v}" for k, v in settings.items() if k != "data")
+    visible = dict.fromkeys(f"{_VISIBLE[row['visible_by']]}\n" for row in rows)
+    means, pairs = [], []
+    for condition, title in _CONDITIONS.items():
+        if some := [row for row in rows if row["condition"] == condition]:
+            of_paper = published if condition == AS_GIVEN else {}
+            header = ("split", "metric", *_representations(some))
+            cells = list(_mean_rows(some, _paper() if of_paper else {}))
+            means.append(Table(title, header, cells, text_columns=(0, 1)))
+            pairs.append(_per_pair(title, some, of_paper))
+    tables = [table.markdown() for table in (*means, *pairs)]
+    head = f"# Keypoints\n\nSettings: {shown}.\n"
+    write_text(folder / "keypoints.md", "\n".join([head, *visible, *tables]))
+    return means
 
-    rows: Sequence[Row]
-    representations: Sequence[str]
-    settings: Mapping[str, Any]
-    published: Mapping[str, PublishedPair]
 
-    def write(self, folder: Path) -> None:
-        """Write ``results.json``, ``pairs.csv`` and ``keypoints.md``."""
-        rows = with_splits(self.rows)
-        write_text(folder / "pairs.csv", csv_text(list(rows[0]), rows))
-        write_text(folder / "keypoints.md", self.markdown())
-        content = {"settings": self.settings, "rows": self.rows}
-        write_text(
-            folder / "results.json", json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-        )
+def _representations(rows: Sequence[Row]) -> list[str]:
+    return list(dict.fromkeys(row["representation"] for row in rows))
 
-    def markdown(self) -> str:
-        """Return all tables as Markdown."""
-        settings = ", ".join(f"{k} {v}" for k, v in self.settings.items() if k != "data")
-        visible = dict.fromkeys(f"{_VISIBLE[row['visible_by']]}\n" for row in self.rows)
-        head = [f"# Keypoints\n\nSettings: {settings}.\n", *visible]
-        tables = [*self.means(), *map(self._per_pair, self._conditions())]
-        return "\n".join([*head, *(table.markdown() for table in tables)])
 
-    def means(self) -> list[Table]:
-        """Return the means over the pairs of each split, one table per condition."""
-        header = ("split", "metric", *self.representations)
-        return [
-            Table(_CONDITIONS[c], header, list(self._mean_rows(c)), text_columns=(0, 1))
-            for c in self._conditions()
+def _mean_rows(
+    rows: Sequence[Row], paper: Mapping[tuple[str, str], Any]
+) -> Iterator[Sequence[str]]:
+    """Yield means over the pairs with a defined score, and the paper's means below them."""
+    splits, representations = {row["split"] for row in rows}, _representations(rows)
+    for split in sorted(splits, key=lambda name: (name != "hard", name != "easy")):
+        columns = [
+            [row for row in rows if (row["split"], row["representation"]) == (split, name)]
+            for name in representations
         ]
+        title = f"{split or 'all'} ({max(map(len, columns))})"
+        for metric, key in _METRICS.items():
+            known = [[row[key] for row in some if row[key] is not None] for some in columns]
+            if not any(known) and key not in _SCORES:
+                continue
+            average = np.median if metric.endswith("median") else np.mean
+            means = (float(average(values)) if values else None for values in known)
+            yield (title, metric, *(_text(mean, metric) for mean in means))
+            title = ""
+            if printed := paper.get((split, key)):
+                figures = (printed.get(name) for name in representations)
+                texts = (_text(float(figure) if figure else None, metric) for figure in figures)
+                yield ("", f"{metric}, paper", *texts)
 
-    def _conditions(self) -> list[str]:
-        return [c for c in _CONDITIONS if any(row["condition"] == c for row in self.rows)]
 
-    def _groups(self, condition: str, key: str) -> dict[Any, list[list[Row]]]:
-        """Return the rows of a condition by split or pair, and by representation."""
-        groups: dict[Any, list[list[Row]]] = {}
-        for row in with_splits(self.rows):
-            if row["condition"] == condition:
-                columns = groups.setdefault(row[key], [[] for _ in self.representations])
-                columns[self.representations.index(row["representation"])].append(row)
-        return groups
-
-    def _mean_rows(self, condition: str) -> Iterator[Sequence[str]]:
-        """Yield means over the pairs with a defined score, and the paper's means below them."""
-        groups = self._groups(condition, "split")
-        for split in sorted(groups, key=lambda name: (name != "hard", name != "easy")):
-            printed = _paper().get(split, {}) if self.published and condition == AS_GIVEN else {}
-            title = f"{split or 'all'} ({max(map(len, groups[split]))})"
-            for metric, key in _METRICS.items():
-                known = [[r[key] for r in rows if r[key] is not None] for rows in groups[split]]
-                if not any(known) and key not in _SCORES.values():
-                    continue
-                average = np.median if metric.endswith("median") else np.mean
-                means = (float(average(values)) if values else None for values in known)
-                yield (title, metric, *(_text(mean, metric) for mean in means))
-                title = ""
-                if key in printed:
-                    figures = (printed[key].get(name) for name in self.representations)
-                    paper = (_text(float(figure) if figure else None, metric) for figure in figures)
-                    yield ("", f"{metric}, paper", *paper)
-
-    def _per_pair(self, condition: str) -> Table:
-        header = ("pair", "split", "overlap %", *self.representations)
-        cells: list[Sequence[str]] = []
-        for name, columns in self._groups(condition, "pair").items():
-            rows = [row for (row,) in columns]
-            scores = (_triple([row[key] for key in _SCORES.values()]) for row in rows)
-            one = rows[0]
-            cells.append((name, one["split"] or "–", percent(one["fov_overlap"]), *scores))
-            printed = self.published.get(name)
-            if printed is not None and condition == AS_GIVEN:
-                scores = (_triple(printed.scores.get(n, (None,) * 3)) for n in self.representations)
-                cells.append(("paper", "", percent(printed.fov_overlap), *scores))
-        title = f"Per pair: {_CONDITIONS[condition].lower()}"
-        return Table(title, header, cells, note="PMR / MS / P in percent.", text_columns=(0, 1))
+def _per_pair(title: str, rows: Sequence[Row], published: Mapping[str, PublishedPair]) -> Table:
+    cells: list[Sequence[str]] = []
+    representations = _representations(rows)
+    for name in dict.fromkeys(row["pair"] for row in rows):
+        found = {row["representation"]: row for row in rows if row["pair"] == name}
+        scores = (_triple([found[n][key] for key in _SCORES]) for n in representations)
+        first = found[representations[0]]
+        cells.append((name, first["split"] or "–", percent(first["fov_overlap"]), *scores))
+        if printed := published.get(name):
+            scores = (_triple(printed.scores.get(n, (None,) * 3)) for n in representations)
+            cells.append(("paper", "", percent(printed.fov_overlap), *scores))
+    header = ("pair", "split", "overlap %", *representations)
+    note = "PMR / MS / P in percent."
+    return Table(f"Per pair: {title.lower()}", header, cells, note, text_columns=(0, 1))
 
 
 def with_splits(rows: Sequence[Row]) -> list[Row]:
@@ -150,13 +147,10 @@ def with_splits(rows: Sequence[Row]) -> list[Row]:
     return [{**row, "split": "hard" if row["pair"] in hard else "easy"} for row in rows]
 
 
-def _paper() -> dict[str, dict[str, dict[str, str]]]:
-    """Read the tables of the paper by split, score and representation."""
+def _paper() -> dict[tuple[str, str], dict[str, str]]:
+    """Read the tables of the paper by split and score."""
     text = Path(__file__).with_name("paper.csv").read_text(encoding="utf-8")
-    tables: dict[str, dict[str, dict[str, str]]] = {}
-    for row in csv.DictReader(text.splitlines()):
-        tables.setdefault(row["split"], {})[row["figure"]] = row
-    return tables
+    return {(row["split"], row["figure"]): row for row in csv.DictReader(text.splitlines())}
 
 
 def _text(value: float | None, metric: str) -> str:
@@ -182,9 +176,6 @@ def matches_png(comparison: Comparison, condition: str) -> bytes:
     Returns:
         Content of a PNG file.
     """
-    from matplotlib.collections import LineCollection
-    from matplotlib.figure import Figure
-
     left, right = comparison.images[condition]
     (rows, width), found = left.shape[:2], comparison.matched[condition]
     figure = Figure((8 * len(found), 8), layout="constrained")

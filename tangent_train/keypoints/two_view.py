@@ -1,5 +1,10 @@
 """Two-view geometry of panoramas: estimate their motion from matches, most of them outliers.
 
+A point in direction l of the left panorama lies on a ray at an unknown distance. In the right
+panorama, with ``x_right = R x_left + t``, the ray appears as a great-circle arc. It starts at
+``R l``, the ray's point at infinity, and ends at ``t``, the left center. Without translation the
+arc is the point ``R l``.
+
 Arguments of pycolmap are in COLMAP's camera axes: x right, y down, z to the panorama's middle.
 """
 
@@ -8,15 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import of_extra
 from tangent_train.geometry import PanoramaPose
-from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors, prefers_rotation
-from tangent_train.keypoints.spherical import Floats, angles_between
+from tangent_train.keypoints.features import Floats, angles_between
 
 _CAMERA_FROM_PANORAMA = np.array([[0, 1.0, 0], [0, 0, -1.0], [1.0, 0, 0]])
 """From the axes of `tangent_train.geometry` to COLMAP's; a reflection."""
@@ -30,6 +34,26 @@ _DRAWS, _HYPOTHESES = 2**15, 512
 """Random pairs of matches for a rotation, and hypotheses tested: enough for 2 % inliers."""
 
 _REFINEMENTS = 6
+_SHIFTS = 16
+_PRECISION_RAD = math.radians(0.01)
+"""Lower limit for σ, below the precision of keypoints."""
+
+
+class Motion(NamedTuple):
+    """Motion from left to right coordinates, ``x_right = R x_left + t``.
+
+    Attributes:
+        rotation: ``(3, 3)`` R.
+        translation: ``(3,)`` t of length 1; None if both panoramas have the same center.
+    """
+
+    rotation: Floats
+    translation: Floats | None = None
+
+    @property
+    def sample(self) -> int:
+        """Number of matches that determine a motion (minimal sample)."""
+        return 2 if self.translation is None else 5
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,23 +124,107 @@ def estimate_two_view(
     Raises:
         SettingError: pycolmap is missing.
     """
-    no_motion = TwoView(np.zeros(len(left_xyz), np.bool_))
+    no_motion, max_error_rad = (
+        TwoView(np.zeros(len(left_xyz), np.bool_)),
+        math.radians(max_error_deg),
+    )
     if len(left_xyz) < _MIN_INLIERS:
         return no_motion
-    search = _Search(left_xyz, right_xyz, math.radians(max_error_deg), seed)
-    general, rotation = search.general(), search.rotation()
-    motion = general or rotation
-    if general is not None and rotation is not None:
-        errors = search.errors(general), search.errors(rotation)
-        motion = rotation if prefers_rotation(*errors, search.max_error_rad) else general
-    if motion is None:
-        return no_motion
-    inliers = search.errors(motion) <= search.max_error_rad
-    if inliers.sum() < _MIN_INLIERS or is_by_chance(
-        left_xyz, right_xyz, motion, search.max_error_rad
+    search = _Search(left_xyz, right_xyz, max_error_rad, seed)
+    general, motion = search.general(), search.rotation()
+    if motion is None or (
+        general is not None
+        and not prefers_rotation(search.errors(general), search.errors(motion), max_error_rad)
     ):
+        motion = general
+    if motion is None or is_by_chance(left_xyz, right_xyz, motion, max_error_rad):
         return no_motion
-    return TwoView(inliers, *motion)
+    inliers = search.errors(motion) <= max_error_rad
+    return TwoView(inliers, *motion) if inliers.sum() >= _MIN_INLIERS else no_motion
+
+
+def motion_errors(left_xyz: Floats, right_xyz: Floats, motion: Motion) -> Floats:
+    """Return the angular error of matches under a motion.
+
+    Args:
+        left_xyz: ``(m, 3)`` unit vectors.
+        right_xyz: ``(m, 3)`` unit vectors.
+        motion: The motion.
+
+    Returns:
+        ``(m,)`` radians: the larger of the angle between the right direction and the arc of the
+        left one, and the angle between the left direction and the arc of the right one.
+    """
+    rotation, translation = motion
+    ahead = left_xyz @ rotation.T
+    if translation is None:
+        return angles_between(ahead, right_xyz)
+    return np.maximum(
+        _arc_angles(right_xyz, ahead, translation), _arc_angles(ahead, right_xyz, -translation)
+    )
+
+
+def _arc_angles(points_xyz: Floats, starts_xyz: Floats, end_xyz: Floats) -> Floats:
+    """Return angles between points and the shorter arcs from ``(m, 3)`` starts to one end."""
+    normals = np.cross(starts_xyz, end_xyz)
+    sines = np.linalg.norm(normals, axis=1)
+    across = np.abs((points_xyz * normals).sum(axis=1)) / np.maximum(sines, 1e-300)
+    # A point is nearest to the inside of the arc, or to one of its ends.
+    after_start = (points_xyz * np.cross(normals, starts_xyz)).sum(axis=1) >= 0
+    before_end = (points_xyz * np.cross(end_xyz, normals)).sum(axis=1) >= 0
+    ends = np.minimum(angles_between(points_xyz, starts_xyz), angles_between(points_xyz, end_xyz))
+    beside = after_start & before_end & (sines > 0)
+    return np.where(beside, np.arcsin(np.minimum(across, 1.0)), ends)
+
+
+def is_by_chance(left_xyz: Floats, right_xyz: Floats, motion: Motion, max_error_rad: float) -> bool:
+    """Return True if a motion with as many inliers is expected by chance.
+
+    The expected number of such motions is ``(m − s) · C(m, k) · C(k, s) · pᵏ⁻ˢ`` (Moisan and Stival
+    2004, equation 6; the criterion of OpenMVG, which the paper used). It has m matches, k inliers,
+    the sample size s, and the share p of wrong matches that fit the motion. A motion is significant
+    if the number is below 1. p is measured on directions that were not matched with each other, so
+    that it takes the density of keypoints into account.
+
+    Args:
+        left_xyz: ``(m, 3)`` unit vectors.
+        right_xyz: ``(m, 3)`` unit vectors.
+        motion: The motion.
+        max_error_rad: Largest error of an inlier.
+    """
+    m, s = len(left_xyz), motion.sample
+    k = int((motion_errors(left_xyz, right_xyz, motion) <= max_error_rad).sum())
+    if k <= s:
+        return True
+    shifts = np.unique(np.linspace(1, m - 1, _SHIFTS).astype(np.int64))
+    wrong = [motion_errors(left_xyz, np.roll(right_xyz, n, axis=0), motion) for n in shifts]
+    share = max(float(np.mean(np.array(wrong) <= max_error_rad)), math.sin(max_error_rad / 2) ** 2)
+    choices = math.log(m - s) + math.log(math.comb(m, k)) + math.log(math.comb(k, s))
+    return choices + (k - s) * math.log(share) > 0
+
+
+def prefers_rotation(general_errors: Floats, rotation_errors: Floats, max_error_rad: float) -> bool:
+    """Return True if a rotation explains the matches, by Torr's criterion GRIC (1998).
+
+    ``Σ min(e²/σ², 2 (4 − d)) + n d ln 4 + k ln 4n`` is compared, over the matches that fit one of
+    the two: d = 3, k = 5 for a general motion, d = 2, k = 3 for a rotation. The smaller value wins.
+    σ is estimated from the median of the general motion's errors.
+
+    Args:
+        general_errors: ``(m,)`` radians.
+        rotation_errors: ``(m,)`` radians.
+        max_error_rad: Largest error of an inlier.
+    """
+    fits = general_errors <= max_error_rad
+    if not fits.any():
+        return True
+    sigma = max(1.4826 * float(np.median(general_errors[fits])), _PRECISION_RAD)
+    either = fits | (rotation_errors <= max_error_rad)
+    n, costs = int(either.sum()), []
+    for errors, d, k in ((general_errors, 3, 5), (rotation_errors, 2, 3)):
+        misfit = np.minimum((errors[either] / sigma) ** 2, 2 * (4 - d)).sum()
+        costs.append(float(misfit + n * d * math.log(4) + k * math.log(4 * n)))
+    return costs[1] < costs[0]
 
 
 @dataclass(frozen=True)
@@ -159,10 +267,14 @@ class _Search:
         for number in np.random.SeedSequence(self.seed).generate_state(_STARTS) % 2**31:
             options.random_seed = int(number)
             start = pycolmap.estimate_relative_pose(left, right, options)
-            # COLMAP selects among the four motions of an essential matrix by counting points in
-            # front of both cameras, which is unreliable if rays are nearly parallel.
-            twins = [] if start is None else _twins(_motion(start["cam2_from_cam1"]))
-            found += [self._refined(twin, refit) for twin in twins]
+            if start is not None:
+                rotation, t = _motion(start["cam2_from_cam1"])
+                # COLMAP selects among the four motions of an essential matrix (Hartley and
+                # Zisserman, result 9.19) by counting points in front of both cameras, which is
+                # unreliable if rays are nearly parallel.
+                twin = (2 * np.outer(t, t) - np.eye(3)) @ rotation
+                motions = [Motion(r, sign * t) for r in (rotation, twin) for sign in (1, -1)]
+                found += [self._refined(motion, refit) for motion in motions]
         return min(found, key=self.cost, default=None)
 
     def rotation(self) -> Motion | None:
@@ -170,14 +282,14 @@ class _Search:
         rng = np.random.default_rng(self.seed)
         pairs = rng.integers(0, len(self.left_xyz), (_DRAWS, 2))
         # A rotation keeps the angle between two directions; parallel ones do not determine it.
-        apart = [
+        apart, other = (
             np.linalg.norm(np.diff(rays[pairs], axis=1)[:, 0], axis=-1)
             for rays in (self.left_xyz, self.right_xyz)
-        ]
-        same = np.abs(apart[0] - apart[1]) < 2 * self.max_error_rad
-        wide = apart[0] > 10 * self.max_error_rad
-        wide &= apart[0] < 2 * math.cos(5 * self.max_error_rad)
-        chosen = pairs[same & wide][:_HYPOTHESES]
+        )
+        usable = np.abs(apart - other) < 2 * self.max_error_rad
+        usable &= apart > 10 * self.max_error_rad
+        usable &= apart < 2 * math.cos(5 * self.max_error_rad)
+        chosen = pairs[usable][:_HYPOTHESES]
         if not len(chosen):
             return None
         rotations = _rotations(self.left_xyz[chosen], self.right_xyz[chosen])
@@ -227,21 +339,12 @@ def rigid_matrix(rotation: Floats, translation: Floats | None) -> Floats:
     return np.column_stack([axes @ rotation @ axes.T, shift])
 
 
-def _motion(cam2_from_cam1: Any) -> Motion:
+def _motion(cam2_from_cam1: Any) -> Any:
     """Convert a motion from COLMAP's axes to those of `tangent_train.geometry`."""
     axes = _CAMERA_FROM_PANORAMA
     translation = axes.T @ cam2_from_cam1.translation
     rotation = axes.T @ cam2_from_cam1.rotation.matrix() @ axes
     return Motion(rotation, translation / np.linalg.norm(translation))
-
-
-def _twins(start: Motion) -> list[Motion]:
-    """Return the four motions of an essential matrix (Hartley and Zisserman, result 9.19)."""
-    rotation, t = start
-    if t is None:
-        return [start]
-    half_turn = 2 * np.outer(t, t) - np.eye(3)
-    return [Motion(r, sign * t) for r in (rotation, half_turn @ rotation) for sign in (1, -1)]
 
 
 def _rotations(left_xyz: Floats, right_xyz: Floats) -> Floats:

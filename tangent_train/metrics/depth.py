@@ -15,20 +15,20 @@ images that have it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import Literal, get_args
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from pydantic import Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor
 from torchmetrics.utilities import dim_zero_cat
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.segmentation import (
+from tangent_train.metrics.scores import (
     BAND_EDGES_DEG,
     ImagesMetric,
     Interval,
@@ -36,7 +36,6 @@ from tangent_train.metrics.segmentation import (
     bootstrap,
     defined_mean,
 )
-from tangent_train.rendering.checks import check_choice
 
 Alignment = Literal["none", "median", "scale", "affine"]
 """Alignment of a prediction with the true distances of the image: ``median`` and ``scale`` multiply
@@ -62,27 +61,13 @@ class DepthProtocol:
         min_distance: Pixels with a smaller true distance, in meters, are ignored.
         max_distance: Pixels with a larger true distance, in meters, are ignored; None for no limit.
         clip: True to clip aligned predictions to these distances.
-
-    Raises:
-        SettingError: A setting is invalid.
     """
 
     alignment: Alignment = "none"
     alignment_in: Quantity = "distance"
-    min_distance: float = 0.0
+    min_distance: Annotated[float, Field(ge=0)] = 0.0
     max_distance: float | None = None
     clip: bool = False
-
-    def __post_init__(self) -> None:
-        check_choice("task.head.alignment", self.alignment, get_args(Alignment))
-        check_choice("task.head.alignment_in", self.alignment_in, get_args(Quantity))
-        if self.min_distance < 0:
-            raise SettingError(
-                "task.head.min_distance", found=self.min_distance, expected="0 or more"
-            )
-        if self.max_distance is not None and self.max_distance <= self.min_distance:
-            expected = f"more than task.head.min_distance={self.min_distance}, or null"
-            raise SettingError("task.head.max_distance", found=self.max_distance, expected=expected)
 
     @property
     def facts(self) -> dict[str, str]:
@@ -172,12 +157,7 @@ def error_sums(
     Returns:
         ``(8, 10)`` float64 sums by weighting: pixels, solid angles, and pixels of the latitude
         bands `BAND_EDGES_DEG`; the last seven are 0 for photos. See `depth_scores`.
-
-    Raises:
-        SettingError: The shapes differ.
     """
-    if prediction.shape != truth.shape:
-        raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
     known = truth > 0  # False for NaN
     predicted = known & (prediction > 0) & prediction.isfinite()
     d, g = (torch.where(predicted, x, 1.0).double() for x in (prediction, truth))

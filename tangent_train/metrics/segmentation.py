@@ -1,9 +1,7 @@
-"""Segmentation: one confusion matrix over the data set, and scores computed from it."""
+"""Classes: confusion matrices over the data set, of pixels or of images, and their scores."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -11,11 +9,12 @@ import torch
 from jaxtyping import Float, Integer
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torchmetrics import Metric
+from torchmetrics.classification import MulticlassConfusionMatrix
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.scores import BAND_EDGES_DEG, ImagesMetric, band_of_rows, defined_mean
 
 AbsentClass = Literal["skip", "zero"]
 """Treatment of a class without labeled pixels: left out of means, or counted as 0."""
@@ -23,42 +22,20 @@ AbsentClass = Literal["skip", "zero"]
 UNKNOWN = 0
 """Class index of unlabeled pixels in all data sets."""
 
-BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
-"""Edges of the latitude bands, from north to south. A row whose center is on an edge belongs to the
-northern band."""
-
-Interval = tuple[float, float]
-"""Lower and upper end of a score, shares of 1."""
-
-_DRAWS_AT_ONCE = 100
-
 
 class SegmentationScores(NamedTuple):
     """Scores of one confusion matrix; classes in order, the unknown class left out.
 
     Attributes:
-        miou: Mean of `iou`.
-        macc: Mean of `accuracy`.
-        iou: ``(K,)`` intersection over union; NaN for absent classes that are skipped.
-        accuracy: ``(K,)`` share of each class's pixels that were predicted correctly.
+        means: Scores over all classes, ``miou`` and ``macc``: the means of those of classes.
+        of_classes: ``(K,)`` intersection over union (``iou``), and share of the pixels of a class
+            that were predicted correctly (``accuracy``); NaN for absent classes that are skipped.
         share: ``(K,)`` each class's share of the labeled pixels.
     """
 
-    miou: float
-    macc: float
-    iou: NDArray[np.float64]
-    accuracy: NDArray[np.float64]
+    means: dict[str, float]
+    of_classes: dict[str, NDArray[np.float64]]
     share: NDArray[np.float64]
-
-    @property
-    def means(self) -> dict[str, float]:
-        """Scores over all classes by name."""
-        return {"miou": self.miou, "macc": self.macc}
-
-    @property
-    def of_classes(self) -> dict[str, NDArray[np.float64]]:
-        """Scores of the classes by name."""
-        return {"iou": self.iou, "accuracy": self.accuracy}
 
 
 def segmentation_scores(
@@ -76,11 +53,9 @@ def segmentation_scores(
         The scores; means are NaN if no pixel is labeled and absent classes are skipped.
     """
     sums = np.stack(_class_sums(np.asarray(confusion, np.float64)))
-    iou, accuracy = _class_scores(sums, absent_class)
-    truth = sums[0]
-    share = truth / truth.sum() if truth.any() else np.zeros_like(truth)
-    miou, macc = float(defined_mean(iou)), float(defined_mean(accuracy))
-    return SegmentationScores(miou, macc, iou, accuracy, share)
+    means = {name: float(score) for name, score in mean_scores(sums, absent_class).items()}
+    share = sums[0] / max(sums[0].sum(), 1e-300)
+    return SegmentationScores(means, _class_scores(sums, absent_class), share)
 
 
 def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
@@ -91,89 +66,23 @@ def _class_sums(confusion: Any) -> tuple[Any, Any, Any]:
 
 def _class_scores(
     sums: NDArray[np.float64], absent_class: AbsentClass
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+) -> dict[str, NDArray[np.float64]]:
     """Return IoU and accuracy ``(..., K)``, given the sums ``(..., 3, K)``."""
     truth, predicted, hits = np.moveaxis(sums, -2, 0)
     missing = np.nan if absent_class == "skip" else 0.0
-    iou = hits / np.maximum(truth + predicted - hits, 1e-300)
-    accuracy = hits / np.maximum(truth, 1e-300)
-    return np.where(truth > 0, iou, missing), np.where(truth > 0, accuracy, missing)
-
-
-def defined_mean(scores: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the mean over the last axis without NaN; NaN if all values are NaN."""
-    count = np.sum(~np.isnan(scores), axis=-1)
-    total = np.nansum(scores, axis=-1)
-    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+    areas = {"iou": truth + predicted - hits, "accuracy": truth}
+    return {
+        name: np.where(truth > 0, hits / np.maximum(area, 1e-300), missing)
+        for name, area in areas.items()
+    }
 
 
 def mean_scores(
     sums: Float[np.ndarray, "*some 3 classes"], absent_class: AbsentClass = "skip"
-) -> dict[str, Any]:
+) -> dict[str, NDArray[np.float64]]:
     """Return mIoU and mAcc, given labeled area, predicted area and hits of each class."""
-    scores = zip(("miou", "macc"), _class_scores(sums, absent_class), strict=True)
-    return {name: defined_mean(of_classes) for name, of_classes in scores}
-
-
-def bootstrap_intervals(
-    of_images: Float[np.ndarray, "images 3 classes"],
-    absent_class: AbsentClass = "skip",
-    draws: int = 1000,
-    seed: int = 0,
-) -> dict[str, Interval]:
-    """Compute 95 % percentile bootstrap intervals of mIoU and mAcc, with images as the unit.
-
-    Each draw samples as many images as there are, with replacement, and scores them as one data set
-    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The result does not
-    depend on the order of the images or the number of processes.
-
-    Args:
-        of_images: The half of `SegmentationCounts.of_images` for pixels or for solid angles.
-        absent_class: Treatment of classes absent from the ground truth of a draw.
-        draws: Number of draws.
-        seed: Seed of the draws.
-
-    Returns:
-        Intervals of ``miou`` and ``macc``; empty for a single image, or without labeled pixels.
-    """
-    return bootstrap(of_images, partial(mean_scores, absent_class=absent_class), draws, seed)
-
-
-def bootstrap(
-    of_images: Float[np.ndarray, "images ..."],
-    score: Callable[[NDArray[np.float64]], Mapping[str, NDArray[np.float64]]],
-    draws: int = 1000,
-    seed: int = 0,
-) -> dict[str, Interval]:
-    """Compute 95 % percentile bootstrap intervals of scores, see `bootstrap_intervals`.
-
-    Args:
-        of_images: Numbers of each image from whose sums the scores follow.
-        score: Function that returns scores ``(draws,)`` by name, given sums ``(draws, …)``.
-        draws: Number of draws.
-        seed: Seed of the draws.
-
-    Returns:
-        Intervals by name; empty for a single image. Undefined scores have no interval.
-    """
-    count = len(of_images)
-    if count <= 1:
-        return {}
-    flat = of_images.reshape(count, -1)
-    flat = flat[np.lexsort(flat.T)]
-    generator = np.random.default_rng(seed)
-    drawn = []
-    for start in range(0, draws, _DRAWS_AT_ONCE):
-        size = min(_DRAWS_AT_ONCE, draws - start)
-        times = generator.multinomial(count, np.full(count, 1 / count), size=size)
-        drawn.append(times.astype(np.float64) @ flat)
-    sums = np.concatenate(drawn).reshape(draws, *of_images.shape[1:])
-    intervals = {}
-    for name, means in score(sums).items():
-        if not np.isnan(means).all():
-            low, high = np.nanquantile(means, (0.025, 0.975))
-            intervals[name] = (float(low), float(high))
-    return intervals
+    scores = _class_scores(sums, absent_class)
+    return {"miou": defined_mean(scores["iou"]), "macc": defined_mean(scores["accuracy"])}
 
 
 class SegmentationCounts(NamedTuple):
@@ -207,10 +116,8 @@ def count_image(
         The counts as tensors.
 
     Raises:
-        SettingError: The shapes differ, or a class index is out of range.
+        SettingError: A class index is out of range.
     """
-    if prediction.shape != truth.shape:
-        raise SettingError("prediction", found=tuple(prediction.shape), expected=tuple(truth.shape))
     known, k = truth != UNKNOWN, num_classes
     pairs = _checked(truth[known], k) * k + _checked(prediction[known], k)
     bands = pairs.new_zeros((len(BAND_EDGES_DEG) - 1, k, k))
@@ -228,37 +135,6 @@ def count_image(
         steradians = torch.zeros_like(pixels, dtype=torch.float64)
     sums = [torch.stack(_class_sums(matrix.double())) for matrix in (pixels, steradians)]
     return SegmentationCounts(pixels, steradians, bands, torch.stack(sums)[None])
-
-
-def band_of_rows(height: int) -> NDArray[np.intp]:
-    """Return the index of the latitude band of each row of a panorama, see `BAND_EDGES_DEG`."""
-    # In degrees, with the division last, so that a row on an edge has no rounding error.
-    southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
-    return np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
-
-
-class ImagesMetric(Metric):
-    """Collects numbers of each image of a data set, on all processes.
-
-    Args:
-        *shape: Shape of the numbers of an image.
-    """
-
-    full_state_update = False
-    of_images: list[Tensor]
-
-    def __init__(self, *shape: int) -> None:
-        super().__init__()
-        self._shape = shape
-        self.add_state("of_images", [], dist_reduce_fx="cat")
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all images."""
-        super().reset()
-        # Processes without images contribute an empty part of the same dtype and shape.
-        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
-        self.of_images = [empty]
 
 
 class SegmentationMetric(ImagesMetric):
@@ -306,3 +182,45 @@ def _checked(indices: Tensor, num_classes: int) -> Tensor:
             "class index", found=f"{least} to {greatest}", expected=f"0 to {num_classes - 1}"
         )
     return indices.long()
+
+
+class ClassificationScores(NamedTuple):
+    """Scores of one confusion matrix.
+
+    Attributes:
+        accuracy: Share of images that were classified correctly.
+        class_accuracy: Mean of `of_class`, in which all classes have the same weight.
+        of_class: ``(K,)`` share of each class's images that were classified correctly; NaN for
+            classes that do not occur, which are left out of the mean.
+        counts: ``(K,)`` number of images of each class.
+    """
+
+    accuracy: float
+    class_accuracy: float
+    of_class: NDArray[np.float64]
+    counts: NDArray[np.int64]
+
+
+def classification_scores(confusion: ArrayLike) -> ClassificationScores:
+    """Compute classification scores of a whole data set.
+
+    Args:
+        confusion: ``(K, K)`` counts; rows are the true classes, columns the predicted ones.
+
+    Returns:
+        The scores; NaN without images.
+    """
+    matrix = np.asarray(confusion, np.int64)
+    counts, hits = matrix.sum(axis=1), matrix.diagonal()
+    of_class = np.where(counts > 0, hits / np.maximum(counts, 1), np.nan)
+    accuracy = float(hits.sum() / counts.sum()) if counts.any() else np.nan
+    return ClassificationScores(accuracy, float(defined_mean(of_class)), of_class, counts)
+
+
+class ClassificationMetric(MulticlassConfusionMatrix):
+    """Counts images in a confusion matrix ``(K, K)``, summed over processes."""
+
+    def compute(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """Return the matrix of all processes; rows are the true classes."""
+        counts: NDArray[np.int64] = super().compute().cpu().numpy()
+        return counts

@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.loaded import (

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid, checked_rotation
-from tangent_train.geometry.pinhole_grid import Faces
+from tangent_train.geometry.grids import Faces
 from tangent_train.rendering.checks import check_panorama
 from tangent_train.rendering.sampling import (
     EquirectMap,

@@ -18,8 +18,7 @@ from pydantic import TypeAdapter
 
 from tangent_train.errors import DataError, counted
 from tangent_train.files import csv_text, read_json, write_text
-from tangent_train.metrics.score_columns import SOLID_ANGLE, ScoreColumn
-from tangent_train.metrics.segmentation import BAND_EDGES_DEG, Interval
+from tangent_train.metrics.scores import BAND_EDGES_DEG, SOLID_ANGLE, Interval, ScoreColumn
 from tangent_train.results.tables import Table, score_text
 
 if TYPE_CHECKING:

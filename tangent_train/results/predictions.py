@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from datamodules.core.label_map import UNKNOWN_NAME
 from tangent_train.errors import counted
 from tangent_train.files import csv_text, write_text
+from tangent_train.heads.base import PICTURES
 from tangent_train.io.image_files import composed
 from tangent_train.io.videos import write_video
 from tangent_train.results.page import EncodedImage, encode_image, write_report
@@ -21,10 +22,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from tangent_train.heads.base import Head, Painter, PredictedImage
+    from tangent_train.heads.base import Head, PredictedImage
     from tangent_train.io.inputs import Job, Video
-
-_PICTURES = ("color", "overlay")  # of the frames of a video: videos
 
 Entry = dict[str, Any]
 """Entry of an image: name, file, rows, columns and its summary, or name and error."""
@@ -61,8 +60,8 @@ class PredictionFolder:
     def files(self, job: Job) -> dict[str, Path]:
         """Return the files of an image by kind; the pixels of frames become videos of pictures."""
         kinds = set(self.kinds)
-        if job.is_frame and kinds.intersection(_PICTURES):
-            kinds = kinds.difference(_PICTURES) | {self.head.source}
+        if job.is_frame and kinds.intersection(PICTURES):
+            kinds = kinds.difference(PICTURES) | {self.head.source}
         return {kind: self._file(kind, job.name) for kind in kinds}
 
     def _file(self, kind: str, name: str) -> Path:
@@ -82,14 +81,16 @@ class PredictionFolder:
         """
         frames = {number: frame for frame, number in video.frames.items()}
 
-        def painted(paint: Painter, number: int, rgb: NDArray[Any]) -> NDArray[Any]:
-            return paint(rgb, self.head.read(self._file(self.head.source, frames[number])))
+        limits = self.head.limits([entry[self.head.summary] for entry in entries])
 
-        for kind in _PICTURES:
+        def painted(kind: str, number: int, rgb: NDArray[Any]) -> Any:
+            pixels = self.head.read(self._file(self.head.source, frames[number]))
+            return self.head.paint(kind, rgb, pixels, limits)
+
+        for kind in PICTURES:
             file = self.path / kind / f"{name}.mp4"
             if kind in self.kinds and not file.exists():
-                paint = self.head.painter(kind, [entry[self.head.summary] for entry in entries])
-                write_video(file, video.path, video.size, partial(painted, paint), every)
+                write_video(file, video.path, video.size, partial(painted, kind), every)
 
     def write_summary(self, settings: Mapping[str, Any], entries: Sequence[Entry]) -> None:
         """Write ``summary.json``, ``summary.csv`` and, for labels, ``classes.json``.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from tangent_train.files import csv_text, write_bytes, write_text
-from tangent_train.metrics.score_columns import SOLID_ANGLE
+from tangent_train.metrics.scores import SOLID_ANGLE
 from tangent_train.results.chart import report_png
 from tangent_train.results.evaluation import EvaluationResult
 from tangent_train.results.published import published_rows

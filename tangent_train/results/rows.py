@@ -15,8 +15,7 @@ from statistics import fmean, stdev
 from typing import Any, NamedTuple
 
 from tangent_train.errors import DataError
-from tangent_train.metrics.score_columns import SOLID_ANGLE
-from tangent_train.metrics.segmentation import Interval
+from tangent_train.metrics.scores import SOLID_ANGLE, Interval
 from tangent_train.results.evaluation import RESULTS_FILE, Band, EvaluationResult
 
 Part = str | Band | None

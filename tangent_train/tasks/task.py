@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
-from datamodules.core.samples import EvaluationSample, valid_mask
+from datamodules.core.dataset import Sample, valid_mask
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.heads import Head
@@ -364,8 +364,8 @@ class PixelTask(Task):
         """Add a batch of panoramas or photos to `metric`; return the predictions."""
         predictions = []
         for fields in zip(*batch, strict=True):
-            sample: EvaluationSample[Tensor] = EvaluationSample(*fields)
-            truth, lengths = self.head.truth(sample.target), None
+            sample: Sample[Tensor] = Sample(*fields)
+            truth, lengths = self.head.truth(sample.labels), None
             if truth.ndim == 2:
                 where = sample.rotation.cpu().numpy(), valid_mask(sample.valid)
                 predicted = self.predict_panorama(sample.images, tuple(truth.shape), *where, truth)
@@ -444,12 +444,12 @@ class ShapeTask(Task):
 
     def training_pairs(self, batch: Any) -> tuple[Tensor, Tensor]:
         """Return the views ``(B, N, C, h, w)`` and classes ``(B,)`` of shapes."""
-        return batch.images, batch.target
+        return batch.images, batch.labels
 
     def evaluate(self, batch: Any) -> Tensor:
         """Add a batch of shapes to `metric`; return the predictions ``(B,)``."""
         logits = self(batch.images)
-        self.add_validation_loss(logits, batch.target)
+        self.add_validation_loss(logits, batch.labels)
         prediction = logits.argmax(dim=1)
-        self.metric.update(prediction, batch.target)
+        self.metric.update(prediction, batch.labels)
         return prediction

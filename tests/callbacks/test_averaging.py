@@ -68,7 +68,7 @@ def test_checkpoints_hold_the_average_and_the_weights_to_go_on_with(
         SmallNetwork(statistics=True), optimizer=partial(torch.optim.Adam, lr=0.03)
     )
     average = EMAWeightAveraging(decay=DECAY)
-    best = BestCheckpoint(tmp_path, "val/class_accuracy")
+    best = BestCheckpoint(tmp_path, "val/class_accuracy", "max")
     contents = CheckpointContents({"config": {}})
     quiet_trainer(
         max_epochs=3,

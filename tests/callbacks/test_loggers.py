@@ -20,8 +20,8 @@ from tensorboard.backend.event_processing.event_accumulator import (  # type: ig
 )
 from torch import nn
 
+from datamodules.core.dataset import render_inputs
 from datamodules.core.inputs import normalize
-from datamodules.core.samples import render_inputs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.callbacks.pictures import log_image
 from tangent_train.cli.run import Run
@@ -31,7 +31,6 @@ from tangent_train.tasks import PixelTask
 from tests.decoded import decoded
 from tests.running import composed_settings
 from tests.tasks.builders import predict_labels, segmentation_task
-from tests.tasks.shapes import Shapes, shape_task
 
 TANGENT = TangentRepresentation(base_level=0, level=4, faces_per_panorama=5)
 STEPS = 3  # of an epoch: 6 panoramas, 2 at a time
@@ -223,18 +222,3 @@ def test_the_validation_loss_is_that_of_all_views_normalized_as_in_training(
         total -= float((chosen[:, 0].numpy() * weights).sum())
         norm += float(weights.sum())
     assert _of_csv(folder)["val/loss"][-1][1] == pytest.approx(total / norm, rel=1e-5)
-
-
-def test_shapes_have_accuracies_and_no_unknown_class(tmp_path: Path) -> None:
-    task: Any = shape_task()
-    _fit(tmp_path, Shapes(), task, "logger=csv", "validation_images=0")
-    scalars = _of_csv(tmp_path)
-    of_classes = [scalars[f"val_accuracy/{name}"] for name in task.head.class_names]
-    assert [step for step, _ in of_classes[0]] == VALIDATIONS
-    mean = np.mean([values[-1][1] for values in of_classes])
-    assert mean == pytest.approx(scalars["val/class_accuracy"][-1][1], rel=1e-6)
-    images = torch.stack([shape.images for shape in Shapes().shapes])
-    labels = torch.stack([shape.target for shape in Shapes().shapes])
-    with torch.no_grad():
-        loss = torch.nn.functional.cross_entropy(task.network(images), labels)
-    assert scalars["val/loss"][-1][1] == pytest.approx(float(loss), rel=1e-5)

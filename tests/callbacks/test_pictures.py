@@ -41,10 +41,10 @@ def test_the_panoramas_of_the_panels_are_kept_for_the_report(tmp_path: Path) -> 
     representation: Any = None
     task = segmentation_task(nn.Identity(), representation, NAMES, partial(torch.optim.SGD, lr=1))
     for first in range(0, 10, 2):
-        target = torch.ones((2, *SHAPE), dtype=torch.uint8)
-        prediction = target.clone().long()
+        labels = torch.ones((2, *SHAPE), dtype=torch.uint8)
+        prediction = labels.clone().long()
         prediction.flatten(1)[:, 0] = 2
-        batch = SimpleNamespace(index=torch.tensor([first, first + 1]), target=target)
+        batch = SimpleNamespace(index=torch.tensor([first, first + 1]), labels=labels)
         panels.on_test_batch_end(trainer, task, prediction, batch, first // 2)
     panels.on_test_end(trainer, task)
     chosen = (0, 3, 6, 9)

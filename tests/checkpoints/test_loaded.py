@@ -17,6 +17,7 @@ from tangent_train.checkpoints.loaded import (
     declared_sizes,
     load_network,
 )
+from tangent_train.checkpoints.outputs import plain_output
 from tangent_train.errors import DataError
 from tests.tasks.small_networks import save_checkpoint
 
@@ -43,7 +44,9 @@ def test_a_network_computes_what_its_task_does(
     assert trained.inputs == (("rgb", "depth") if "network=unet" in overrides else ("rgb",))
     images = torch.randn(2, trained.in_channels, *size)
     with torch.no_grad():
-        torch.testing.assert_close(trained.network(images), task(images), rtol=0, atol=0)
+        torch.testing.assert_close(
+            trained.network(images), plain_output(task(images)), rtol=0, atol=0
+        )
     assert not any(module.training for module in trained.network.modules())
     assert trained.image_size == size
     assert (trained.size_multiple, trained.fixed_size) == (multiple, None)
@@ -95,9 +98,9 @@ def _network(**settings: Any) -> dict[str, Any]:
         ),
         ({"settings": {"_target_": "os.system"}}, r"network\._target_=?.*os\.system"),
         ({"settings": _network(widths=[])}, r"network cannot be built"),
-        ({"representation": None}, r".*representation: Input should be"),
-        ({"depth_kind": "inverse"}, r".*depth_kind: Input should be"),
-        ({"unknown": 1}, r".*unknown: Unexpected"),
+        ({"representation": None}, r".*representation=null, not a valid dict"),
+        ({"depth_kind": "inverse"}, r".*depth_kind=inverse, not "),
+        ({"unknown": 1}, r".*unknown=1, not a known setting"),
     ],
 )
 def test_files_that_cannot_be_loaded_are_explained(
@@ -115,7 +118,7 @@ def test_files_that_cannot_be_loaded_are_explained(
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (None, "no such file"),
+        (None, "No such file"),
         (b"not a checkpoint", r"a damaged file, or not a file of torch\.save"),
         ({"state_dict": {}}, "no description of a network"),
         ([1, 2], "no description of a network"),

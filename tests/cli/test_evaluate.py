@@ -147,7 +147,7 @@ def test_the_network_estimates_the_up_direction(
         max_tilts.append(max_tilt_deg)
         return np.array([0.0, 0, -1])
 
-    monkeypatch.setattr("datamodules.core.panorama_module.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.image_module.estimate_up", estimate)
     given = [*ROOMS, "data.upright=auto", "data.max_tilt_deg=180", "data.num_workers=1", rooms]
     mapped = _written(tmp_path / "map.json", MAP)
     run("evaluate", network, *given, mapped, "hydra.run.dir=imported")

@@ -163,7 +163,6 @@ def test_relative_depth_is_marked(
         ({"min_confidence": 0.5}, "min_confidence: found 0.5; expected 0: nothing reads it"),
         ({"upright": "auto"}, "upright: found auto; expected pose or null"),
         ({"write": "[labels,color]"}, "write: found labels; expected depth, color, points for"),
-        ({"points": 0, "write": "[points]"}, "points: found 0; expected an integer of 1 or more"),
         ({"points": 9}, "points: found 9; expected null: nothing reads it"),
         ({"depth": "."}, "depth: found .*takes rgb"),
         ({"write": "[points]", "checkpoint": None}, "write: found points; expected labels, color"),

@@ -336,7 +336,6 @@ _IN = {"input": "in", "output": "tan"}
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
         ({"input": "in"}, "output: found null"),
-        ({**_IN, "faces": [80]}, "80"),
         ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},

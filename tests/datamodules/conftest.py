@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthrooms.generate import RoomSettings, generate_rooms
+from datamodules.synthrooms.datamodule import RoomSettings, generate_rooms
 from datamodules.synthshapes import ShapeSettings, generate_shapes
 from tangent_train.rendering import EquirectRepresentation
 

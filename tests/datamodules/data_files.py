@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datamodules.core.data_module import DataModule
-from datamodules.core.splits import Split
+from datamodules.core.files import Split
 from tangent_train.rendering.resampling import resize
 
 GPANO_TAGS = {

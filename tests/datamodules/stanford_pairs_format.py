@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
+from datamodules.stanford2d3ds.files import euler_angles
 from datamodules.stanford2d3ds.pairs import published_pairs
-from datamodules.synthrooms.camera import euler_angles
 from tangent_train.geometry import rotation_about
 from tests.datamodules.data_files import write_png
 

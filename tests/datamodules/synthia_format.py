@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from datamodules.core.problems import Problems
+from datamodules.core.files import Problems
 from datamodules.synthia.generate import make_panoramas
 from tests.datamodules.data_files import write_png
 

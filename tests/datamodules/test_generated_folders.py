@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from datamodules.synthrooms.datamodule import SynthRooms
-from datamodules.synthrooms.generate import generate_rooms
+from datamodules.synthrooms.datamodule import SynthRooms, generate_rooms
 from datamodules.synthshapes import SynthShapes, generate_shapes
 from tangent_train.errors import DataError, SettingError
+from tangent_train.manifest import Manifest, Shard
 from tangent_train.rendering import TangentRepresentation
 from tests.datamodules.conftest import TINY_ROOMS, TINY_SHAPES
 from tests.datamodules.data_files import contents, names_of
@@ -39,6 +39,14 @@ def test_folders_of_other_settings_are_left_alone(tiny_rooms: Path, tiny_shapes:
         assert contents(root) == before
 
 
+def test_two_parts_begun_at_once_have_the_same_settings(tmp_path: Path) -> None:
+    """Refused before the first shape is written."""
+    Manifest.open(tmp_path, {"generator": "SynthShapes"}, is_shared=True)
+    with pytest.raises(SettingError, match="expected null"):
+        generate_shapes(tmp_path, TINY_SHAPES)
+    assert [path.name for path in tmp_path.iterdir()] == ["manifest.json"]
+
+
 @pytest.mark.parametrize("module", [SynthRooms, SynthShapes])
 def test_data_are_generated_then_read_like_the_real_set(
     module: type[SynthRooms | SynthShapes], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -48,7 +56,7 @@ def test_data_are_generated_then_read_like_the_real_set(
     data = module(tmp_path / "data", TangentRepresentation(0, 2), val_fraction=0.5, **settings)
     with pytest.raises(DataError):
         data.setup()
-    data.prepare_data()
+    assert data.prepare(Shard(1, 2)) < data.prepare(Shard()), "a part needs all files"
     names = {split: names_of(data, split) for split in ("train", "val", "test")}
     assert all(names.values())
     assert all(("area_5" in name) or ("/test/" in name) for name in names["test"])

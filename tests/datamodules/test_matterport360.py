@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.matterport360 import CLASSES, Matterport360
 from datamodules.tables import read_table
 from tangent_train.errors import DataError
@@ -92,5 +92,5 @@ def test_missing_scenes_and_counts_are_reported(root: Path, erp: Any, tmp_path: 
     assert missing[0].startswith("59 of 61 scenes of train are missing, such as 1LXtFkjw3qL")
     assert counts == "found 4 train, 2 val, 4 test; published are 7829 train, 772 val, 2014 test"
     assert (count, problems.listed()) == (10, [])
-    with pytest.raises(DataError, match=r"no panoramas of release=360fv; expected <scene>/rgb"):
+    with pytest.raises(DataError, match=r"found no panoramas; .*Request Matterport3D"):
         Matterport360(tmp_path, erp).setup()

@@ -10,8 +10,8 @@ import pytest
 import torch
 import trimesh
 
-from datamodules.core.splits import SPLITS, Split
-from datamodules.modelnet40.meshes import clean_mesh, mesh_spheres, read_off
+from datamodules.core.files import SPLITS, Split
+from datamodules.modelnet40.meshes import mesh_spheres, read_mesh
 from datamodules.modelnet40.shapes import MODELNET40, STEPS, ModelNet40, find_shapes
 from tangent_train.errors import DataError
 from tangent_train.rendering import TangentRepresentation, equirect_to_tangent
@@ -100,8 +100,8 @@ def test_views_are_those_of_the_float_spheres(make_module: MakeModule, root: Pat
     """All six channels, against a rendering in float64 by the torch renderer."""
     module = make_module()
     batch = module.on_after_batch_transfer(next(iter(module.test_dataloader())), 0)
-    mesh = read_off(root / f"{module.dataset('test').name(3)}.off")
-    spheres = torch.from_numpy(mesh_spheres(clean_mesh(mesh), (16, 32))).movedim(-1, 0)
+    mesh = read_mesh(root / f"{module.dataset('test').name(3)}.off")
+    spheres = torch.from_numpy(mesh_spheres(mesh, (16, 32))).movedim(-1, 0)
     views = equirect_to_tangent(spheres, module.representation.grid)
     normalization: Any = module.normalization
     mean, std = torch.tensor([normalization.mean, normalization.std])[..., None, None]
@@ -140,7 +140,7 @@ def test_views_of_a_rotated_shape_are_views_of_its_rotated_mesh(
     for index in range(2):
         rotated = samples.shape_rotation(index)
         assert bool(rotated[2, 2] > 1 - 1e-12) is (rotation == "yaw")
-        mesh = clean_mesh(read_off(root / f"{module.dataset('test').name(index)}.off"))
+        mesh = read_mesh(root / f"{module.dataset('test').name(index)}.off")
         mesh.vertices = mesh.vertices @ rotated.T
         steps = np.rint(mesh_spheres(mesh, (64, 128)) * STEPS).astype(np.uint16)
         (views,) = representation.view_sets()

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation

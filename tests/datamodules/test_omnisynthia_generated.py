@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.core.problems import Problems
+from datamodules.core.files import Problems
 from datamodules.synthia.generate import make_panoramas
 from datamodules.synthia.reader import VIEWS
 from tangent_train.geometry import equirect_directions

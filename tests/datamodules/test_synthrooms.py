@@ -8,20 +8,20 @@ import cv2
 import numpy as np
 import pytest
 
-from datamodules.stanford2d3ds.files import UNKNOWN_CLASS
-from datamodules.synthrooms.camera import PanoramaRays, PerspectiveRays, Pose, euler_rotation
-from datamodules.synthrooms.datamodule import SynthRooms
-from datamodules.synthrooms.furniture import build_room, draw_room_type
-from datamodules.synthrooms.generate import (
+from datamodules.stanford2d3ds.files import UNKNOWN_CLASS, euler_rotation
+from datamodules.synthrooms.datamodule import (
     INSTANCES,
     RoomPlan,
+    SynthRooms,
     encode_picture,
     pose_record,
 )
+from datamodules.synthrooms.furniture import build_room, draw_room_type
 from datamodules.synthrooms.render import (
     MISSING,
     Picture,
     RayScene,
+    View,
     draw_camera,
     draw_holes,
     render_picture,
@@ -31,7 +31,7 @@ from tangent_train.errors import SettingError
 
 
 def test_impossible_settings_are_named() -> None:
-    with pytest.raises(SettingError, match=r"data\.rooms: found .*expected numbers of rooms"):
+    with pytest.raises(SettingError, match=r"data\.rooms: found .*expected '1', "):
         SynthRooms("rooms", rooms={"rooms": {"7": 1}})  # type: ignore[arg-type]
 
 
@@ -61,10 +61,10 @@ def test_every_class_covers_enough_pixels_in_enough_rooms(rooms: list[Room]) -> 
     missing = 0
     for room in rooms:
         scene = RayScene(room)
-        holes = draw_holes(room.rng, scene)
-        camera = draw_camera(room.rng, scene, room.plan, [])
-        view = PanoramaRays(Pose.looking(camera.location, camera.heading), 32)
-        items = render_picture(scene, view, camera, holes, 1, room.rng).items
+        holes = draw_holes(scene)
+        camera = draw_camera(scene)
+        view = View.looking(camera.location, 32, heading=camera.heading)
+        items = render_picture(scene, view, camera, holes, 1).items
         seen = Counter(room.items[k] for k in items[items != MISSING])
         pixels += seen
         present.update(seen.keys())
@@ -108,9 +108,9 @@ def test_pictures_survive_the_files() -> None:
 
 @pytest.mark.parametrize("panorama", [True, False])
 def test_poses_have_every_key_and_agree_with_themselves(panorama: bool) -> None:
-    original = Pose.looking(np.array([1.0, 2.0, 1.5]), 0.7)
-    rotated = Pose.looking(original.location, -1.2, 0.3, 0.1)
-    view = PanoramaRays(original, 64) if panorama else PerspectiveRays(rotated, 100, 1.0)
+    original = View.looking(np.array([1.0, 2.0, 1.5]), 64, heading=0.7)
+    photo = View.looking(original.location, 100, 1.0, heading=-1.2, pitch=0.3, roll=0.1)
+    view = original if panorama else photo
     frame = "equirectangular" if panorama else "4"
     record = pose_record(ROOMS[1], CAMERA, frame, view, original)
     assert record["camera_uuid"] == record["point_uuid"] == CAMERA

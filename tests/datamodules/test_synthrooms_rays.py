@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import (
-    PanoramaRays,
-    PerspectiveRays,
-    Pose,
-    draw_rays,
-    euler_angles,
-    euler_rotation,
-)
+from datamodules.stanford2d3ds.files import euler_angles, euler_rotation
 from datamodules.synthrooms.furniture import build_empty_room
-from datamodules.synthrooms.layout import FloorPlan
-from datamodules.synthrooms.render import MISSING, Camera, Holes, Picture, RayScene, render_picture
-from datamodules.synthrooms.room import Light, Room
+from datamodules.synthrooms.render import (
+    MISSING,
+    Camera,
+    Picture,
+    RayScene,
+    View,
+    draw_view,
+    render_picture,
+)
+from datamodules.synthrooms.room import FloorPlan, Light, Room
 from tangent_train.geometry import (
     equirect_directions,
     random_rotation,
@@ -28,7 +28,7 @@ from tangent_train.geometry import (
 
 SIZE = np.array([5.0, 4.0, 3.0])
 HERE = np.array([1.5, 2.2, 1.4])
-NO_HOLES = Holes(np.zeros((0, 3)), np.zeros(0))
+NO_HOLES = np.zeros((0, 4))
 
 
 def empty_room() -> Room:
@@ -49,15 +49,13 @@ def _is_slab(triangles: NDArray[Any]) -> bool:
     return bool(np.isclose(np.ptp(triangles, axis=(0, 1)).min(), 0.1))
 
 
-def take(
-    view: PanoramaRays, holes: Holes = NO_HOLES, caps: tuple[float, float] = (0.0, 0.0)
-) -> Picture:
-    camera = Camera(HERE, 0.0, caps, np.full(3, 3.0, np.float32), 0.0)
-    return render_picture(RayScene(empty_room()), view, camera, holes, 2, np.random.default_rng(0))
+def take(view: View, holes: NDArray[np.float64] = NO_HOLES) -> Picture:
+    camera = Camera(HERE, 0.0, (0.0, 0.0), np.full(3, 3.0, np.float32), 0.0)
+    return render_picture(RayScene(empty_room()), view, camera, holes, 2)
 
 
 def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
-    view = PanoramaRays(Pose.looking(HERE, heading=0.7), 64)
+    view = View.looking(HERE, 64, heading=0.7)
     rays = view.rays().astype(np.float64)
     with np.errstate(divide="ignore"):
         expected = np.where(rays > 0, (SIZE - HERE) / rays, -HERE / rays).min(axis=-1)
@@ -68,10 +66,10 @@ def test_distances_in_an_empty_box_are_those_of_its_planes() -> None:
 
 
 def test_unscanned_surfaces_have_a_color_but_no_label_or_depth() -> None:
-    view = PanoramaRays(Pose.looking(HERE, 0.0), 64)
+    view = View.looking(HERE, 64, heading=0.0)
     whole = take(view)
     wall = HERE + np.array([3.5, 0, 0])
-    holed = take(view, Holes(wall[None], np.array([0.5])))
+    holed = take(view, np.array([[*wall, 0.5]]))
     # The ball meets the wall in a disc; its ragged radius is between 0.43 and 0.56 m.
     points = HERE + view.rays() * np.nan_to_num(whole.depth_m)[..., None]
     away = np.linalg.norm(points - wall, axis=-1)
@@ -96,19 +94,19 @@ def test_euler_angles_give_their_rotation_back(seed: int) -> None:
 
 
 def test_panorama_rays_are_the_sphere_mirrored_and_turned_by_the_heading() -> None:
-    view = PanoramaRays(Pose.looking(PLACE, heading=0.7), 16)
+    view = View.looking(PLACE, 16, heading=0.7)
     expected = equirect_directions((16, 32)) @ to_right_handed(rotation_about((0, 0, 1), 0.7)).T
     np.testing.assert_allclose(view.rays(), expected, atol=1e-6)
 
 
 def test_perspective_rays_project_to_their_pixels() -> None:
-    view = PerspectiveRays(Pose.looking(PLACE, 0.4, 0.2, 0.1), 9, math.radians(60))
+    view = View.looking(PLACE, 9, math.radians(60), heading=0.4, pitch=0.2, roll=0.1)
     rays = view.rays()
-    projected = rays @ view.pose.world_from_camera @ view.camera_matrix.T
+    projected = rays @ view.world_from_camera @ view.camera_matrix.T
     pixels = projected[..., :2] / projected[..., 2:]
     columns, rows = np.meshgrid(np.arange(9), np.arange(9))
     np.testing.assert_allclose(pixels, np.stack([columns, rows], axis=-1), atol=1e-4)
-    np.testing.assert_allclose(rays[4, 4], view.pose.world_from_camera[:, 2], atol=1e-6)
+    np.testing.assert_allclose(rays[4, 4], view.world_from_camera[:, 2], atol=1e-6)
     # The edge columns' outer sides span the field of view.
     edges = [view.rays(dx=dx)[4, j] for dx, j in ((-0.5, 0), (0.5, 8))]
     assert math.acos(float(edges[0] @ edges[1])) == pytest.approx(math.radians(60), abs=1e-3)
@@ -118,7 +116,7 @@ def test_views_look_around_as_asked() -> None:
     rng = np.random.default_rng(0)
     up = {
         kind: np.array(
-            [draw_rays(rng, kind, PLACE, 8).pose.world_from_camera[2, 2] for _ in range(2000)]
+            [draw_view(rng, kind, PLACE, 8).world_from_camera[2, 2] for _ in range(2000)]
         )
         for kind in ("uniform", "stanford", "wide")
     }

@@ -13,7 +13,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import TangentGrid
 from tangent_train.inference.label_maps import __file__ as label_maps
 from tangent_train.io.camera_files import CameraFile, write_cameras
-from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.results.evaluation import EvaluationResult
 
 ROOT = Path(__file__).parents[2]

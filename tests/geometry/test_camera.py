@@ -91,11 +91,11 @@ def test_perspective_directions_project_to_their_pixel() -> None:
 
 
 @pytest.mark.parametrize(
-    ("size", "spans"), [((300, 760), "68.32° × 32.18°"), ((760, 300), "29.99° × 72.32°")]
+    ("size", "spans"), [((300, 760), r"\[68.32, 32.18\]"), ((760, 300), r"\[29.99, 72.32\]")]
 )
 def test_image_too_small_either_way_is_refused(size: tuple[int, int], spans: str) -> None:
     matrix = K.copy()
     matrix[:2, 2] = size[1] / 2, size[0] / 2
-    expected = f"field of view: found 45° × 45° for an image that spans {spans};"
+    expected = rf"field of view: found \[45.0, 45.0\]° for an image that spans {spans}°;"
     with pytest.raises(SettingError, match=expected):
         shift_range(matrix, size, 45, (128, 128))

@@ -48,7 +48,7 @@ def _room(seed: int = 0) -> Any:
     rng = np.random.default_rng(seed)
     room = build_room(rng, draw_room_type(rng))
     scene = RayScene(room)
-    location = draw_camera(rng, scene, room.plan, []).location
+    location = draw_camera(scene).location
 
     def distances(directions: NDArray[np.float64]) -> NDArray[np.float64]:
         rays = np.ascontiguousarray(directions.reshape(-1, 3), dtype=np.float32)

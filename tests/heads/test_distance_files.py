@@ -79,11 +79,11 @@ def test_a_video_has_one_range_of_colors() -> None:
     everywhere = np.array(True)
     summaries = [head.summarize(frame, everywhere) for frame in frames]
     assert [summary.get("median") for summary in summaries] == [1, 4, None, 9]
-    paint = head.painter("color", summaries)
-    painted = [paint(frame.image.rgb, frame.pixels)[0, 0] for frame in frames]
+    limits = head.limits(summaries)
+    painted = [head.paint("color", f.image.rgb, f.pixels, limits)[0, 0] for f in frames]
     assert (painted[0] == distance_colors()[0]).all()
     place = 255 * math.log(4) / math.log(9 * 1.01)
     assert (painted[1] == distance_colors()[round(place)]).all()
     assert not painted[2].any()
-    (row,) = head.table(summaries[2:3]).rows
+    (row,) = head.table(summaries[2:3])[2]
     assert row == ["known pixels, % of the solid angle", "0"]

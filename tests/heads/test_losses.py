@@ -7,12 +7,8 @@ import pytest
 import torch
 from torch.nn import functional
 
-from tangent_train.heads.losses import (
-    auxiliary_sum,
-    cross_entropy_norm,
-    cross_entropy_sum,
-    log_error_sum,
-)
+from tangent_train.heads.classes import auxiliary_sum, cross_entropy_norm, cross_entropy_sum
+from tangent_train.heads.distance import log_error_sum
 
 
 @pytest.mark.parametrize("smoothing", [0.0, 0.1])

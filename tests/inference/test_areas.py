@@ -11,8 +11,8 @@ import pytest
 import torch
 from torch import nn
 
-from datamodules.core.class_weights import class_weights
-from datamodules.core.samples import valid_mask
+from datamodules.core.dataset import valid_mask
+from datamodules.core.label_map import class_weights
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.config.build import build_from_config
 from tangent_train.heads import head_of
@@ -98,12 +98,12 @@ def test_labels_are_those_of_the_whole_panorama(tmp_path: Path, kind: str, rotat
             predicted = predict_labels(
                 task,
                 batch.images[0],
-                tuple(batch.target[0].shape),
+                tuple(batch.labels[0].shape),
                 batch.rotation[0].numpy(),
                 valid=valid_mask(batch.valid[0]),
             )
-            metric.update(predicted, batch.target[0])
-            labels.append(predicted.where(batch.target[0] > 0, 0))
+            metric.update(predicted, batch.labels[0])
+            labels.append(predicted.where(batch.labels[0] > 0, 0))
             views.append(batch.images.numel())
         counts.append(metric.compute())
     for name in ("pixels", "bands", "solid_angle"):  # true classes, which the fill does not change
@@ -142,7 +142,7 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
     expected = predict_labels(
         task,
         batch.images[0],
-        tuple(batch.target[0].shape),
+        tuple(batch.labels[0].shape),
         batch.rotation[0].numpy(),
         valid=valid_mask(batch.valid[0]),
     )

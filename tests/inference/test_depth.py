@@ -25,7 +25,7 @@ from tangent_train.geometry import (
     equirect_solid_angles,
     rotation_about,
 )
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic, from_distance, is_metric
 from tangent_train.inference.api import Network

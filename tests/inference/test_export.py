@@ -18,7 +18,7 @@ from safetensors import safe_open
 from safetensors.numpy import load_file
 from safetensors.torch import save_file
 
-from datamodules.core.labels import DISTANCE
+from datamodules.core.label_map import DISTANCE
 from models import UNet, initialize
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network

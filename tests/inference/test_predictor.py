@@ -14,9 +14,9 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules.core.images import distance_from_z_depth
+from datamodules.core.dataset import render_inputs
+from datamodules.core.depth import distance_from_z_depth
 from datamodules.core.inputs import normalize
-from datamodules.core.samples import render_inputs
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from models import make_distortion_aware
 from tangent_train.checkpoints.loaded import LoadedNetwork
@@ -114,7 +114,7 @@ def test_labels_are_those_of_an_evaluation(
     task = segmentation_task(trained.network, made, trained.class_names, SGD)
     batch = next(iter(data.test_dataloader()))
     batch = data.on_after_batch_transfer(batch, 0)
-    shape, rotation = tuple(batch.target[0].shape), batch.rotation[0].numpy()
+    shape, rotation = tuple(batch.labels[0].shape), batch.rotation[0].numpy()
     expected = predict_labels(task, batch.images[0], shape, rotation).numpy()
     read = data.dataset("test").read(int(batch.index[0]))
     assert (read.up is None) == (upright is None)

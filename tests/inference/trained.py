@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import METADATA_KEY, LoadedNetwork
 from tangent_train.config.build import build_from_config

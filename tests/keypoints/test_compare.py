@@ -9,8 +9,9 @@ import pytest
 from PIL import Image
 
 from datamodules.core.panorama_pairs import ImagePairs, PanoramaPair
+from tangent_train.errors import SettingError
 from tangent_train.geometry.coverage import is_valid
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.keypoints.compare import AS_GIVEN, CUBE, ROTATED, SHRUNK, Comparer
 from tests.datamodules.data_files import GPANO_TAGS, gpano_xmp
 from tests.keypoints.ball_room import ball_pair
@@ -72,6 +73,8 @@ def test_without_depth_all_keypoints_count_and_blank_panoramas_have_no_scores(
             assert (row["putative"], row["geometry"]) == (0, "none")
             assert row["pose_auc_20"] is None
             assert row["pmr"] is row["ms"] is row["p"] is None
+    with pytest.raises(SettingError, match="level: found 8; expected 7 or less for ball"):
+        Comparer((0,), level=8).compare(pair)
 
 
 def test_keypoints_of_partial_panoramas_lie_in_their_areas(

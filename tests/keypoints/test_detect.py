@@ -10,14 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tangent_train.geometry import TangentGrid, lonlat_to_xyz, random_rotation, rotation_about
-from tangent_train.keypoints.detect import (
-    detect,
+from tangent_train.keypoints.features import (
+    SphericalKeypoints,
     detect_on_equirect,
     detect_on_tangent_images,
-    gnomonic_jacobian,
 )
-from tangent_train.keypoints.spherical import SphericalKeypoints
-from tests.geometry.directions import angle_deg, unit
+from tests.geometry.directions import angle_deg
 from tests.keypoints.textures import Agreement, blob, rotated, texture
 
 LEVEL, SHAPE = 7, (256, 512)
@@ -66,7 +64,6 @@ def test_blank_panoramas_have_no_keypoints_and_color_is_converted(tangent: bool)
         return detect_on_equirect(image)
 
     assert len(found(np.full((101, 77, 3), 90, np.uint8))) == 0
-    assert len(detect(np.zeros((1, 1), np.uint8)).points_xy) == 0
     image = texture((101, 177))  # odd sizes
     gray, color = found(image), found(np.repeat(image[..., None], 3, axis=2))
     assert len(gray) > 30
@@ -96,24 +93,6 @@ def test_a_rotated_panorama_has_rotated_keypoints(base_level: int) -> None:
     assert agreement.turn_deg < 3
 
 
-@pytest.mark.parametrize("base_level", [0, 2])
-def test_the_gnomonic_jacobian_is_the_derivative(base_level: int) -> None:
-    grid = TangentGrid(base_level, 6, rotation=ROTATION)
-    rng = np.random.default_rng(0)
-    for face in (0, grid.num_images - 1):
-        pixels = rng.uniform(-0.5, grid.dim - 0.5, (50, 2))
-
-        def ray(pixels_xy: NDArray[np.float64], face: int = face) -> NDArray[np.float64]:
-            homogeneous = np.column_stack([pixels_xy, np.ones(len(pixels_xy))])
-            rays = unit(homogeneous @ np.linalg.inv(grid.camera_matrix).T)
-            return np.asarray(rays @ grid.world_from_camera[face].T)
-
-        steps = 1e-5 * np.eye(2)
-        numeric = [(ray(pixels + step) - ray(pixels - step)) / 2e-5 for step in steps]
-        jacobian = gnomonic_jacobian(ray(pixels), grid, face)
-        np.testing.assert_allclose(jacobian, np.stack(numeric, axis=-1), atol=1e-9)
-
-
 # At base level 2 two keypoints of this texture are found on both sides of a border.
 @pytest.mark.parametrize("base_level", [0, 2])
 def test_every_keypoint_is_owned_by_its_image_and_occurs_once(base_level: int) -> None:
@@ -127,4 +106,4 @@ def test_every_keypoint_is_owned_by_its_image_and_occurs_once(base_level: int) -
     angle = angle_deg(points.orientations_xyz[left], points.orientations_xyz[right])
     assert not (other_image & (ratio < np.log(1.1)) & (angle < 15)).any()
     inner = (points.directions_xyz * points.orientations_xyz).sum(axis=1)
-    np.testing.assert_allclose(inner, 0, atol=1e-12)
+    np.testing.assert_allclose(inner, 0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""Keypoints on the sphere: Jacobians, sizes and orientations."""
+"""Keypoints on the sphere: sizes and orientations."""
 
 from __future__ import annotations
 
@@ -6,26 +6,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, rotation_about
-from tangent_train.keypoints.spherical import angles_between, equirect_jacobian, local_to_sphere
+from tangent_train.geometry import rotation_about
+from tangent_train.keypoints.features import angles_between, local_to_sphere
 from tests.geometry.directions import random_directions
 from tests.keypoints.scenes import keypoints_at
-
-SHAPE = (90, 210)
-"""Not twice as wide as high."""
-
-
-def direction(pixels_xy: NDArray[np.float64]) -> NDArray[np.float64]:
-    return lonlat_to_xyz(equirect_to_lonlat(pixels_xy, SHAPE))
-
-
-def test_the_panoramas_jacobian_is_the_derivative() -> None:
-    rng = np.random.default_rng(0)
-    pixels = rng.uniform([-0.5, -0.4], [SHAPE[1] - 0.5, SHAPE[0] - 0.6], (200, 2))
-    steps = 1e-5 * np.eye(2)
-    numeric = [(direction(pixels + step) - direction(pixels - step)) / 2e-5 for step in steps]
-    found = equirect_jacobian(direction(pixels), SHAPE)
-    np.testing.assert_allclose(found, np.stack(numeric, axis=-1), rtol=0, atol=1e-9)
 
 
 def skewed_maps(count: int = 40) -> NDArray[np.float64]:

@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 
 from tangent_train.geometry import PanoramaPose, random_rotation
-from tangent_train.keypoints.motion import Motion, is_by_chance, motion_errors
-from tangent_train.keypoints.two_view import TwoView, estimate_two_view
+from tangent_train.keypoints.two_view import (
+    Motion,
+    TwoView,
+    estimate_two_view,
+    is_by_chance,
+    motion_errors,
+)
 from tests.geometry.directions import angle_deg, unit
 from tests.keypoints.scenes import Scene, rotation_angle_deg, two_views
 

@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial import cKDTree
 
 from tangent_train.geometry import equirect_directions
-from tangent_train.keypoints.spherical import SphericalKeypoints
+from tangent_train.keypoints.features import SphericalKeypoints
 from tests.geometry.directions import angle_deg
 
 

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from torchmetrics.utilities import dim_zero_cat
 
-from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.metrics.depth import (
     Alignment,
@@ -171,17 +170,3 @@ def test_limits_ignore_true_distances_and_clip_predictions_only_if_asked() -> No
     scores = depth_scores(error_sums(near.aligned(prediction, truth), limited).numpy()[0])
     assert scores["mae"] == pytest.approx((0 + 1 + 0) / 3)
     assert near.facts == {"alignment": "none", "range": "0.1 to 10 m, predictions clipped"}
-
-
-@pytest.mark.parametrize(
-    ("settings", "named"),
-    [
-        ({"alignment": "mean"}, "task.head.alignment"),
-        ({"alignment_in": "log"}, "task.head.alignment_in"),
-        ({"min_distance": -1}, "task.head.min_distance"),
-        ({"min_distance": 2, "max_distance": 2}, "task.head.max_distance"),
-    ],
-)
-def test_invalid_settings_are_named(settings: dict[str, Any], named: str) -> None:
-    with pytest.raises(SettingError, match=named):
-        DepthProtocol(**settings)

@@ -13,7 +13,7 @@ from torchvision.models import ResNet50_Weights, resnet50
 from torchvision.models.segmentation import fcn_resnet50
 
 from models import FCNResNet
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tests.tasks.small_networks import with_statistics
 
 LAST = ("classifier.4.weight", "classifier.4.bias")
@@ -76,18 +76,6 @@ def test_published_weights_come_from_the_cache_or_the_internet(
     tensors = FCNResNet(4, 14, 50, weights="imagenet").get_parameter("backbone.conv1.weight")
     assert torch.equal(tensors[:, :3], stem)
     assert not tensors[:, 3].any(), "depth changes nothing before the first step"
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"depth": 34}, r"network\.depth: found 34; expected 50 or 101"),
-        ({"depth": 50, "weights": "voc"}, r"network\.weights: found voc; expected null, coco"),
-    ],
-)
-def test_impossible_settings_are_refused(settings: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingError, match=message):
-        FCNResNet(**{"in_channels": 3, "num_classes": 14, **settings})
 
 
 @pytest.mark.parametrize("frozen", [True, False])

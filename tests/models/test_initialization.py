@@ -147,7 +147,7 @@ def test_a_file_without_a_fitting_tensor_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.safetensors").write_bytes(b"nothing")
     with pytest.raises(DataError, match=r"broken\.safetensors: found an unreadable file"):
         initialize(_network(), tmp_path / "broken.safetensors")
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="No such file"):
         initialize(_network(), tmp_path / "nowhere.pt")
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from models.mapped import MappedConv, Table
 from models.tables import mesh_operators
 from tangent_train.geometry import icosphere, vertex_resolution
-from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.geometry.icosphere import icosphere_directions
 
 CL = torch.channels_last
 

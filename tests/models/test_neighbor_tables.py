@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from models.mapped import Table
 from models.tables import face_neighbors, gnomonic_points, hexagonal_rings, mapped_samples
 from tangent_train.geometry import icosphere, vertex_resolution
-from tangent_train.geometry.gnomonic_points import gnomonic_points_xyz, tangent_axes
-from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.geometry.icosphere import icosphere_directions
+from tangent_train.geometry.sphere import gnomonic_points_xyz, tangent_axes
 
 _TABLES = [hexagonal_rings, face_neighbors, gnomonic_points]
 _POLES = [0, 11]

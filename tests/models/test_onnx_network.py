@@ -64,9 +64,9 @@ def test_other_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         path = tmp_path / f"{name}.onnx"
         if content is not None:
             path.write_bytes(content)
-        with pytest.raises(DataError, match=rf"{name}\.onnx: found (no such|an unreadable) file"):
+        with pytest.raises(DataError, match=rf"{name}\.onnx: found an unreadable file"):
             OnnxNetwork(path)
-    with pytest.raises(DataError, match=r"outputs \['a', 'b'\]; .* the only output"):
+    with pytest.raises(DataError, match=r"; expected one input .*, and one output"):
         OnnxNetwork(_linear(tmp_path / "two.onnx", outputs=("a", "b")))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(SettingError, match=r"onnxruntime.*pip install -e '\.\[export\]'"):
@@ -149,7 +149,7 @@ def test_outputs_without_an_axis_of_images_are_of_files_for_one(
 
 
 def test_other_onnx_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"found images as tensor\(int64\); expected tensor"):
+    with pytest.raises(DataError, match=r"found images tensor\(int64\) .*; expected one"):
         OnnxNetwork(write_onnx(tmp_path / "whole.onnx", IDENTITY, kind=TensorProto.INT64))
     flat = helper.make_node("Flatten", ["images"], ["scores"])
     network = OnnxNetwork(write_onnx(tmp_path / "flat.onnx", flat))

@@ -73,13 +73,6 @@ def test_a_checkpoint_is_read_without_trust_and_works_in_mixed_precision(tmp_pat
         assert network(torch.zeros(1, 4, 16, 32)).shape == (1, 13, 16, 32)
 
 
-def test_images_of_another_size_are_refused() -> None:
-    network = network_of("sfno", 3)
-    message = r"found images of 64 × 32 .*expected whole .* 32 × 16 .*representation=erp"
-    with pytest.raises(SettingError, match=message):
-        network(torch.zeros(1, 4, 32, 64))
-
-
 def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch_harmonics.examples", None)
     with pytest.raises(SettingError, match=r"network=SphericalUNet: .*'\.\[spectral\]'"):

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from torch import nn
 
-from models import HexUNet, UNet
+from models import HexUNet, IcoCNN, UNet, ZonalClassifier
 from models.unet import Down
 from tangent_train.errors import SettingError
-from tests.running import run_python
 
 
 def test_pooling_first_equals_halving_after_the_first_convolution() -> None:
@@ -55,27 +53,18 @@ def test_scores_have_the_size_of_the_images_and_every_parameter_learns(network: 
     torch.testing.assert_close(last, expected, atol=1e-5, rtol=1e-4)
 
 
-def test_a_side_that_does_not_fit_is_refused() -> None:
-    with pytest.raises(
-        SettingError, match=r"64 × 48 \(width × height\); expected sides that are multiples of 32"
-    ):
-        UNet(3, 4)(torch.zeros(1, 3, 48, 64))
-    with pytest.raises(
-        SettingError, match=r"HexUNet: found 32 × 24 \(width × height\); .* multiples of 16"
-    ):
-        HexUNet(3, 4)(torch.zeros(1, 3, 24, 32))
-    with pytest.raises(SettingError, match=r"2562 × 1 .*for signals on an icosphere.*=ugscnn"):
-        UNet(3, 4)(torch.zeros(1, 3, 1, 2562))
-
-
-def test_importing_a_network_imports_its_own_file(tmp_path: Path) -> None:
-    program = "import sys, models.unet; print(*(n for n in sys.modules if n[:4] in {}))"
-    done = run_python(tmp_path, "-c", program.format("('mode', 'tang', 'data')"))
-    assert {name for name in done.stdout.split() if name.partition(".")[0] != "dataclasses"} == {
-        "datamodules",  # the package alone: all names in it are imported when they are used
-        "models",
-        "models.unet",
-        "tangent_train",
-        "tangent_train.errors",
-        "tangent_train.imports",
-    }
+@pytest.mark.parametrize(
+    ("network", "shape", "message"),
+    [
+        (UNet(3, 4), (3, 48, 64), r"64 × 48 \(.*\); expected sides that are multiples of 32"),
+        (HexUNet(3, 4), (3, 24, 32), "HexUNet: found 32 × 24 .* multiples of 16"),
+        (UNet(3, 4), (3, 1, 2562), "2562 × 1 .*network=ugscnn"),
+        (IcoCNN(3, 4, 1, (4, 4)), (3, 32, 64), "found 64 × 32 .* 42 × 1 .*=icosphere"),
+        (ZonalClassifier(2, 4, 3), (1, 2, 32, 64), "found 64 × 32 .* 32 × 16 .*representation=erp"),
+    ],
+)
+def test_images_that_do_not_fit_are_refused(
+    network: nn.Module, shape: tuple[int, ...], message: str
+) -> None:
+    with pytest.raises(SettingError, match=message):
+        network(torch.zeros(1, *shape))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation
-from tangent_train.geometry.icosphere_signals import IcosphereElements
+from tangent_train.geometry.icosphere import IcosphereElements
 from tangent_train.rendering import (
     Blend,
     Interpolation,

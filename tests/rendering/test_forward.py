@@ -129,7 +129,6 @@ def test_gradients_agree_with_finite_differences(shape: tuple[int, int]) -> None
         (np.zeros((4, 8), bool), {}, "nearest"),
         (np.zeros((4, 8), complex), {"interpolation": "nearest"}, "complex"),
         (np.zeros((4, 8)), {"interpolation": "cubic"}, "interpolation: found 'cubic'"),
-        (np.zeros((4, 8)), {"faces": [20]}, "faces"),
         (torch.zeros(4, 8), {}, "panorama"),
         (torch.zeros(1, 4, 8, dtype=torch.uint8), {}, "float"),
     ],

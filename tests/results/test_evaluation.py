@@ -160,16 +160,6 @@ def test_means_stand_with_their_intervals(tmp_path: Path) -> None:
     assert {name: tuple(ends) for name, ends in read.items()} == record.intervals
 
 
-def test_shapes_are_counted_per_class_and_over_all(tmp_path: Path) -> None:
-    record = _record_of_shapes()
-    assert record.scores == {"accuracy": 13 / 16, "class_accuracy": 0.75}
-    write_results(record, tmp_path)
-    text = (tmp_path / "results.md").read_text()
-    assert "| mug | 4 | 25.0 |" in text
-    assert "| plant" not in text, "no shape, and none predicted"
-    assert "| mean |  | 75.0 |" in text
-
-
 def test_the_heat_map_has_shares_of_the_true_class() -> None:
     """The shares include pixels predicted as unknown."""
     matrices = _matrices({(1, 0): 10, (1, 1): 65, (1, 2): 25, (2, 2): 7})

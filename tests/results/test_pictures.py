@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.core.images import Image
-from tangent_train.geometry.equirect import area_mask
+from datamodules.core.dataset import Image
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.heads.pictures import (
-    colorize,
     mixed_picture,
     prediction_panel,
     shown_arrays,
@@ -48,8 +47,8 @@ def test_the_panel_shows_input_truth_prediction_and_error(rows: int, scale: int)
     bottom = slice(44 + height, 44 + 2 * height, scale)
     right = slice(width + 8, 2 * width + 8, scale)
     np.testing.assert_array_equal(panel[top, left], rgb)
-    np.testing.assert_array_equal(panel[top, right], colorize(truth, 4))
-    np.testing.assert_array_equal(panel[bottom, left], colorize(prediction, 4))
+    np.testing.assert_array_equal(panel[top, right], class_colors(4)[truth])
+    np.testing.assert_array_equal(panel[bottom, left], class_colors(4)[prediction])
     error = panel[bottom, right]
     assert np.all(error[(truth == 0)] == 160)
     assert np.all(error[(truth != 0) & (prediction == truth)] == 255)

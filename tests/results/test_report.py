@@ -94,16 +94,6 @@ def test_a_single_run_is_shown_with_its_interval_over_images() -> None:
     assert explained not in _runs_report(*several).means().note
 
 
-def test_the_views_of_a_row_are_named() -> None:
-    target = "tangent_train.rendering.EquirectRepresentation"
-    records = []
-    for aware in (False, True):
-        section = {"_target_": target, "distortion_aware": aware, "base_level": None}
-        records.append(example_result([0.5] * 3, representation=section))
-    shown = {cells["b"] for cells in _cells(_runs_report(*records)).values()}
-    assert shown == {"ERP", "ERP, distortion-aware"}
-
-
 def test_published_rows_stand_beside_the_same_protocol_and_level() -> None:
     report = _runs_report(example_result([0.5] * 13, REAL, protocol=PROTOCOL))
     cells = _cells(report)
@@ -129,16 +119,6 @@ def test_scores_with_one_differing_fact_are_not_shown_and_the_fact_is_named(name
         f"{name}: published {PROTOCOL.get(name, '–')}, this run changed."
     )
     assert 1 <= len(others) <= 2
-
-
-def test_published_scores_of_one_protocol_have_their_own_differences() -> None:
-    """Scores at levels 5 and 7 differ from a run at level 6."""
-    result = example_result([0.5] * 13, REAL, protocol=PROTOCOL, level=6)
-    _, (five, seven, _) = published_rows([result])
-    assert five.startswith("Not comparable: Zhang et al.: 43.3 and 3 more (paper_512). level: ")
-    assert seven.endswith(
-        "tangent images: 44.9 and 2 more (paper_512). level: published 7, this run 6."
-    )
 
 
 def test_a_fold_without_a_published_score_is_named() -> None:

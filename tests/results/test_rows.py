@@ -93,18 +93,6 @@ def test_groups_have_different_names_however_many_settings_differ() -> None:
     assert "patience" not in "".join(labels)
 
 
-def test_networks_from_elsewhere_make_other_groups() -> None:
-    records = [
-        replace(example_result([0.1, 0.2, 0.3], network=None, seed=seed), checkpoint=file)
-        for file in ("one.onnx", "two.onnx")
-        for seed in (0, 1)
-    ]
-    assert [(label, len(group)) for label, group in group_results(records).items()] == [
-        ("mine (checkpoint=one.onnx)", 2),
-        ("mine (checkpoint=two.onnx)", 2),
-    ]
-
-
 def test_runs_with_other_classes_are_refused() -> None:
     records = [
         example_result([0.1, 0.2, 0.3]),

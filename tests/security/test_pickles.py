@@ -15,7 +15,6 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from models.pretrained import read_tensors
-from tangent_train.checkpoints.content import read_checkpoint
 from tangent_train.checkpoints.loaded import load_network
 from tangent_train.errors import DataError
 from tangent_train.heads import ClassesHead
@@ -46,7 +45,7 @@ def _archive(path: Path, created: Path) -> None:
 
 
 def _legacy(path: Path, created: Path) -> None:
-    content = {"config": {}, "state_dict": {}, "callbacks": Creating(created)}
+    content = {"state_dict": {}, "callbacks": Creating(created)}
     torch.save(content, path, _use_new_zipfile_serialization=False)
 
 
@@ -72,7 +71,6 @@ def created(tmp_path: Path) -> Path:
 def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
     readers: tuple[Any, ...] = (
         load_network,
-        read_checkpoint,
         read_tensors,
         read_image_size,
     )

@@ -22,7 +22,7 @@ from studies.representation_distortion import representation_distortion
 from studies.rotation_error import icosahedral_rotations, mean_error
 from studies.surface_area import surface_area
 from tangent_train.geometry import equirect_directions, random_rotation
-from tangent_train.geometry.icosphere_signals import icosphere_directions
+from tangent_train.geometry.icosphere import icosphere_directions
 from tangent_train.rendering import IcosphereRepresentation
 
 DOCS = Path(__file__).resolve().parents[2] / "docs"

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor, nn
 
 from tangent_train.heads import ClassesHead, DistanceHead, Head
-from tangent_train.tasks import PixelTask
+from tangent_train.tasks import PixelTask, Task
 
 
 def build_head(head: type[Head], names: Sequence[str], settings: dict[str, Any]) -> Any:
-    """Build a head from the settings that it takes, which are removed."""
-    taken = inspect.signature(head).parameters.keys() & settings.keys()
-    return head(names, **{name: settings.pop(name) for name in taken})
+    """Build a head from the settings that tasks do not take, which are removed."""
+    given = settings.keys() - inspect.signature(Task).parameters.keys()
+    return head(names, **{name: settings.pop(name) for name in given})
 
 
 def segmentation_task(

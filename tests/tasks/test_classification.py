@@ -14,7 +14,7 @@ def _expected(count: int, smoothing: float = 0.1) -> tuple[list[Tensor], Tensor]
     network = shape_task().network.double()
     shapes = Shapes(count).shapes
     scores = network(torch.stack([shape.images for shape in shapes]).double())
-    labels = torch.stack([shape.target for shape in shapes])
+    labels = torch.stack([shape.labels for shape in shapes])
     loss = functional.cross_entropy(scores, labels, label_smoothing=smoothing)
     return list(torch.autograd.grad(loss, list(network.parameters()))), loss.detach()
 

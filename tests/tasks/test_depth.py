@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
+from torch.utils.data import default_collate
 
-from datamodules.core.samples import EvaluationSample, TrainingSample
+from datamodules.core.dataset import Sample
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
@@ -20,7 +21,6 @@ from tangent_train.rendering import PerspectiveRepresentation, TangentRepresenta
 from tangent_train.results.evaluation import evaluation_result, result_tables
 from tests.tasks.builders import depth_task
 from tests.tasks.shapes import Spheres, gradients_of, quiet_trainer
-from tests.tasks.test_segmentation import WHOLE
 
 pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:UserWarning")
 
@@ -52,11 +52,8 @@ class Data(Spheres):
             steps[:3] = 0
             labels[:7, 1:] = 0
             labels *= len(self.train) != 1
-            rays = torch.zeros(0, 3, 3)
-            self.train.append(TrainingSample(images, labels, rays, lengths, 0))
-            target = torch.from_numpy(steps.astype(np.int32))
-            rotation = torch.eye(3).double()
-            self.test.append(EvaluationSample(images, target, rotation, lengths, WHOLE, 0))
+            self.train.append(Sample(images, labels, lengths, 0))
+            self.test.append(Sample(images, torch.from_numpy(steps.astype(np.int32)), lengths, 0))
 
 
 class Right(nn.Module):
@@ -97,7 +94,7 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     assert task.loss_sum((images,), truth) / near.sum() == pytest.approx(0, abs=2e-5)
     (scores,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
     assert scores["val/loss"] == pytest.approx(0, abs=2e-5)
-    counts = [int(((s.target > 0) & (s.target <= 5 * 512)).sum()) for s in data.test]
+    counts = [int(((s.labels > 0) & (s.labels <= 5 * 512)).sum()) for s in data.test]
     assert task.result[:, 0, 0].tolist() == counts
     assert task.head.facts["range"] == "0 to 5 m"
     # Pixels at the borders of the blocks are interpolated.
@@ -131,9 +128,7 @@ def test_crops_of_a_photo_have_the_ray_lengths_of_the_photo_and_scales_of_their_
     lengths = torch.from_numpy(crops.ray_lengths())
     assert len(crops) > 1
     assert lengths.amax() > 1.2
-    area, rotation = WHOLE[None], torch.eye(3).double()[None]
-    index: Any = torch.zeros(1)
-    batch = EvaluationSample(images[None], target[None], rotation, lengths[None], area, index)
+    batch = default_collate([Sample(images, target, lengths, 0)])
     task = _task(Right(kind, lengths), representation)
     torch.testing.assert_close(task.evaluate(batch)[0], target / 512, rtol=1e-3, atol=0)
     result = task.metric.compute()
@@ -192,15 +187,6 @@ def test_chunks_and_accumulated_batches_give_the_gradient_of_one_mean(
         assert float((found - whole).norm() / whole.norm()) < 1e-4
 
 
-@pytest.mark.parametrize(
-    ("network", "settings", "named"),
-    [
-        (Right("relative_depth"), {"alignment": "none"}, "task.head.alignment.*relative_depth"),
-        (nn.Identity(), {"depth_kind": "depth"}, "task.head.depth_kind"),
-    ],
-)
-def test_settings_that_do_not_fit_are_refused(
-    network: nn.Module, settings: dict[str, Any], named: str
-) -> None:
-    with pytest.raises(SettingError, match=named):
-        _task(network, **settings)
+def test_relative_depth_is_not_compared_without_an_alignment() -> None:
+    with pytest.raises(SettingError, match=r"task.head.alignment.*relative_depth"):
+        _task(Right("relative_depth"), alignment="none")

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 from torch.utils.data import DataLoader
 
-from datamodules.core.samples import EvaluationSample, TrainingSample
+from datamodules.core.dataset import Sample
 from models import AuxiliaryHead
 from tangent_train.errors import SettingError
 from tangent_train.rendering import TangentRepresentation
@@ -23,13 +23,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:You defined a `validation_step`:
 
 NAMES = ("unknown", "a", "b")
 WEIGHTS = torch.tensor([1.0, 3.0])
-WHOLE = torch.empty(0, 0, dtype=torch.bool)
 ONE = torch.ones(1, 1, 1)
 TANGENT = TangentRepresentation(base_level=0, level=4)
 
 
 def _sample(images: Tensor, target: Tensor) -> Any:
-    return EvaluationSample(images, target, torch.eye(3).double(), ONE, WHOLE, 0)
+    return Sample(images, target, ONE, 0)
 
 
 class Data(Spheres):
@@ -52,7 +51,7 @@ class Data(Spheres):
             labels = torch.from_numpy(whole.render(truth, "nearest"))
             labels[:7, 1:] = 0
             labels *= len(self.train) != 1
-            self.train.append(TrainingSample(tensor, labels, torch.tensor(whole.rays()), ONE, 0))
+            self.train.append(Sample(tensor, labels, ONE, 0, torch.tensor(whole.rays())))
             self.test.append(_sample(tensor, torch.from_numpy(truth)))
 
     def class_weights(self, kind: str) -> Tensor:

@@ -8,9 +8,9 @@ from typing import Any
 
 from tangent_train.errors import SettingError, at_least
 from tangent_train.geometry import PinholeGrid, RingGrid, TangentGrid
+from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import check_coverage
-from tangent_train.geometry.equirect import area_mask, check_area
-from tangent_train.geometry.horizontal import half_extents
+from tangent_train.geometry.sphere import area_mask, check_area
 from tangent_train.rendering.checks import Blend
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation
 from tangent_train.rendering.representations.views import (
@@ -104,7 +104,7 @@ class HorizontalRepresentation(PinholeRepresentation):
 
 def _pair(fov: float | Sequence[float]) -> tuple[float, float]:
     pair: Any = (fov, fov) if isinstance(fov, int | float) else tuple(fov)
-    return pair  # checked by `half_extents`
+    return pair
 
 
 def ring_size(
@@ -128,7 +128,7 @@ def ring_size(
     >>> ring_size(9, (100, 100)), ring_size(9, (100, 70)), ring_size(9, (60, 60), 640)
     ((512, 512), (320, 512), (640, 640))
     """
-    across, down = half_extents(fov_deg)
+    across, down = map(half_width, fov_deg)
     if isinstance(dim, Sequence):
         if len(dim) != 2:
             raise SettingError("dim", found=list(dim), expected="columns, or [rows, columns]")

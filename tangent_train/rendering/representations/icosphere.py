@@ -26,7 +26,7 @@ from tangent_train.geometry import (
     to_right_handed,
     xyz_to_lonlat,
 )
-from tangent_train.geometry.icosphere_signals import (
+from tangent_train.geometry.icosphere import (
     IcosphereElements,
     faces_of_vertices,
     icosphere_count,
@@ -156,7 +156,7 @@ class IcosphereViews(Views):
 
     def _points(self, shape: tuple[int, int]) -> tuple[NDArray[np.float32]]:
         """Return columns and rows ``(2, P)`` of the sampling points in a panorama."""
-        points = sampling_points(self.level, self.elements).directions
+        points = sampling_points(self.level, self.elements)[0]
         positions = np.empty((2, len(points)), np.float32)
         for start in range(0, len(points), _CHUNK):
             part = slice(start, start + _CHUNK)
@@ -250,7 +250,6 @@ class IcosphereRepresentation:
         choices = ("none", "yaw", "so3")
         check_choice("representation.random_rotation", random_rotation, choices)
         check_choice("representation.interpolation", interpolation, ("barycentric", "nearest"))
-        icosphere(level)  # refuses other levels
         self.level, self.elements = level, elements
         self.random_rotation = random_rotation
         self.mirror = mirror

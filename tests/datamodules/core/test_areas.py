@@ -145,7 +145,7 @@ def test_the_estimate_of_up_does_not_see_the_fill(
     """The file is read again, because the panorama is small."""
     seen: list[Any] = []
     monkeypatch.setattr(
-        "datamodules.core.panorama_module.estimate_up", lambda *given: seen.append(given)
+        "datamodules.core.image_module.estimate_up", lambda *given: seen.append(given)
     )
     root = write_strips(tmp_path, (100, 512))
     settings: Any = {"area": AREA, "fill": "reflect", "upright": "auto", "test_rotation": rotation}

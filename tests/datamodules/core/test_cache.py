@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.core.cache import Cache
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.manifest import Shard
 from tests.conftest import fabricate
@@ -38,7 +38,7 @@ def test_cached_arrays_are_memory_mapped(tmp_path: Path) -> None:
     source.write_bytes(b"abc")
     files = ImageFiles("room/küche 1", source)
     item = _Item(np.arange(105, dtype=np.uint8).reshape(5, 7, 3), None, np.eye(3))
-    cache = Cache.of(tmp_path / "cache", {"level": 5}, _Item)
+    cache = Cache(tmp_path / "cache", {"level": 5}, _Item)
     for _ in range(2):
         found = cache.read(files, lambda: item)
         assert found.depth is None
@@ -49,7 +49,7 @@ def test_cached_arrays_are_memory_mapped(tmp_path: Path) -> None:
             np.testing.assert_array_equal(array, getattr(item, name))
     record = np.load(cache.path(files), allow_pickle=False)
     np.testing.assert_array_equal(record["rgb"], item.rgb, err_msg="NumPy reads it alone")
-    assert Cache.of(tmp_path / "cache", {"level": 6}, _Item).path(files) != cache.path(files)
+    assert Cache(tmp_path / "cache", {"level": 6}, _Item).path(files) != cache.path(files)
 
 
 @pytest.mark.parametrize(("size", "seconds"), [(3, -1), (4, 0)])
@@ -61,7 +61,7 @@ def test_a_changed_source_is_read_again(
     source = tmp_path / "a.png"
     source.write_bytes(b"abc")
     time = source.stat().st_mtime_ns
-    cache, files = Cache.of(tmp_path / "cache", {}, _Item), ImageFiles("a", source)
+    cache, files = Cache(tmp_path / "cache", {}, _Item), ImageFiles("a", source)
 
     def change() -> None:
         source.write_bytes(b"x" * size)
@@ -81,7 +81,7 @@ def test_a_changed_source_is_read_again(
 def _samples(module: Any) -> list[torch.Tensor]:
     training, testing = list(module.train_dataloader()), list(module.test_dataloader())
     tensors = [part for one in training for part in (*one.images, one.labels)]
-    return tensors + [part for one in testing for part in (*one.images, one.target)]
+    return tensors + [part for one in testing for part in (*one.images, one.labels)]
 
 
 @pytest.mark.parametrize(
@@ -107,8 +107,7 @@ def test_shards_fill_a_cache_and_only_missing_files_are_decoded(
 ) -> None:
     cache = tmp_path / "cache"
     counts = [
-        Stanford2D3DS(root, erp, cache=cache).fill_cache(Shard(number, 3).part)
-        for number in (1, 2, 3)
+        Stanford2D3DS(root, erp, cache=cache).prepare(Shard(number, 3)) for number in (1, 2, 3)
     ]
     assert sum(counts) == 8
     sorted(cache.rglob("*.npy"))[0].unlink()

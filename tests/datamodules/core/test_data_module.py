@@ -17,10 +17,10 @@ from lightning.pytorch.plugins import HalfPrecision
 from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
 
-from datamodules.core.class_weights import class_weights
-from datamodules.core.images import Image, ImageFiles
-from datamodules.core.loading import EpochSampler, sample_rng
-from datamodules.core.splits import SPLITS
+from datamodules.core.dataset import Image, sample_rng
+from datamodules.core.files import SPLITS, ImageFiles
+from datamodules.core.label_map import class_weights
+from datamodules.core.loading import EpochSampler
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
@@ -92,7 +92,7 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     for split in ("train", "val"):
         assert known.dataset(split).read(0).up is None
     tagged = np.array([0.6, 0, 0.8])
-    monkeypatch.setattr("datamodules.core.panorama_module.read_up", lambda path: tagged)
+    monkeypatch.setattr("datamodules.core.image_module.read_up", lambda path: tagged)
     known = make_module(test_rotation=30, upright="pose")
     np.testing.assert_array_equal(known.dataset("train").read(0).up, tagged)
     rotated_up = known.dataset("test").read(0).up
@@ -104,7 +104,7 @@ def test_up_is_estimated_from_the_file_of_a_small_panorama(
     stanford_root: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     seen: list[NDArray[np.uint8]] = []
-    estimate = "datamodules.core.panorama_module.estimate_up"
+    estimate = "datamodules.core.image_module.estimate_up"
     monkeypatch.setattr(estimate, lambda rgb, *_: seen.append(rgb))
     for level in (3, 4):  # the files have 32 rows
         representation = EquirectRepresentation(level)
@@ -122,7 +122,7 @@ def test_a_network_estimates_up_of_test_panoramas_that_were_read_before(
     def judge(panorama: Any, ups: NDArray[np.float64]) -> NDArray[np.float64]:
         return ups[:, 1]
 
-    monkeypatch.setattr("datamodules.core.panorama_module.estimate_up", estimate)
+    monkeypatch.setattr("datamodules.core.image_module.estimate_up", estimate)
     auto, upright = make_module(upright="auto"), make_module()
     assert auto.dataset("test").read(0).up is None
     for module in (auto, upright):
@@ -143,8 +143,7 @@ def test_processes_share_the_panoramas(
         monkeypatch.setattr("torch.distributed.get_rank", lambda rank=rank: rank)
         module = make_module()
         seen += [int(batch.index) for batch in module.test_dataloader()]
-        with pytest.warns(UserWarning, match="2 of 8 training panoramas"):
-            steps.add(len(module.train_dataloader()))
+        steps.add(len(module.train_dataloader()))
     assert sorted(seen) == list(range(5))
     assert len(steps) == 1
 

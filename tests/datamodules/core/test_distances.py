@@ -12,10 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.cityscapes import Cityscapes
-from datamodules.core.image_module import ImageDataModule, PhotoDataModule
-from datamodules.core.labels import DISTANCE, PIXEL_CLASSES
-from datamodules.core.panorama_module import draw_rotation
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
+from datamodules.core.image_module import ImageDataModule, PhotoDataModule, draw_rotation
+from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.folder.labeled import FolderPanoramas, FolderPhotos
 from datamodules.matterport360 import Matterport360
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
@@ -151,17 +150,17 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
         data = _data(source, root, **settings)
         data.prepare_data()
         training, test = data.dataset("train")[1, 0], data.dataset("test")[0]
-        assert {training.labels.dtype, test.target.dtype} == {torch.int32}
-        batches.append((*training.images, training.labels, *test.images, test.target))
+        assert {training.labels.dtype, test.labels.dtype} == {torch.int32}
+        batches.append((*training.images, training.labels, *test.images, test.labels))
     for others in batches[1:]:
         for one, other in zip(batches[0], others, strict=True):
             torch.testing.assert_close(one, other, rtol=0, atol=0)
     data = _data(source, root, cache=tmp_path, in_memory=True, labels=PIXEL_CLASSES)
     data.prepare_data()
-    target = data.dataset("test")[0].target
+    target = data.dataset("test")[0].labels
     assert 0 < target.max() < 50
     target.zero_()
-    assert data.dataset("test")[0].target.max() > 0, "a copy of what is in memory"
+    assert data.dataset("test")[0].labels.max() > 0, "a copy of what is in memory"
     assert len(list(tmp_path.iterdir())) == 2
 
 
@@ -206,7 +205,7 @@ def test_float_depth_of_a_folder_is_in_meters(tmp_path: Path, suffix: str) -> No
         write_depth_m(tmp_path / "depth" / f"{name}{suffix}", meters, 1)
     representation: Any = EquirectRepresentation(4)
     data = _data(SOURCES["folder"], tmp_path, representation, val_fraction=0)
-    labels = data.dataset("test")[0].target.numpy()
+    labels = data.dataset("test")[0].labels.numpy()
     assert labels[0, : len(special)].tolist() == [0, 0, 0, 0, 1, 65531, 0, 0, 0]
     np.testing.assert_allclose(labels[1:] / 512, meters[1:], atol=0.5001 / 512)
 
@@ -232,9 +231,7 @@ def test_masked_and_rotated_distances_keep_their_values(
     if rotation:
         R = draw_rotation("so3", 0, 0)
         expected = expected[_pixels(equirect_directions((32, 64)) @ R, 32)]
-    target = data.dataset("test")[0].target.numpy()
-    distance_m = data.dataset("test").read(0).distance_m
-    np.testing.assert_array_equal(distance_m, np.where(target, target / 512, np.nan))
+    target = data.dataset("test")[0].labels.numpy()
     assert (target == expected).mean() > 0.99, "but for rounding at the borders of pixels"
     assert 0.2 < (target > 0).mean() < 0.5
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from datamodules.core.images import Unknown, mask_black, resize_depth
+from datamodules.core.depth import resize_depth
+from datamodules.core.image_module import Unknown, mask_black
 from tangent_train.rendering.resampling import resize
 from tests.datamodules.data_files import nearest_valid
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,9 @@ import numpy as np
 import pytest
 
 from datamodules.core.data_module import data_set
-from datamodules.core.images import ImageFiles
+from datamodules.core.files import ImageFiles, Split
+from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.label_map import LabelMap
-from datamodules.core.panorama_module import PanoramaDataModule
-from datamodules.core.splits import Split
 from tangent_train.errors import DataError, SettingError
 from tangent_train.rendering import EquirectRepresentation
 from tests.datamodules.data_files import read_png, write_png
@@ -24,13 +24,13 @@ class Toy(PanoramaDataModule):
 
     label_maps = {"3": LabelMap.of(["sky", "wall", "ground"], [0])}  # noqa: RUF012
 
-    def files(self, split: Split) -> list[ImageFiles]:
+    def files(self) -> Mapping[Split, Sequence[ImageFiles]]:
         """All but the last one are for training."""
         files = [
             ImageFiles(path.stem, path, self.root / "labels" / path.name)
             for path in sorted((self.root / "rgb").glob("*.png"))
         ]
-        return {"train": files[:-1], "val": [], "test": files[-1:]}[split]
+        return {"train": files[:-1], "val": [], "test": files[-1:]}
 
 
 def _toy(root: Path, largest: int = 3, **settings: Any) -> Toy:
@@ -48,7 +48,7 @@ def test_a_data_set_is_its_files_and_classes(tmp_path: Path) -> None:
     data.prepare_data()
     assert len(data.dataset("train")) == 2
     (sample,) = data.dataset("test")
-    np.testing.assert_array_equal(sample.target, read_png(tmp_path / "labels" / "c.png"))
+    np.testing.assert_array_equal(sample.labels, read_png(tmp_path / "labels" / "c.png"))
     problems, count = data.check()
     assert (problems.items, count) == (set(), 3)
     assert data.class_names == ("unknown", "sky", "wall", "ground")

@@ -9,10 +9,8 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from datamodules.core.dataset import ImageDataset
-from datamodules.core.images import Image
+from datamodules.core.dataset import Image, ImageDataset, jitter_colors, render_inputs, world_rays
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION, Input, normalize
-from datamodules.core.samples import jitter_colors, render_inputs, world_rays
 from tangent_train.geometry import equirect_directions
 from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
 from tangent_train.rendering.representations.views import Representation

@@ -125,5 +125,5 @@ def test_invalid_camera_matrices_are_refused(two: Path, value: Any) -> None:
     write_cameras(two, {"hall/a": value, ".": K})
     ((name, finding, _),) = _found(two, fov=70)
     assert name == "cameras.json"
-    assert finding.startswith("'hall/a': ")
+    assert "hall/a" in finding
     assert "; expected an object of cameras by name" in finding

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchmetrics import MeanAbsoluteError
 
 from tangent_train.heads import Head, Scores
-from tangent_train.metrics.score_columns import ScoreColumn
+from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.rendering.mosaic import MeanMosaic
 
 
@@ -31,7 +31,6 @@ class ShareHead(Head):
     labels = "pixel_classes"
     columns: ClassVar = {"mae": ScoreColumn("mean absolute error", "", better="lower")}
     main_score = "mae"
-    takes = "images (n, C, h, w) to numbers (n, 1, h, w)"
     num_outputs = 1
 
     def __init__(self, class_names: Sequence[str], class_name: str) -> None:

@@ -15,7 +15,7 @@ from tangent_train.geometry import (
     random_rotation,
     rotation_about,
 )
-from tangent_train.geometry.icosphere_signals import (
+from tangent_train.geometry.icosphere import (
     IcosphereElements,
     icosphere_count,
     icosphere_directions,

@@ -168,9 +168,7 @@ def test_cropping_takes_the_least_covering_side_that_is_a_multiple() -> None:
         (TangentRepresentation, {"random_rotation": "tilt"}, "'none' or 'yaw' or 'so3'"),
         (TangentRepresentation, {"blend": "average"}, "'nearest' or 'feather'"),
         (HorizontalRepresentation, {"faces_per_panorama": 19}, "found 19; expected 1 to 18"),
-        (HorizontalRepresentation, {"fov": 180}, r"fov: found \[180, 180\]; expected 0 to 170"),
-        (HorizontalRepresentation, {"rings": [{"pitch": 91, "views": 8}]}, "pitch: -90 to 90"),
-        (HorizontalRepresentation, {"rings": [{"pitch": 90, "views": 2}]}, "the same direction"),
+        (HorizontalRepresentation, {"fov": 180}, "fov: found 180; expected more than 0 and less"),
         (
             HorizontalRepresentation,
             {"rings": WIDE_RINGS[:2]},

@@ -10,9 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from datamodules.synthrooms.camera import PanoramaRays, Pose
 from datamodules.synthrooms.furniture import build_room
-from datamodules.synthrooms.render import Camera, RayScene, draw_camera, draw_holes, render_picture
+from datamodules.synthrooms.render import (
+    Camera,
+    RayScene,
+    View,
+    draw_camera,
+    draw_holes,
+    render_picture,
+)
 from tangent_train.io.pixel_files import read_pixels, write_pixels
 from tests.cli.rendering import render_with
 from tests.geometry.directions import angle_deg
@@ -22,20 +28,21 @@ pycolmap = pytest.importorskip("pycolmap")
 pycolmap.logging.minloglevel = 2
 
 
-def _panoramas(folder: Path) -> dict[str, Pose]:
+def _panoramas(folder: Path) -> dict[str, View]:
     """Three of 512 rows in one room, tilted by up to 11°, within 0.6 m of the first."""
     rng = np.random.default_rng(1)
     room = build_room(rng, "office")
     scene = RayScene(room)
-    holes, first = draw_holes(rng, scene), draw_camera(rng, scene, room.plan, [])
+    holes, first = draw_holes(scene), draw_camera(scene)
     poses = {}
     for k in range(3):
         place = first.location + (rng.uniform(-0.35, 0.35, 3) if k else 0)
-        pose = Pose.looking(place, rng.uniform(-3, 3), *rng.uniform(-0.2, 0.2, 2))
+        heading, (pitch, roll) = rng.uniform(-3, 3), rng.uniform(-0.2, 0.2, 2)
+        view = View.looking(place, 512, heading=heading, pitch=pitch, roll=roll)
         camera = Camera(place, 0.0, (0.0, 0.0), first.gain, 0.004)
-        picture = render_picture(scene, PanoramaRays(pose, 512), camera, holes, 1, rng)
+        picture = render_picture(scene, view, camera, holes, 1)
         write_pixels(folder / f"{k}" / "room.png", picture.rgb)
-        poses[f"{k}/room.png"] = pose
+        poses[f"{k}/room.png"] = view
     return poses
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datamodules.core.splits import SPLITS
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Run, predicted, run_command
@@ -40,7 +39,7 @@ def test_folders_of_images_with_depth(run: Run, tmp_path: Path, kind: str) -> No
     shutil.copytree("out/depth", root / "depth")
     (root / "classes.json").write_text('["wall"]')
     data = FolderPanoramas(root, labels="distance", level=2)
-    files = [one for split in SPLITS for one in data.files(split)]
+    files = [one for found in data.files().values() for one in found]
     assert sorted(one.name for one in files) == ["flat/kitchen", "hall"]
     for one in files:
         expected = read_depth_m(tmp_path / "out" / "depth" / f"{one.name}.{kind}", 1000)

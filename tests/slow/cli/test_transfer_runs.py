@@ -32,8 +32,7 @@ def test_real_runs_from_photos_to_panoramas(
         torch.load(OF_SEED_0 / name / "checkpoints" / "last.ckpt", weights_only=True)
         for name in ("P", "S-FT-1")
     )
-    assert tuned["config"]["optimizer"]["lr"] == 3e-4
-    assert tuned["config"]["representation"]["level"] == p["config"]["representation"]["level"]
+    assert found["S-FT-1"]["settings"]["optimizer.lr"] == 3e-4
     assert tuned["epoch"] == 0
     (optimizer,) = tuned["optimizer_states"]
     assert int(optimizer["state"][0]["step"]) == tuned["global_step"] > 0, "a new optimizer"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from datamodules.core.splits import SPLITS
+from datamodules.core.files import SPLITS
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import DataError
 from tangent_train.rendering import EquirectRepresentation

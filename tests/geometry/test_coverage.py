@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation
-from tangent_train.geometry.equirect import area_mask
+from tangent_train.geometry.sphere import area_mask
 from tangent_train.rendering import (
     CubemapRepresentation,
     EquirectRepresentation,

@@ -1,24 +1,70 @@
-"""Problems of a data set, collected instead of raised one by one."""
+"""The files of a data set: their splits, and their problems, collected instead of raised."""
 
 from __future__ import annotations
 
-import errno
-import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING, NamedTuple, TypeVar
+from typing import Any, Literal, NamedTuple, TypeVar
+
+import numpy as np
 
 from tangent_train.errors import DataError, SettingError
 
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator, Mapping, Sequence
+Split = Literal["train", "val", "test"]
+"""A split of a data set."""
 
-    from datamodules.core.cache import Files
-    from datamodules.core.images import ImageFiles
-    from datamodules.core.splits import Split
+SPLITS: tuple[Split, ...] = ("train", "val", "test")
+"""All splits, in order."""
+
+# Sortable keys: names, or tuples of names and numbers.
+_Group = TypeVar("_Group", bound="str | tuple[Any, ...]")
+
+_UNREADABLE = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
-_Files = TypeVar("_Files", bound="Files")
+class ImageFiles(NamedTuple):
+    """The files of one panorama or photo.
+
+    Attributes:
+        name: Unique short name; ``/`` between groups.
+        rgb: Color image.
+        labels: File of class labels; None if the labels are distances.
+        depth: Depth image, if depth is an input or the labels are distances.
+        camera: File with the camera matrix, for photos with one file each.
+    """
+
+    name: str
+    rgb: Path
+    labels: Path | None = None
+    depth: Path | None = None
+    camera: Path | None = None
+
+    @property
+    def paths(self) -> tuple[Path, ...]:
+        """All files of the image."""
+        return tuple(path for path in self[1:] if path is not None)
+
+
+def draw_groups(
+    groups: Iterable[_Group], fraction: float, seed: int | Sequence[int]
+) -> set[_Group]:
+    """Draw some of the groups; the draw depends on the seed, not on the order of the groups.
+
+    Args:
+        groups: All groups; repeated groups count once.
+        fraction: Share of the groups to draw: at least one group and at most all but one.
+        seed: Seed of the draw.
+
+    >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
+    ['attic', 'kitchen']
+    """
+    ordered = sorted(set(groups))
+    if len(ordered) < 2:
+        return set()
+    count = min(max(1, round(fraction * len(ordered))), len(ordered) - 1)
+    order = np.random.default_rng(seed).permutation(len(ordered))
+    return {ordered[place] for place in order[:count]}
 
 
 class Problem(NamedTuple):
@@ -59,26 +105,17 @@ class Problems:
         Args:
             item: Name of the unusable item; None for the whole data set.
             file: Broken file, if the error does not name it first.
-
-        Raises:
-            OSError: The disk is full.
         """
         try:
             yield
-        except (DataError, SettingError) as error:
-            self.add(error, item, file)
-        except OSError as error:
-            if error.errno == errno.ENOSPC:
-                raise
-            path = file if error.filename is None else Path(os.fsdecode(error.filename))
-            found = error if error.errno is None else os.strerror(error.errno)
+        except _UNREADABLE as error:
+            path = file if error.filename is None else Path(error.filename)
             expected = "a file or folder that can be read"
-            self.add(DataError(path, found=found, expected=expected), item, file)
+            self._add(DataError(path, found=error, expected=expected), item, file)
+        except (DataError, SettingError) as error:
+            self._add(error, item, file)
 
-    def add(
-        self, error: DataError | SettingError, item: str | None = None, file: Path | None = None
-    ) -> None:
-        """Note an error, see `noted`."""
+    def _add(self, error: DataError | SettingError, item: str | None, file: Path | None) -> None:
         where = error.subject if file is None or isinstance(error.subject, PurePath) else file
         finding = error.finding
         if error.found is not None and where is not error.subject:
@@ -86,11 +123,12 @@ class Problems:
         self._noted.append(Problem(str(where), finding, error.remedy, item, error))
 
     def add_all(self, others: Problems) -> None:
-        """Add the problems of another check."""
+        """Add the problems and warnings of another check."""
         self._noted += others._noted
+        self.warnings += others.warnings
 
     def compare_counts(
-        self, splits: Mapping[Split, Sequence[Files]], *published: Mapping[str, int]
+        self, splits: Mapping[Split, Sequence[Any]], *published: Mapping[str, int]
     ) -> None:
         """Warn if the numbers of images of the splits are not published ones.
 
@@ -99,12 +137,10 @@ class Problems:
             published: Published numbers of images of these splits.
         """
         found = {str(split): len(images) for split, images in splits.items()}
-        if not any(found == numbers for numbers in published):
-            counts, *others = (
-                ", ".join(f"{count} {split}" for split, count in numbers.items())
-                for numbers in (found, *published)
-            )
-            self.warnings.append(f"found {counts}; published are {' or '.join(others)}")
+        if found not in published:
+            every = (found, *published)
+            texts = [", ".join(f"{n} {split}" for split, n in counts.items()) for counts in every]
+            self.warnings.append(f"found {texts[0]}; published are {' or '.join(texts[1:])}")
         for split, count in found.items():
             allowed = [numbers[split] for numbers in published]
             if count not in allowed:
@@ -136,7 +172,7 @@ class Problems:
         """Names of unusable images or shapes."""
         return {p.item for p in self._noted if p.item is not None}
 
-    def without(self, items: Iterable[_Files]) -> list[_Files]:
+    def without(self, items: Iterable[Any]) -> list[Any]:
         """Return the usable images or shapes."""
         broken = self.items
         return [item for item in items if item.name not in broken]
@@ -155,8 +191,9 @@ class Problems:
         listed = self.listed()
         if not listed:
             return
-        if len(listed) == 1 or all(isinstance(problem.error, SettingError) for problem in listed):
-            raise listed[0].error
-        lines = [f"{root}: found {len(listed)} problems; expected none."]
-        lines += [f"  {problem.error}" for problem in listed]
-        raise DataError("\n".join([*lines, remedy]).rstrip())
+        error: Exception = listed[0].error
+        if len(listed) > 1 and any(isinstance(problem.error, DataError) for problem in listed):
+            lines = [f"{root}: found {len(listed)} problems; expected none."]
+            lines += [f"  {problem.error}" for problem in listed]
+            error = DataError("\n".join([*lines, remedy]).rstrip())
+        raise error

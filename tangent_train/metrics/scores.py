@@ -1,0 +1,157 @@
+"""Names, units, means and intervals of scores, shared by all kinds of output."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torchmetrics import Metric
+
+_Value = TypeVar("_Value")
+
+SOLID_ANGLE = "_solid_angle"
+"""Suffix of the name of a score by solid angle; without it, it is the name of the same score by
+pixels."""
+
+
+@dataclass(frozen=True)
+class ScoreColumn:
+    """Name and unit of a score in reports.
+
+    Attributes:
+        text: Name of the score in reports.
+        unit: ``%`` for a share of 1, which is printed in percent; else a unit, or "".
+        of_class: Key of the score of one class that this score is the mean of, or "".
+        class_text: Name of that score in reports.
+        better: ``higher``, or ``lower`` for errors.
+        is_main: True if reports of several runs and headlines contain the score; all scores are in
+            the files and in the tables of a run.
+    """
+
+    text: str
+    unit: str = "%"
+    of_class: str = ""
+    class_text: str = ""
+    better: str = "higher"
+    is_main: bool = True
+
+    @property
+    def title(self) -> str:
+        """Title of a column with the score."""
+        return f"{self.text} {self.unit}".strip() + " ↓" * (self.better == "lower")
+
+    @property
+    def class_title(self) -> str:
+        """Title of a column with the score of one class."""
+        return f"{self.class_text} {self.unit}".strip()
+
+
+def by_solid_angle(scores: Mapping[str, _Value]) -> dict[str, _Value]:
+    """Rename scores to those by solid angle."""
+    return {name + SOLID_ANGLE: value for name, value in scores.items()}
+
+
+def with_solid_angle(columns: Mapping[str, ScoreColumn]) -> dict[str, ScoreColumn]:
+    """Add the columns of the same scores by solid angle.
+
+    Args:
+        columns: Columns of scores by pixels.
+    """
+    return dict(columns) | {
+        name + SOLID_ANGLE: replace(
+            column,
+            text=f"{column.text} by solid angle",
+            of_class=column.of_class and column.of_class + SOLID_ANGLE,
+            class_text=column.class_text and f"{column.class_text} by solid angle",
+        )
+        for name, column in columns.items()
+    }
+
+
+BAND_EDGES_DEG = (90, 60, 30, 0, -30, -60, -90)
+"""Edges of the latitude bands, from north to south. A row whose center is on an edge belongs to the
+northern band."""
+
+Interval = tuple[float, float]
+"""Lower and upper end of a score, shares of 1."""
+
+
+def band_of_rows(height: int) -> NDArray[np.intp]:
+    """Return the index of the latitude band of each row of a panorama, see `BAND_EDGES_DEG`."""
+    # In degrees, with the division last, so that a row on an edge has no rounding error.
+    southward_deg = (2 * np.arange(height) + 1) * 90 / height - 90
+    return np.searchsorted(-np.array(BAND_EDGES_DEG[1:-1]), southward_deg, side="left")
+
+
+def defined_mean(scores: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the mean over the last axis without NaN; NaN if all values are NaN."""
+    count = np.sum(~np.isnan(scores), axis=-1)
+    total = np.nansum(scores, axis=-1)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
+
+
+def bootstrap(
+    of_images: Float[np.ndarray, "images ..."],
+    score: Callable[[NDArray[np.float64]], Mapping[str, NDArray[np.float64]]],
+    draws: int = 1000,
+    seed: int = 0,
+) -> dict[str, Interval]:
+    """Compute 95 % percentile bootstrap intervals of scores, with images as the unit.
+
+    Each draw samples as many images as there are, with replacement, and scores them as one data set
+    (Efron and Tibshirani, An Introduction to the Bootstrap, 1993, chapter 13). The result does not
+    depend on the order of the images or the number of processes.
+
+    Args:
+        of_images: Numbers of each image from whose sums the scores follow.
+        score: Function that returns scores ``(draws,)`` by name, given sums ``(draws, …)``.
+        draws: Number of draws.
+        seed: Seed of the draws.
+
+    Returns:
+        Intervals by name; empty for a single image. Undefined scores have no interval.
+    """
+    count = len(of_images)
+    if count <= 1:
+        return {}
+    flat = of_images.reshape(count, -1)
+    flat = flat[np.lexsort(flat.T)]
+    generator = np.random.default_rng(seed)
+    times = generator.multinomial(count, np.full(count, 1 / count), size=draws)
+    sums = (times.astype(np.float64) @ flat).reshape(draws, *of_images.shape[1:])
+    intervals = {}
+    for name, means in score(sums).items():
+        if not np.isnan(means).all():
+            low, high = np.nanquantile(means, (0.025, 0.975))
+            intervals[name] = (float(low), float(high))
+    return intervals
+
+
+class ImagesMetric(Metric):
+    """Collects numbers of each image of a data set, on all processes.
+
+    Args:
+        *shape: Shape of the numbers of an image.
+    """
+
+    full_state_update = False
+    of_images: list[Tensor]
+
+    def __init__(self, *shape: int) -> None:
+        super().__init__()
+        self._shape = shape
+        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        # Processes without images contribute an empty part of the same dtype and shape.
+        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
+        self.of_images = [empty]
