@@ -10,14 +10,14 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, Field, model_validator
+from pydantic import AfterValidator, BaseModel, Field
 
+from tangent_train.errors import DataError
 from tangent_train.files import read_json, write_text
 from tangent_train.geometry import (
     PanoramaPose,
@@ -104,19 +104,12 @@ class _CamerasJson(BaseModel):
     views: list[_Rotation] = []
     overlapping: bool = False
 
-    @model_validator(mode="after")
-    def _check_faces(self) -> Self:
-        if not set(self.faces) <= set(range(self.grid.num_images)):
-            raise ValueError(f"face {max(self.faces)} of {self.grid.num_images} images")
-        return self
-
     @property
     def faces(self) -> tuple[int, ...]:
         return tuple(image.face for image in self.images)
 
-    @cached_property
     def grid(self) -> PinholeGrid:
-        """The grid that the fields describe."""
+        """Return the grid that the fields describe."""
         if self.base_level is not None:
             rotation: Any = self.icosahedron_rotation
             in_world = None if rotation is None else _in_world(rotation)
@@ -198,9 +191,14 @@ def read_cameras(path: Path) -> CameraFile:
         DataError: The file is missing, or its content is not valid.
     """
     content: _CamerasJson = read_json(path, _EXPECTED, kind=_CamerasJson)
+    try:
+        grid = content.grid()
+        grid.face_indices(content.faces)
+    except (ValueError, IndexError, OverflowError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
     shape = content.source.height, content.source.width
     files = tuple(image.file for image in content.images)
-    return CameraFile(content.source.file, shape, content.grid, content.faces, files)
+    return CameraFile(content.source.file, shape, grid, content.faces, files)
 
 
 class _RigCamera(BaseModel):

@@ -72,9 +72,9 @@ def test_pixels_are_at_the_positions_in_the_file(grid: PinholeGrid, tmp_path: Pa
         ({"icosahedron_rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}, "rotation"),
         ({"views": []}, "views|stack"),
         ({"views": [[[1, 0, 0], [0, 1, 0], [0, 0, -1]]]}, "rotation"),
-        ({"camera": CAMERA | {"matrix": (-9 * np.eye(3)).tolist()}}, r"matrix\.0\.0"),
+        ({"camera": CAMERA | {"matrix": (-9 * np.eye(3)).tolist()}}, "camera.matrix"),
         ({"camera": CAMERA | {"matrix": [[]]}}, "camera.matrix"),
-        ({"images": [{"file": "a.png"}]}, "images.0.face"),
+        ({"images": [{"file": "a.png"}]}, "images"),
         ({"images": [{"file": "a.png", "face": 20}]}, "20"),
     ],
 )
