@@ -50,10 +50,6 @@ THIRTEEN: tuple[str, ...] = (*CLASSES[:12], "car")
 _GROUPS = {"rider": "person", **dict.fromkeys(("truck", "bus", "motorcycle", "bicycle"), "car")}
 _IDS = (7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33)
 _UNKNOWN = [*sorted(set(range(34)) - set(_IDS)), 255]  # 255: license plates, id -1
-_GET_IT = (
-    "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
-    "https://www.cityscapes-dataset.com and point data.root at the folder that holds them."
-)
 _CAMERA = '{"intrinsic": {"fx": …, "fy": …, "u0": …, "v0": …}}, in pixels'
 
 
@@ -92,7 +88,10 @@ class Cityscapes(PhotoDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, _IDS, strict=True)), _UNKNOWN))
     no_depth = "disparities are not read"
-    get_it = _GET_IT
+    get_it = (
+        "Get leftImg8bit, gtFine and camera (…_trainvaltest.zip) from "
+        "https://www.cityscapes-dataset.com and point data.root at the folder that holds them."
+    )
     test_split = "val"
 
     inputs: Sequence[Input] = ("rgb",)

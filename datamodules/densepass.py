@@ -33,10 +33,6 @@ from datamodules.core.image_module import PanoramaDataModule
 from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap
 
-_GET_IT = (
-    "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the folder "
-    "with leftImg8bit and gtFine."
-)
 _HEIGHT, _WIDTH = 400, 2048
 _LABELS = "_labelTrainIds.png"
 
@@ -53,7 +49,10 @@ class DensePASS(PanoramaDataModule):
 
     label_maps = class_maps(LabelMap.of(dict(zip(CLASSES, range(19), strict=True)), [255]))
     no_depth = "DensePASS has no depth images"
-    get_it = _GET_IT
+    get_it = (
+        "Get DensePASS from https://github.com/chma1024/DensePASS and point data.root at the "
+        "folder with leftImg8bit and gtFine."
+    )
 
     inputs: Sequence[Input] = ("rgb",)
     horizon_row: Annotated[float, Field(ge=0, le=_HEIGHT)] = _HEIGHT / 2

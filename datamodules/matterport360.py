@@ -58,11 +58,6 @@ def _merged(column: str) -> LabelMap:
     return LabelMap.of(members, set(range(42)) - {n for ns in members.values() for n in ns})
 
 
-_GET_IT = (
-    "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from 360BEV "
-    "(https://github.com/jamycheung/360BEV) or SFSS-MMSI "
-    "(https://github.com/sguttikon/SFSS-MMSI), and point data.root at the folder of the scenes."
-)
 _FOLDERS = {
     "360fv": ("rgb", "semantic", "depth"),
     "sfss": (
@@ -93,7 +88,12 @@ class Matterport360(PanoramaDataModule):
         "41": LabelMap.of(CATEGORIES[:-1], [0]),
     }
     units_per_m = 4000
-    get_it = _GET_IT
+    get_it = (
+        "Request Matterport3D at https://niessner.github.io/Matterport and its panoramas from "
+        "360BEV (https://github.com/jamycheung/360BEV) or SFSS-MMSI "
+        "(https://github.com/sguttikon/SFSS-MMSI), and point data.root at the folder of the "
+        "scenes."
+    )
     fact_settings: ClassVar[tuple[str, ...]] = ("release", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)

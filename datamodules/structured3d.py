@@ -54,10 +54,6 @@ CLASSES: tuple[str, ...] = (
 INVALID = ("01155", "01192", "01714", "01816", "01852", "03398")
 """Scenes that the errata of the release call invalid; published lists of images hold them."""
 
-_GET_IT = (
-    "Request Structured3D at https://structured3d-dataset.org and point data.root at the folder "
-    "with scene_00000 and the others."
-)
 _PUBLISHED = {"train": 18362, "val": 1776, "test": 1697}
 _FIRST = (0, 3000, 3250)
 """First scene of each split."""
@@ -106,7 +102,10 @@ class Structured3DImages(ImageDataModule):
         "published_s3d8": PublishedS3D8(_EIGHT.names, _EIGHT.labels),
     }
     units_per_m = 1000
-    get_it = _GET_IT
+    get_it = (
+        "Request Structured3D at https://structured3d-dataset.org and point data.root at the "
+        "folder with scene_00000 and the others."
+    )
     place: ClassVar[str]
     fact_settings: ClassVar[tuple[str, ...]] = (
         *("configuration", "lighting", "invalid_scenes", "test_split"),

@@ -47,10 +47,6 @@ Weather = Literal["cloud", "fog", "rain", "sun"]
 """Folders of the release."""
 
 _MERGED = {"pedestrian": "person", "vehicles": "car", "road line": "road"}
-_GET_IT = (
-    "Get SynPASS as https://github.com/jamycheung/Trans4PASS describes and point data.root at the "
-    "folder with img and semantic."
-)
 _PUBLISHED = (
     {"train": 5700, "val": 1690, "test": 1690},
     {"train": 5700, "val": 2180, "test": 1200},
@@ -77,7 +73,10 @@ class SynPASS(PanoramaDataModule):
         "13": _TWENTY_TWO.regrouped(THIRTEEN, _MERGED),
     }
     no_depth = "SynPASS has no depth images"
-    get_it = _GET_IT
+    get_it = (
+        "Get SynPASS as https://github.com/jamycheung/Trans4PASS describes and point data.root at"
+        " the folder with img and semantic."
+    )
     fact_settings: ClassVar[tuple[str, ...]] = ("weather", "time", "test_split")
 
     inputs: Sequence[Input] = ("rgb",)

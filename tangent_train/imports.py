@@ -7,7 +7,7 @@ import logging
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
-from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from unittest.mock import patch
 
@@ -20,7 +20,8 @@ def check_own_packages() -> None:
     """
     root = Path(__file__).parents[1]
     for name in ("datamodules", "models"):
-        found = import_module(name).__file__
+        spec = find_spec(name)
+        found = None if spec is None else spec.origin
         if found is None or Path(found).parents[1] != root:
             raise ImportError(f"{found} has the name of a package of tangent-train: rename it")
 

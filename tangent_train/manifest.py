@@ -17,7 +17,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 from tangent_train.errors import SettingError
 
@@ -26,7 +26,8 @@ MANIFEST = "manifest.json"
 _Item = TypeVar("_Item")
 
 
-class Shard(NamedTuple):
+@dataclass(frozen=True)
+class Shard:
     """One of several parts of a list: ``items[number - 1 :: count]``.
 
     Attributes:

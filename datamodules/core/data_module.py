@@ -306,8 +306,7 @@ class DataModule(LightningDataModule, ABC):
         self._test_images = self.problems.incomplete.get(self.test_split, "")
         if self.test_split == "val":
             scenes = {files.name: files.name.partition("/")[0] for files in found["train"]}
-            fraction = self.val_fraction
-            drawn = draw_groups(scenes.values(), fraction, self.seed) if fraction else set()
+            drawn = draw_groups(scenes.values(), self.val_fraction, self.seed)
             found["test"] = found["val"]
             found["val"] = [files for files in found["train"] if scenes[files.name] in drawn]
             found["train"] = [files for files in found["train"] if scenes[files.name] not in drawn]

@@ -53,14 +53,14 @@ def draw_groups(
 
     Args:
         groups: All groups; repeated groups count once.
-        fraction: Share of the groups to draw: at least one group and at most all but one.
+        fraction: Share of the groups to draw: at least one group and at most all but one; 0: none.
         seed: Seed of the draw.
 
     >>> sorted(draw_groups(["hall", "attic", "kitchen", "hall"], 0.5, seed=0))
     ['attic', 'kitchen']
     """
     ordered = sorted(set(groups))
-    if len(ordered) < 2:
+    if len(ordered) < 2 or not fraction:
         return set()
     count = min(max(1, round(fraction * len(ordered))), len(ordered) - 1)
     order = np.random.default_rng(seed).permutation(len(ordered))

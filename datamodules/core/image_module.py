@@ -163,7 +163,7 @@ class ImageDataModule(DataModule):
 
     def decode(self, files: ImageFiles) -> Image:
         """Decode the files of an image, at any size; z-depth of photos."""
-        labels: Any = None if files.labels is None else self.decode_labels(files)
+        labels: Any = None if self.has_distances else self.decode_labels(files)
         depth = None if files.depth is None else self.decode_depth(files)
         return Image(read_rgb(files.rgb), depth, labels, camera_matrix=self.decode_camera(files))
 
@@ -221,12 +221,6 @@ class ImageDataModule(DataModule):
             return self.read(files).labels
         labels, shape = self.decode_labels(files), self.read_shape
         return labels if shape is None else resize(labels, shape, "nearest")
-
-    def _find_files(self) -> dict[Split, list[Any]]:
-        found = super()._find_files()
-        if self.has_distances:
-            found = {s: [files._replace(labels=None) for files in found[s]] for s in found}
-        return found
 
     def check_files(self, files: ImageFiles) -> None:
         """See `DataModule`: the files of an image are complete, suit the settings, of one size."""

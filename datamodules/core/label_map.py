@@ -197,9 +197,8 @@ def read_label_map(path: Path) -> LabelMap:
         named = [(name, value) for value, name in enumerate(content) if name is not None]
     elif isinstance(content, dict):
         named = list(content.items())
-    names = [name for name, _ in named if name != UNKNOWN_NAME]
-    usable = [name for name in names if isinstance(name, str) and name.isprintable()]
-    wrong = [json.dumps(name) for name, _ in named if name not in usable]
+    texts = [name for name, _ in named if isinstance(name, str) and name.isprintable()]
+    wrong = [json.dumps(n) for n, _ in named if n not in texts or n == UNKNOWN_NAME]
     for label, (name, given) in enumerate(named, start=1):
         for key in given if isinstance(given, list) else [given]:
             plain = plain_name(key) if isinstance(key, str) else key

@@ -180,9 +180,7 @@ class StanfordImages(ImageDataModule):
         for area in self.areas:
             part = test if area in stanford.FOLDS[self.fold] else training
             part += list_pictures(self.root, area, self.group, self.reads_depth, self.problems)
-        rooms: set[tuple[str, str, int]] = set()
-        if self.val_fraction:
-            rooms = draw_groups(map(room_of, training), self.val_fraction, self.seed)
+        rooms = draw_groups(map(room_of, training), self.val_fraction, self.seed)
         val = [files for files in training if room_of(files) in rooms]
         train = [files for files in training if room_of(files) not in rooms]
         return {"train": train, "val": val, "test": test}

@@ -59,9 +59,9 @@ def import_network(settings: ImportSettings) -> None:
         DataError: A file cannot be used.
         SettingError: A setting is missing or impossible, or the file exists.
     """
-    output = settings.output
     from tangent_train import photo_networks
 
+    output, size = settings.output, settings.image_size
     suffix = ".onnx" if settings.library == "onnx" else ".ckpt"
     if output.suffix.lower() != suffix:
         raise SettingError("output", found=output.name, expected=f"a name ending in {suffix}")
@@ -77,36 +77,23 @@ def import_network(settings: ImportSettings) -> None:
             views=settings.views,
             unknown_classes=settings.unknown_classes,
             unknown_wins=settings.unknown_wins,
-            image_size=_rows_and_columns(settings.image_size),
+            image_size=None if size is None else (size[0], size[-1]),
             score_kind=settings.scores,
         )
     print_text(_understood(output, trained, settings))
-
-
-def _rows_and_columns(given: tuple[int, ...] | None) -> tuple[int, int] | None:
-    """A size of images; one number is that of a square."""
-    if given is None:
-        return None
-    if len(given) not in (1, 2) or min(given) < 1:
-        raise SettingError(
-            "image_size", found=list(given), expected="[rows,columns], or the side of a square"
-        )
-    return given[0], given[-1]
 
 
 def _load(settings: ImportSettings) -> PhotoNetwork:
     """Return the network, from the library or the option that the settings name."""
     from tangent_train.photo_networks import own_files
 
-    load: Callable[..., PhotoNetwork]
-    if settings.library == "onnx":
-        load = own_files.load_onnx
-    elif settings.library is not None:
-        load = import_module(f"tangent_train.photo_networks.{settings.library}").load
-    elif settings.network is not None:
-        load = partial(own_files.load_config, settings.network)
-    else:
+    if (settings.library or settings.network) is None:
         raise SettingError("library", found="null", expected="a library, or network=<option>")
+    load: Callable[..., PhotoNetwork] = own_files.load_onnx
+    if settings.library is None:
+        load = partial(own_files.load_config, settings.network or {})
+    elif settings.library != "onnx":
+        load = import_module(f"tangent_train.photo_networks.{settings.library}").load
     given = {n: getattr(settings, n) for n in signature(load).parameters if n in _OF_LIBRARIES}
     network = load(**given, normalization=settings.normalization)
     read = _READ | given.keys()
@@ -118,24 +105,25 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
     """Description of an imported network."""
     from tangent_train.inference.views import PanoramaViews
 
-    names = trained.class_names[1:]
-    mean, std = trained.normalization.mean, trained.normalization.std
-    numbers = [" ".join(f"{value:.4g}" for value in values) for values in (mean, std)]
+    names, kind = trained.class_names[1:], trained.depth_kind
+    mean, std = (
+        " ".join(f"{value:.4g}" for value in values)
+        for values in (trained.normalization.mean, trained.normalization.std)
+    )
     size = width_height(trained.fixed_size) if trained.fixed_size else "any"
     multiple = f", multiples of {trained.size_multiple}" if trained.size_multiple > 1 else ""
-    kind = trained.depth_kind
-    lines = [
-        f"{path}: {path.stat().st_size / 1e6:.1f} MB",
-        f"{len(names)} classes: {', '.join(names)}" if kind is None else f"depth: {kind}",
-        f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
-        f"normalization of images from 0 to 1: mean {numbers[0]}, std {numbers[1]}",
-        f"image size: {size}{multiple}",
-        f"panoramas: {PanoramaViews(trained).description()}",
-    ]
-    if trained.trust:
-        trust = ",".join(trained.trust)
-        lines.append(f"your own network: every command that reads it needs trust=[{trust}]")
-    if settings.unknown_classes:
-        effect = "written as unknown" if settings.unknown_wins else "never win"
-        lines.insert(2, f"{', '.join(settings.unknown_classes)}: {effect}")
-    return "\n".join(lines)
+    effect = "written as unknown" if settings.unknown_wins else "never win"
+    trust = f"your own network: commands that read it need trust=[{','.join(trained.trust)}]"
+    unknown = f"{', '.join(settings.unknown_classes)}: {effect}"
+    return "\n".join(
+        [
+            f"{path}: {path.stat().st_size / 1e6:.1f} MB",
+            f"{len(names)} classes: {', '.join(names)}" if kind is None else f"depth: {kind}",
+            *[unknown] * bool(settings.unknown_classes),
+            f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
+            f"normalization of images from 0 to 1: mean {mean}, std {std}",
+            f"image size: {size}{multiple}",
+            f"panoramas: {PanoramaViews(trained).description()}",
+            *[trust] * bool(trained.trust),
+        ]
+    )

@@ -8,18 +8,14 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
 from contextlib import contextmanager, redirect_stdout, suppress
 from functools import partial
 from importlib import import_module
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from tangent_train.errors import DataError, SettingError, nearest, printable
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from omegaconf import DictConfig
 
 
 @contextmanager
@@ -31,9 +27,8 @@ def _errors_as_messages(command: str) -> Iterator[None]:
     try:
         yield
     except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
-        cause: Any = error.__cause__
-        known = getattr(cause, "parent_node", None)  # of an override without a setting
-        remedy = "" if known is None else nearest(str(cause.key), map(str, known))
+        known = getattr(error.__cause__, "parent_node", None)  # of an override without a setting
+        remedy = nearest(str(getattr(error.__cause__, "key", "")), map(str, known or ()))
         sys.exit(printable(f"tangent-{command}: {error}\n{remedy}".rstrip()))
     except KeyboardInterrupt:
         sys.exit(130)
@@ -48,7 +43,7 @@ def _main(command: str) -> None:
     from tangent_train.config.settings import config_name, validate
     from tangent_train.files import config_folder
 
-    def job(config: DictConfig) -> Any:
+    def job(config: Any) -> Any:
         if in_sweep():  # outside the block: the other jobs go on
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions

@@ -65,17 +65,12 @@ def predict(settings: PredictSettings) -> None:
         prediction.count(inputs)
     errors: dict[str, dict[str, str]] = {}
     steps = prediction.predict, prediction.read, prediction.write
-    jobs = work_on("Predicting", inputs.jobs(missing), len(missing), *steps)
-    try:
-        with closing(jobs):
-            for job in jobs:
-                if job.error:
-                    errors[job.name] = {"file": str(job.path), "error": job.error}
-                else:
-                    manifest.finish(job.name, file=str(job.path), **job.value)
-    except KeyboardInterrupt:
-        print_text("The finished images are kept; the same command continues.")
-        raise
+    with closing(work_on("Predicting", inputs.jobs(missing), len(missing), *steps)) as jobs:
+        for job in jobs:
+            if job.error:
+                errors[job.name] = {"file": str(job.path), "error": job.error}
+            else:
+                manifest.finish(job.name, file=str(job.path), **job.value)
     manifest = Manifest.open(settings.output, same)  # with what other shards have finished
     left = manifest.missing(names)
     if left and not errors.keys() >= set(left):
@@ -135,14 +130,23 @@ class _Prediction:
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
         self.folder = PredictionFolder(settings.output, head, kinds)
-        views = _views(settings, loaded)
-        if isinstance(views, PanoramaViews):
+        given = settings.levels, settings.base_level, settings.blend, settings.rotations
+        views: PanoramaViews | PhotoViews
+        if settings.projection == "perspective":
+            views = PhotoViews(loaded, *given)
+        else:
+            views = PanoramaViews(loaded, *given, settings.views, settings.fill)
             print_text(f"A panorama is predicted in {views.description(settings.area)}.")
-        given = settings.device, settings.view_batch_size
         self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
-        self._predictor = Predictor(loaded, head, views, *given)
+        device, batch_size = settings.device, settings.view_batch_size
+        self._predictor = Predictor(loaded, head, views, device, batch_size)
         self._up_likelihood = UpLikelihood(original, self._predictor.device)
-        self._depth = _depth_folder(settings, loaded)
+        self._depth = None
+        if "depth" in loaded.inputs:
+            if settings.depth is None:
+                expected = "a folder of depth images, which the network takes"
+                raise SettingError("depth", found="null", expected=expected)
+            self._depth = DepthFolder(settings.depth, settings.depth_scale)
         if settings.upright == "auto" and loaded.depth_kind is not None:
             expected = "pose or null: depth networks do not estimate the up direction"
             raise SettingError("upright", found="auto", expected=expected)
@@ -151,14 +155,15 @@ class _Prediction:
         """Let the head count in some of the images, see `Head.count`."""
         names = inputs.names
         chosen = [names[k] for k in evenly_spread(_COUNTED_IMAGES, len(names))]
-        if line := self._head.count(self._mosaics(inputs, chosen)):
-            print_text(line)
 
-    def _mosaics(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:
-        for job in inputs.jobs(names):
-            with suppress(DataError, SettingError):  # reported when the image is predicted
-                if not job.error:
-                    yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
+        def mosaics() -> Iterator[Any]:
+            for job in inputs.jobs(chosen):
+                with suppress(DataError, SettingError):  # reported when the image is predicted
+                    if not job.error:
+                        yield self._predictor.predict(self._upright(self.read(job)), averaged=True)
+
+        if line := self._head.count(mosaics()):
+            print_text(line)
 
     def read(self, job: Job) -> InputImage:
         """Read one image."""
@@ -207,29 +212,11 @@ class _Prediction:
 
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
-    names = {"checkpoint", "input", "every", "output", "label_map", "depth", "projection"}
+    names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
     names |= {"levels", "base_level", "blend", "rotations", "write", "report", "shard"}
     names |= {"view_batch_size", "device", "trust"}
     panoramas = {"area", "fill", "views", "upright", "mask"}
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | ({"depth_scale"} if "depth" in loaded.inputs else set())
-
-
-def _views(settings: PredictSettings, loaded: LoadedNetwork) -> PanoramaViews | PhotoViews:
-    given = settings.levels, settings.base_level, settings.blend, settings.rotations
-    if settings.projection == "perspective":
-        return PhotoViews(loaded, *given)
-    return PanoramaViews(loaded, *given, settings.views, settings.fill)
-
-
-def _depth_folder(settings: PredictSettings, loaded: LoadedNetwork) -> DepthFolder | None:
-    if ("depth" in loaded.inputs) != (settings.depth is not None):
-        raise SettingError(
-            "depth",
-            found=settings.depth or "null",
-            expected=f"a folder of depth images for a network that takes depth; this one takes "
-            f"{' and '.join(loaded.inputs)}",
-        )
-    return None if settings.depth is None else DepthFolder(settings.depth, settings.depth_scale)
+    return names | ({"depth", "depth_scale"} if "depth" in loaded.inputs else set())

@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
 from lightning.pytorch.utilities import rank_zero_only
 
 from datamodules.core.inputs import RGBD_NORMALIZATION, channel_names
@@ -19,12 +18,9 @@ from tangent_train.checkpoints.loaded import (
 )
 from tangent_train.cli.run import Run
 from tangent_train.config.build import build_from_config
-from tangent_train.config.from_file import without_weights
-from tangent_train.config.settings import TrainSettings
+from tangent_train.config.settings import TrainSettings, typed_names
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, printable
-
-_RGB = 3
 
 
 def with_pretrained_network(
@@ -47,33 +43,26 @@ def with_pretrained_network(
     Raises:
         DataError: The file has no network that can be trained.
     """
-    if path.suffix.lower() == ".onnx":
-        expected = "a checkpoint, a state dict or a .safetensors file"
-        raise DataError(path, found="an ONNX file, which is not trained", expected=expected)
     description = read_description(path)
     if description is None or description.settings is None:
         return settings, None
     changes: dict[str, Any] = {}
-    typed = any(re.match(r"[+~]*network[.@=]", o) for o in HydraConfig.get().overrides.task)
-    if not typed:
-        if description.score_kind in ("probabilities", "labels"):
-            raise DataError(
-                path,
-                found=f"a network that returns {description.score_kind}",
-                expected="logits, which the losses need",
-            )
-        changes["network"] = section = without_weights(description.trainable_settings())
+    is_typed = any(re.match(r"network([.@]|$)", name) for name in typed_names())
+    if not is_typed:
+        if description.score_kind != "logits":
+            found = f"a network that returns {description.score_kind}"
+            raise DataError(path, found=found, expected="logits, which the losses need")
+        changes["network"] = section = description.trainable_settings() or {}
         _print(f"Network of {path}: {section['_target_']} (another: network=…)")
-    head = settings.task["head"]
-    if description.depth_kind is not None and head.get("depth_kind", "") is None:
-        changes["task"] = settings.task | {"head": head | {"depth_kind": description.depth_kind}}
-        kind = description.depth_kind
+    head, kind = settings.task["head"], description.depth_kind
+    if kind is not None and head.get("depth_kind", "") is None:
+        changes["task"] = settings.task | {"head": head | {"depth_kind": kind}}
         _print(f"Output of the network: {kind} (another: task.head.depth_kind=…)")
     normalization = _normalization(description, settings.data)
     if normalization is not None:
         changes["data"] = settings.data | {"normalization": normalization}
         _print(f"Normalization of {path}: {normalization} (another: data.normalization=…)")
-    return settings.model_copy(update=changes), None if typed else path
+    return settings.model_copy(update=changes), None if is_typed else path
 
 
 def load_pretrained(run: Run, path: Path | None) -> None:
@@ -94,12 +83,11 @@ def load_pretrained(run: Run, path: Path | None) -> None:
             found = task.backbone_lr_factor
             raise SettingError("task.backbone_lr_factor", found=found, expected=expected)
         return
-    description, channels, heads = read_description(path), None, set[str]()
-    if description is not None:
-        if description.groups is not None or description.class_names != tuple(data.class_names):
-            heads = _heads(run)
-        if description.inputs and hasattr(data, "inputs"):
-            channels = (channel_names(description.inputs), channel_names(data.inputs))
+    known, channels, heads = read_description(path), None, set[str]()
+    if known and (known.groups is not None or known.class_names != tuple(data.class_names)):
+        heads = _heads(run)
+    if known and known.inputs and hasattr(data, "inputs"):
+        channels = (channel_names(known.inputs), channel_names(data.inputs))
     origins = initialize(task.network, path, channels, heads)
     task.fresh = frozenset(origins.fresh)
     _print(f"Tensors from {path}\n{origins}")
@@ -117,12 +105,9 @@ def _normalization(
     inputs = data.get("inputs")
     if not description.inputs or inputs is None or data.get("normalization") is not None:
         return None
-    default = {"mean": RGBD_NORMALIZATION.mean, "std": RGBD_NORMALIZATION.std}
-    count = _RGB + ("depth" in inputs)
-    return {
-        name: [*values, *default[name][len(values) :]][:count]
-        for name, values in ((name, getattr(description.normalization, name)) for name in default)
-    }
+    given, default, count = description.normalization, RGBD_NORMALIZATION, 3 + ("depth" in inputs)
+    pairs = {"mean": (given.mean, default.mean), "std": (given.std, default.std)}
+    return {n: [*values, *more[len(values) :]][:count] for n, (values, more) in pairs.items()}
 
 
 def _heads(run: Run) -> set[str]:

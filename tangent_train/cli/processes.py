@@ -50,11 +50,12 @@ def run_job(command: str) -> float | None:
     if not file.is_file():
         return None
     content = json.loads(file.read_bytes())
-    expected = f"{content['mode']}imize"
-    direction = hydra.sweeper.get("direction") or expected
-    if direction != expected:  # the sweeper would search for the worst score
-        expected = f"{expected}, for {content['figure']}"
-        raise SettingError("hydra.sweeper.direction", found=direction, expected=expected)
+    needed = f"{content['mode']}imize"
+    found = hydra.sweeper.get("direction") or needed
+    if found != needed:  # the sweeper would search for the worst score
+        raise SettingError(
+            "hydra.sweeper.direction", found=found, expected=f"{needed}, for {content['figure']}"
+        )
     return float(content["best"])
 
 

@@ -16,7 +16,7 @@ from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
-from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
+from tangent_train.geometry import PinholeGrid, nearest_level, rotation_about
 from tangent_train.inference.views import view_settings
 from tangent_train.io.camera_files import (
     CAMERAS_FILE,
@@ -54,17 +54,12 @@ def render(settings: RenderSettings) -> None:
         SettingError: A setting is invalid, or the output was written with other settings.
     """
     modes = [name for name in _MODES if getattr(settings, name) is not None]
-    if len(modes) != 1:
-        raise SettingError(
-            "input, back and poses",
-            found=" and ".join(modes) or "none of them",
-            expected="input=<panoramas>, back=<results for tangent images>, or "
-            "poses=<a model of COLMAP>",
-        )
-    if settings.output is None and settings.figure is None:
-        raise SettingError("output", found="null", expected="a folder, or with back= a file")
+    if len(modes) != 1 or (settings.output or settings.figure) is None:
+        found = " and ".join(modes) or "none of them"
+        expected = "input=<panoramas>, back=<results> or poses=<a model of COLMAP>, and output="
+        raise SettingError("input, back and poses", found=found, expected=expected)
     run, read = _MODES[modes[0]]
-    check_read(settings, {*read, modes[0], "output"})
+    check_read(settings, {*read, *modes, "output", "overwrite"})
     run(settings, settings.model_dump(mode="json", exclude=_NOT_CONTENT))
 
 
@@ -127,40 +122,28 @@ def _render_missing(
     """Render what is missing in a folder; return the number of panoramas that failed."""
     missing = manifest.missing(names)
     print_text(f"{counted(len(names), 'panoramas')}, {len(names) - len(missing)} done already.")
-    failed = 0
     for job in work_on("Rendering", jobs(missing), len(missing), work):
-        if job.error:
-            failed += 1
-        else:
-            manifest.finish(job.name, file=_file_name(job))
-    return failed
+        if not job.error:  # of a frame, its name; else the file below the input
+            suffix = job.path.suffix
+            file = job.name if job.is_frame else job.name.removesuffix(suffix) + suffix
+            manifest.finish(job.name, file=file)
+    return len(manifest.missing(names))
 
 
 def _print_written(output: Path, names: Sequence[str], failed: int) -> None:
     if failed < len(names):
         print_text(f"Results are in {output}.")
     if failed:
-        sys.exit(
-            f"tangent-render: {failed} of {len(names)} panoramas could not be rendered, see above"
-        )
-
-
-def _file_name(job: Job) -> str:
-    """Return the file of a panorama below the input; of a frame, its name."""
-    return job.name if job.is_frame else job.name.removesuffix(job.path.suffix) + job.path.suffix
+        text = f"{failed} of {len(names)} panoramas could not be rendered, see above"
+        sys.exit(f"tangent-render: {text}")
 
 
 def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
-    """Write the figure of a single panorama."""
-    names = inputs.names
-    if len(names) > 1:
-        raise SettingError("figure", found=f"{len(names)} panoramas", expected="one panorama")
+    """Write the figure of the first panorama."""
     check_new(path, overwrite=settings.overwrite)
-    (job,) = inputs.jobs(names)
+    job = next(iter(inputs.jobs(inputs.names)))
     image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
-    grid, _, _ = _views(settings, image.shape[0])
-    if not isinstance(grid, TangentGrid):
-        raise SettingError("figure", found="a file", expected=f"null, for {settings.views}")
+    grid: Any = _views(settings, image.shape[0])[0]
     write_pixels(path, tangent_figure(image, grid))
     print_text(f"Written: {path}")
 
@@ -173,9 +156,7 @@ def _views(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int,
     section |= {name: value for name, value in given.items() if value is not None}
     # Labels are rendered back from the owner of each direction.
     section |= {"blend": "nearest"} if "blend" in section else {}
-    grid: PinholeGrid | None = getattr(build_from_config(section, "views"), "grid", None)
-    if grid is None:
-        raise SettingError("views", found=settings.views, expected="tangent, horizontal or cubemap")
+    grid: PinholeGrid = build_from_config(section, "views").grid
     if settings.rotation is not None:  # x forward, y to the right, z up
         yaw, pitch, roll = np.radians(settings.rotation)
         # A positive rotation about y looks down.
@@ -186,15 +167,13 @@ def _views(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int,
 
 def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
     """Return the rows of the largest panorama; files that cannot be read fail later."""
-    sizes = [(video.path, video.size[1:]) for video in inputs.videos.values()]
-    rows = [512]
-    for path in inputs.images.values():
-        with suppress(DataError):
-            sizes.append((path, read_image_size(path)))
-    for path, size in sizes:
+    sizes: dict[Path, Any] = {video.path: video.size[1:] for video in inputs.videos.values()}
+    rows = []
+    for path in [*sizes, *inputs.images.values()]:
         with suppress(DataError, SettingError):
+            size = sizes.get(path) or read_image_size(path)
             rows.append(read_area(path, size, settings.area).full_shape[0])
-    return max(rows[1:] or rows)
+    return max(rows, default=512)
 
 
 def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
@@ -204,9 +183,8 @@ def _write_poses(settings: RenderSettings, _: Mapping[str, Any]) -> None:
     rig = read_rig((settings.cameras or model.absolute().parent.parent) / RIG_FILE)
     poses = panorama_poses(model, rig)
     write_poses(output, poses)
-    print_text(
-        f"Written: {output}, poses of {len(poses)} of {counted(len(rig.panoramas), 'panoramas')}"
-    )
+    count = counted(len(rig.panoramas), "panoramas")
+    print_text(f"Written: {output}, poses of {len(poses)} of {count}")
 
 
 def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
@@ -231,32 +209,28 @@ def _render_back(settings: RenderSettings, content: Mapping[str, Any]) -> None:
     found = sorted(path.parent.relative_to(root) for path in root.rglob(CAMERAS_FILE))
     folders = {str(name): back / name for name in found if (back / name).is_dir()}
     if not folders:
-        raise DataError(
-            root,
-            found=f"no {CAMERAS_FILE}",
-            expected="the cameras of the tangent images",
-            remedy="Give cameras=<the folder that tangent-render wrote>.",
-        )
-    manifest = Manifest.open(output, content)
-    failed = _render_missing(
-        manifest,
-        list(folders),
-        lambda names: [Job(name, folders[name]) for name in names],
-        lambda job, _: write(
-            job.path, root / job.name / CAMERAS_FILE, output / job.name, adds_suffix=True
-        ),
-    )
-    _print_written(output, list(folders), failed)
+        remedy = "Give cameras=<the folder that tangent-render wrote>."
+        expected = "the cameras of the tangent images"
+        raise DataError(root, found=f"no {CAMERAS_FILE}", expected=expected, remedy=remedy)
+
+    def work(job: Job, _: Callable[[float], object]) -> None:
+        write(job.path, root / job.name / CAMERAS_FILE, output / job.name, adds_suffix=True)
+
+    def jobs(names: Sequence[str]) -> list[Job]:
+        return [Job(name, folders[name]) for name in names]
+
+    failed = _render_missing(Manifest.open(output, content), [*folders], jobs, work)
+    _print_written(output, [*folders], failed)
 
 
 _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set[str]]] = {
     "input": (
         _render_views,
         {"every", "area", "views", "base_level", "level", "dim", "faces", "rotation", "format"}
-        | {"interpolation", "colmap", "mask", "mask_classes", "figure", "overwrite"},
+        | {"interpolation", "colmap", "mask", "mask_classes", "figure"},
     ),
-    "back": (_render_back, {"cameras", "blend", "height", "kind", "z_depth", "overwrite"}),
-    "poses": (_write_poses, {"cameras", "overwrite"}),
+    "back": (_render_back, {"cameras", "blend", "height", "kind", "z_depth"}),
+    "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
 

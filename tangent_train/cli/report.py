@@ -18,7 +18,17 @@ def report(arguments: Sequence[str]) -> None:
     Raises:
         DataError: Runs are missing or cannot be read.
     """
-    options = _parser().parse_args(arguments)
+    parser = argparse.ArgumentParser(
+        "tangent-report",
+        description="Mean and spread of scores over folds and seeds, with published scores.",
+        epilog="Runs that differ only in fold and seed share a row. Example: tangent-report "
+        "runs/paper/semseg_s7_b0_rgbd --output report_s7",
+    )
+    of_folders = "folders of runs, or folders with runs below them"
+    parser.add_argument("folders", nargs="+", type=Path, help=of_folders)
+    of_output = "folder for report.md, report.csv and report.png (default: report)"
+    parser.add_argument("--output", type=Path, default=Path("report"), help=of_output)
+    options = parser.parse_args(arguments)
     # Slow imports, not needed to refuse a command line.
     from tangent_train.results.evaluation import find_runs, load_result
     from tangent_train.results.report import runs_report
@@ -31,23 +41,3 @@ def report(arguments: Sequence[str]) -> None:
     for note in runs.notes:
         print_text(f"- {note}")
     print_text(f"Files: {options.output}/report.*")
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "tangent-report",
-        description="Mean and spread of scores over folds and seeds, with published scores.",
-        epilog="Runs that differ only in fold and seed share a row. Example: tangent-report "
-        "runs/paper/semseg_s7_b0_rgbd --output report_s7",
-    )
-    parser.add_argument(
-        "folders", nargs="+", type=Path, help="folders of runs, or folders with runs below them"
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=Path("report"),
-        metavar="FOLDER",
-        help="folder for report.md, report.csv and report.png (default: report)",
-    )
-    return parser

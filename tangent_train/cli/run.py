@@ -36,15 +36,7 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
 from tangent_train.inference.up_likelihood import UpLikelihood
-from tangent_train.results.evaluation import (
-    confusion_table,
-    evaluation_result,
-    flat_settings,
-    plain_scores,
-    result_tables,
-    summary_lines,
-    write_results,
-)
+from tangent_train.results import evaluation
 from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table
 from tangent_train.tasks.optimization import Schedule
@@ -95,7 +87,7 @@ class Run:
             use_distributed_sampler=False,  # the samplers of the data count every image once
         )
         for logger in trainer.loggers:
-            logger.log_hyperparams(flat_settings(settings.model_dump(mode="json")))
+            logger.log_hyperparams(evaluation.flat_settings(settings.model_dump(mode="json")))
         return trainer
 
     def contents(self) -> dict[str, Any]:
@@ -165,26 +157,26 @@ class Run:
         is_inside = checkpoint.is_relative_to(self.folder)
         name = str(checkpoint.relative_to(self.folder) if is_inside else checkpoint)
         result = replace(
-            evaluation_result(head, task.result, data.noun, task.evaluated),
+            evaluation.evaluation_result(head, task.result, data.noun, task.evaluated),
             groups=[
                 {"group": group, "images": len(places)}
-                | plain_scores(head.scores_of(task.result, places))
+                | evaluation.plain_scores(head.scores_of(task.result, places))
                 for group, places in sorted(groups.items())
             ],
             protocol={**data.facts, **head.facts},
             checkpoint=name,
             label_map=self.settings.model_dump(mode="json").get("label_map"),
             folds=data.folds,
-            settings=flat_settings(self.settings.model_dump(mode="json")),
+            settings=evaluation.flat_settings(self.settings.model_dump(mode="json")),
         )
-        notes, tables = [f"Checkpoint: {name}", *self.notes], result_tables(result)
-        summary, (rows, sources) = summary_lines(result), published_rows([result])
+        notes, tables = [f"Checkpoint: {name}", *self.notes], evaluation.result_tables(result)
+        summary, (rows, sources) = evaluation.summary_lines(result), published_rows([result])
         published = [published_table(rows, result)] if rows else []
-        write_results(result, self.folder, [*notes, *sources], published)
+        evaluation.write_results(result, self.folder, [*notes, *sources], published)
         write_report(
             self.folder / "report.html",
             f"Evaluation of {checkpoint.name}",
-            tables=[*tables, *([confusion_table(result)] if result.confusion else [])],
+            tables=[*tables, *([evaluation.confusion_table(result)] if result.confusion else [])],
             images=[i for c in callbacks if isinstance(c, Pictures) for i in c.images],
             class_names=head.class_names,
             notes=[*summary, *notes],

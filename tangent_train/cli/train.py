@@ -27,6 +27,14 @@ from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path, write_text
 
+_EXPECTED_WARNINGS = (
+    "Checkpoint directory .* exists and is not empty",  # a resumed run has checkpoints
+    ".* your dataloader is not resumable",  # the data module stores where to continue
+    "Total length of `list` across ranks is zero",  # a run may have no validation
+    "The number of training batches",  # a small data set has few batches
+    "Found .* in eval mode at the start of training",  # network.frozen_statistics=true
+)
+
 
 def train(settings: TrainSettings) -> float | None:
     """Train, then evaluate the best epoch on the test fold, if it is not empty.
@@ -75,11 +83,9 @@ def _create_folder(folder: Path) -> None:
     try:
         (folder / "checkpoints").mkdir(parents=True)
     except FileExistsError as error:
+        found, remedy = f"{folder}, the folder of another run", f"To continue it: resume={folder}"
         raise SettingError(
-            "hydra.run.dir",
-            found=f"{folder}, the folder of another run",
-            expected="a new folder",
-            remedy=f"To continue that run: resume={folder}",
+            "hydra.run.dir", found=found, expected="a new folder", remedy=remedy
         ) from error
 
 
@@ -88,15 +94,8 @@ def _fit(run: Run, trainer: lightning.Trainer, resumed: Path | None) -> None:
     if "SUBMITIT_EXECUTOR" in os.environ:  # SLURM announces the end of a job by SIGUSR2
         signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
     with warnings.catch_warnings():
-        # A resumed run has checkpoints.
-        warnings.filterwarnings("ignore", "Checkpoint directory .* exists and is not empty")
-        # The data module, not its loader, stores where to continue.
-        warnings.filterwarnings("ignore", ".* your dataloader is not resumable")
-        # A run may have no validation; a small data set has few batches.
-        warnings.filterwarnings("ignore", "Total length of `list` across ranks is zero")
-        warnings.filterwarnings("ignore", "The number of training batches")
-        # This is what network.frozen_statistics=true does.
-        warnings.filterwarnings("ignore", "Found .* in eval mode at the start of training")
+        for message in _EXPECTED_WARNINGS:
+            warnings.filterwarnings("ignore", message)
         try:
             trainer.fit(run.task, datamodule=run.data, ckpt_path=resumed, weights_only=True)
         except SIGTERMException:

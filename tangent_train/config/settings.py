@@ -58,21 +58,16 @@ class Settings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
 
-class TrustSettings(Settings):
-    """Settings of commands that may load a network from a file."""
-
-    trust: OneOrMore[str] = ()
-    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
-
-
-class NetworkSettings(TrustSettings):
+class NetworkSettings(Settings):
     """Settings of commands that load a network from a file."""
 
     checkpoint: ExistingPath
     """network, written by tangent-train, tangent-import or tangent-export"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
-class LabelMapSettings(TrustSettings):
+class LabelMapSettings(Settings):
     """Settings of commands that map the classes of a network."""
 
     label_map: str | Path | None = None
@@ -93,7 +88,7 @@ class ImageSettings(Settings):
     sphere"""
 
 
-class PredictSettings(ImageSettings, NetworkSettings, LabelMapSettings):
+class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
     input: str | Path
@@ -179,7 +174,7 @@ class RenderSettings(ImageSettings):
     """indices of the images to write, e.g. [0,5]; null = all"""
     rotation: tuple[float, float, float] | None = None
     """rotation of the views as a whole: [yaw,pitch,roll] in degrees; null = none"""
-    format: str = "png"
+    format: Literal["png", "jpg", "webp", "tif", "npy"] = "png"
     """png | jpg | webp | tif | npy"""
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
     """bilinear | nearest (for labels and depth)"""
@@ -191,7 +186,7 @@ class RenderSettings(ImageSettings):
     mask_classes: OneOrMore[str] | None = None
     """classes to ignore, e.g. [person]; mask is then a folder with labels/ and classes.json"""
     figure: Path | None = None
-    """PNG file of one panorama and its tangent images; output is then optional"""
+    """PNG file of the first panorama and its tangent images; output is then optional"""
     back: ExistingPath | None = None
     """folder of results on the tangent images of one panorama, or a folder of such folders"""
     poses: ExistingPath | None = None
@@ -251,7 +246,7 @@ class ImportSettings(Settings):
     """the network predicts depth of this kind: metric_z | metric_distance | relative_depth |
     relative_disparity | canonical_inverse | log_distance; null = from the model (huggingface),
     or it predicts classes"""
-    image_size: OneOrMore[int] | None = None
+    image_size: Annotated[OneOrMore[PositiveInt], Field(max_length=2)] | None = None
     """fixed size of the images: [rows,columns] or the side; null = from the model"""
     views: Views = None
     """views of panoramas: horizontal_wide | horizontal | horizontal_economy | tangent | erp |
@@ -350,7 +345,7 @@ class RunSettings(Settings):
     off"""
 
 
-class TrainSettings(RunSettings, TrustSettings):
+class TrainSettings(RunSettings):
     """Settings of tangent-train."""
 
     init_from: Path | None = None
@@ -358,9 +353,11 @@ class TrainSettings(RunSettings, TrustSettings):
     weights"""
     resume: Path | None = None
     """folder of an interrupted run, which is continued with its settings"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
 
 
-class EvaluateSettings(RunSettings, NetworkSettings, LabelMapSettings):
+class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """Settings of tangent-evaluate."""
 
     representation: Section | None = None  # type: ignore[assignment]
@@ -403,7 +400,7 @@ class FineTuningSettings(Settings):
     """schedule of the learning rate in fine-tuning"""
 
 
-class TransferSettings(RunSettings, LabelMapSettings):
+class TransferSettings(LabelMapSettings, RunSettings):
     """Settings of tangent-transfer."""
 
     name: str = "transfer"
@@ -416,6 +413,8 @@ class TransferSettings(RunSettings, LabelMapSettings):
     """one transfer per fold, e.g. [1, 2, 3]; null = data.fold, or no folds"""
     checkpoint: ExistingPath | None = None
     """network trained on photos (P), which is evaluated and fine-tuned; null = train it"""
+    trust: OneOrMore[str] = ()
+    """packages of your own whose classes a checkpoint may name, e.g. my_networks"""
     compare: OneOrMore[str | Section] = ("erp", "cubemap")
     """further views to evaluate P on: names of representations, or settings, e.g. {name: fine,
     option: erp, rows: 1024}"""

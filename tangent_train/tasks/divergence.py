@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import lightning
@@ -35,7 +34,7 @@ def check_loss(task: lightning.LightningModule, loss: float, batch: Any) -> None
         cause = f"weights that were not finite before: {broken}"
     data: Any = task.trainer.datamodule  # type: ignore[attr-defined]
     names = [data.dataset("train").name(index) for index in batch.index.tolist()]
-    _stop(task, "loss of", f"{loss}, from {cause}", names)
+    _stop(task, "loss of", f"{loss}, from {cause}", *names)
 
 
 def check_weights(task: lightning.LightningModule) -> None:
@@ -58,16 +57,11 @@ def _broken_tensors(task: lightning.LightningModule) -> str:
     return ", ".join([name for name, tensor in tensors if is_broken(tensor)][:_NAMED])
 
 
-def _stop(
-    task: lightning.LightningModule, subject: str, found: str, names: Sequence[str] = ()
-) -> None:
-    place = ", ".join([f"epoch {task.trainer.current_epoch}", *names[:_NAMED]])
-    half = str(task.trainer.precision).startswith("16")
-    precision = "trainer.precision=bf16-mixed (float16 overflows beyond 65504), " if half else ""
-    raise SettingError(
-        f"{subject} step {task.trainer.global_step} ({place})",
-        found=found,
-        expected="finite numbers",
-        remedy=f"Try, in a new run, {precision}a smaller optimizer.lr or "
-        "trainer.gradient_clip_val=1.",
-    )
+def _stop(task: lightning.LightningModule, subject: str, found: str, *names: str) -> None:
+    trainer = task.trainer
+    place = ", ".join([f"epoch {trainer.current_epoch}", *names[:_NAMED]])
+    remedy = "Try, in a new run, a smaller optimizer.lr or trainer.gradient_clip_val=1."
+    if str(trainer.precision).startswith("16"):
+        remedy += " Or trainer.precision=bf16-mixed: float16 overflows beyond 65504."
+    subject = f"{subject} step {trainer.global_step} ({place})"
+    raise SettingError(subject, found=found, expected="finite numbers", remedy=remedy)

@@ -9,7 +9,6 @@ from typing import Any, Self
 
 import lightning
 import torch
-from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 from torch.optim import Optimizer
@@ -89,12 +88,10 @@ class Task(lightning.LightningModule, ABC):
         self.network: nn.Module = network.to(memory_format=self.memory_format)
         if compile is not None:
             self.network.compile(**compile)  # in place: names of tensors stay as they are
-        self.representation = representation
-        self.head = head
+        self.representation, self.head = representation, head
         self.make_optimizer: Any = optimizer
-        self.schedule = scheduler
+        self.schedule, self.backbone_lr_factor = scheduler, backbone_lr_factor
         self.view_batch_size = view_batch_size
-        self.backbone_lr_factor = backbone_lr_factor
         self.auxiliary_weight = auxiliary_weight
         self.eval_view_batch_size = eval_view_batch_size
         self.sees_rays = sees_rays(network)
@@ -312,16 +309,12 @@ class PixelTask(Task):
     bounds its memory (`models.SphereContext`). The arguments are those of `Task`.
     """
 
-    def forward(
-        self,
-        images: Float[Tensor, "images channels height width"],
-        rays: Float[Tensor, "spheres of_each 3 3"] | None = None,
-    ) -> Mapping[str, Tensor]:
+    def forward(self, images: Tensor, rays: Tensor | None = None) -> Mapping[str, Tensor]:
         """Return the outputs of the network at every pixel by name: ``out``, optionally ``aux``.
 
         Args:
-            images: Images of one or several spheres.
-            rays: Viewing rays, see `Views.rays`, for networks that take them.
+            images: Images ``(n, C, h, w)`` of one or several spheres.
+            rays: Viewing rays ``(spheres, N, 3, 3)`` for networks that take them, see `Views.rays`.
 
         Raises:
             SettingError: The shape of the output does not fit the images or the labels.
@@ -386,7 +379,7 @@ class PixelTask(Task):
 
     def predict_panorama(
         self,
-        images: Float[Tensor, "images channels height width"],
+        images: Tensor,
         shape: Any,
         rotation: NDArray[Any] | None = None,
         valid: NDArray[Any] | None = None,
@@ -395,7 +388,7 @@ class PixelTask(Task):
         """Predict every pixel of a panorama, see `Head`.
 
         Args:
-            images: Images of all view sets of the representation, in this order.
+            images: Images ``(n, C, h, w)`` of all view sets of the representation, in this order.
             shape: ``(H, W)`` of the panorama.
             rotation: Rotation of the representation ``(3, 3)``.
             valid: ``(H, W)`` valid pixels of a partial panorama; None if all are valid.
@@ -435,10 +428,8 @@ class ShapeTask(Task):
     `Task`.
     """
 
-    def forward(
-        self, images: Float[Tensor, "shapes views channels height width"]
-    ) -> Float[Tensor, "shapes classes"]:
-        """Return the logits of the classes."""
+    def forward(self, images: Tensor) -> Tensor:
+        """Return the logits ``(B, K)`` of views ``(B, N, C, h, w)``."""
         logits: Tensor = self.network(images)
         return logits
 

@@ -12,12 +12,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tangent_train.heads.pictures import colorize_distance
 from tangent_train.io.palette import class_colors
 from tangent_train.io.videos import read_frames
 from tests.cli.tiny_runs import Predict, predicted
-from tests.datamodules.data_files import hide_start, read_png
-from tests.inference.trained import CLASS_NAMES, sphere, write_depth_checkpoint
+from tests.datamodules.data_files import read_png
+from tests.inference.trained import CLASS_NAMES, sphere
 from tests.running import Capture, Patch
 
 av: Any = pytest.importorskip("av")
@@ -90,39 +89,6 @@ def test_frames_get_the_labels_of_images_and_pictures_are_a_video(
     entries = predicted(tmp_path / "out")
     assert len(entries) == 2 * len(TIMES)
     assert entries["walk.mp4/000003"]["classes"] == entries["walk/000003"]["classes"]
-
-
-def test_every_third_frame(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
-    """With the numbers and times that they have in the video."""
-    video = _write_video(tmp_path / "in" / "walk.mp4")
-    cv2.imwrite(str(tmp_path / "in" / "a.png"), sphere(32))
-    predict(output="all")
-    predict(every=3)
-    assert "4 images, 0 done already" in capsys.readouterr().out
-    whole, third = (_labels(tmp_path / name / "labels" / "walk") for name in ("all", "out"))
-    assert list(third) == ["000000", "000003", "000006"]
-    assert all((third[name] == whole[name]).all() for name in third)
-    for kind in ("color", "overlay"):
-        made, times = _decoded(tmp_path / "out" / kind / "walk.mp4")
-        assert times == pytest.approx(_decoded(video)[1][::3])
-        expected = _decoded(tmp_path / "all" / kind / "walk.mp4")[0][::3]
-        assert np.abs(made.astype(int) - expected).mean() < 8
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert set(re.findall(r"walk/\d{6}", page)) == {f"walk/{n}" for n in third}
-    with pytest.raises(SystemExit, match="every: found 2; expected 3, with which"):
-        predict(every=2)
-
-
-def test_hidden_frames_are_neither_counted_nor_shown(
-    tmp_path: Path, predict: Predict, capsys: Capture
-) -> None:
-    video = _write_video(tmp_path / "in" / "walk.mp4")
-    hide_start(video, 4 / 16)  # the fourth frame's time
-    for done in (0, 4):
-        predict(report=12)
-        assert f"4 images, {done} done already" in capsys.readouterr().out
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert set(re.findall(r"walk/\d{6}", page)) == {f"walk/{n:06d}" for n in range(4)}
 
 
 def test_an_interrupted_video_is_resumed(
@@ -199,23 +165,3 @@ def test_videos_that_cannot_be_used(
     with pytest.raises(SystemExit, match="1 of 1 images"):
         predict(input=good, output="good")
     assert "pip install -e '.[video]'" in " ".join(capsys.readouterr().out.split())
-
-
-def test_depth_of_a_video(tmp_path: Path, predict: Predict, capsys: Capture) -> None:
-    """The video has one range of colors; missing frames are predicted again."""
-    video = _write_video(tmp_path / "in" / "walk.mp4")
-    settings: dict[str, Any] = {"write": "[depth,color,points]", "points": 100, "align": "none"}
-    settings |= {"checkpoint": write_depth_checkpoint(tmp_path / "net.ckpt"), "input": video}
-    predict(**settings)
-    files = sorted((tmp_path / "out" / "depth" / "walk").iterdir())
-    depth = np.stack([read_png(path) for path in files]) / 1000
-    entries = predict(**settings)
-    assert "7 images, 7 done already" in capsys.readouterr().out
-    assert len(list((tmp_path / "out" / "points" / "walk").glob("*.ply"))) == 7
-    near = min(entry["depth"]["colors"][0] for entry in entries.values())
-    far = max(entry["depth"]["colors"][1] for entry in entries.values())
-    colors = np.stack([colorize_distance(frame, (near, far)) for frame in depth])
-    made, _ = _decoded(tmp_path / "out" / "color" / "walk.mp4")
-    assert np.abs(made - colors.astype(float)).mean() < 8
-    predict(**settings | {"write": "[color]", "points": "null"}, output="other")
-    assert len(list((tmp_path / "other" / "depth" / "walk").iterdir())) == 7, "of the video"

@@ -60,32 +60,6 @@ def test_colors_come_back(
     np.testing.assert_array_equal(again, tangent_to_equirect(expected, grid, (64, 128), blend))
 
 
-@pytest.mark.parametrize(
-    "dtype", ["i1", "u4", "i8", "u8", ">u2", ">i4", ">f4", "f2", "f8", "?", "fortran"]
-)
-def test_arrays_of_any_type_keep_their_values(tmp_path: Path, dtype: str) -> None:
-    """Nearest pixels, there and back: squares of large numbers, such as ids of 62 bits."""
-    rng = np.random.default_rng(0)
-    ids = np.kron(rng.integers(2**40, 2**62, (8, 16)), np.ones((8, 8), np.int64))
-    values = ids.astype(np.int32, order="F") if dtype == "fortran" else (ids % 1000).astype(dtype)
-    values = ids.astype(dtype) if dtype in ("u4", "i8", "u8", ">u2", ">i4", "f8") else values
-    np.save(tmp_path / "ids.npy", values)
-    settings = {"base_level": 0, "level": 7, "interpolation": "nearest", "format": "npy"}
-    render_with(input=tmp_path / "ids.npy", output=tmp_path / "tan", **settings)
-    images = [np.load(path) for path in (tmp_path / "tan" / "ids").glob("*.npy")]
-    assert set(np.unique(images).tolist()) <= set(values.ravel().tolist())
-    kind = {} if values.dtype.kind == "f" else {"kind": "labels"}
-    folder = tmp_path / "tan" / "ids"
-    render_with(back=folder, output=tmp_path / "back.npy", blend="nearest", **kind)
-    back = np.load(tmp_path / "back.npy")
-    assert back.dtype.newbyteorder("=") == values.dtype.newbyteorder("=")
-    inside = np.kron(np.ones((8, 16)), np.pad(np.ones((4, 4)), 2)) == 1
-    inside[:8], inside[-8:] = False, False  # near the poles squares are slim
-    # Floats are features, which are interpolated.
-    rtol = {"f2": 2e-3, ">f4": 2e-7, "f8": 4e-16}.get(dtype, 0)
-    np.testing.assert_allclose(back[inside], values[inside], rtol=rtol, atol=0)
-
-
 def test_a_folder_of_panoramas_and_back_is_continued(tmp_path: Path, refused: Refused) -> None:
     for name in ("a.png", "deeper/b.jpg", "deeper/c.v2.tif"):
         write_pixels(tmp_path / "in" / name, smooth(32))
@@ -107,18 +81,6 @@ def test_a_folder_of_panoramas_and_back_is_continued(tmp_path: Path, refused: Re
     assert written == {"deeper/b.png", "deeper/c.v2.png", "new.png"}
     for name in written:
         assert np.abs(_read(back / name).astype(int) - smooth(32)).max() <= 12
-
-
-def test_levels_follow_the_rows_and_large_panoramas_are_averaged(tmp_path: Path) -> None:
-    write_pixels(tmp_path / "a.png", smooth(90))
-    render_with(input=tmp_path / "a.png", output=tmp_path / "tan", base_level=0)
-    assert read_cameras(tmp_path / "tan" / "a" / "cameras.json").grid == TangentGrid(0, 5)
-    # A checkerboard of single pixels: averaged it is gray, sampled it would be black and white.
-    board = np.where(np.indices((128, 256)).sum(axis=0) % 2, 255, 0)
-    write_pixels(tmp_path / "board.png", board[..., None].repeat(3, axis=2).astype(np.uint8))
-    render_with(input=tmp_path / "board.png", output=tmp_path / "fine", base_level=0, level=5)
-    assert set(np.unique(_read(tmp_path / "fine" / "board" / "face_004.png"))) <= {127, 128}
-    assert read_cameras(tmp_path / "fine" / "board" / "cameras.json").shape == (128, 256)
 
 
 def test_labels_are_never_mixed(tmp_path: Path, refused: Refused) -> None:
@@ -213,11 +175,8 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
     np.save(tmp_path / "features" / "face_003.npy", np.zeros((20, 20, 3), np.float32))
     message = refused(output=tmp_path / "no.npy", **settings)
     assert "face_003.npy: found float32 of shape (20, 20, 3)" in message
-    given = {"views": views, "figure": "a.png"}
-    assert "figure: found" in refused(input=tmp_path / "room.png", **given)
-    for changes in ({"views": "erp"}, {"views": views, "base_level": 0}):
-        message = refused(input=tmp_path / "room.png", output=tmp_path / "no", **changes)
-        assert "views: found" in message
+    changed = {"output": tmp_path / "no", "views": views, "base_level": 0}
+    assert "views: found" in refused(input=tmp_path / "room.png", **changed)
 
 
 @pytest.mark.parametrize(
@@ -243,8 +202,6 @@ def test_a_figure_alone_or_beside_the_images(room: Path, tmp_path: Path, refused
     assert _read(figure).shape[1] == 1600
     message = refused(input=room, figure=figure, output=tmp_path / "tan")
     assert "figure.png, which exists" in message
-    write_pixels(room.with_name("second.png"), smooth(32))
-    assert "figure: found 2 panoramas" in refused(input=room.parent, figure=tmp_path / "b.png")
 
 
 def test_a_broken_panorama_does_not_stop_the_others(tmp_path: Path, refused: Refused) -> None:
@@ -335,8 +292,8 @@ _IN = {"input": "in", "output": "tan"}
     ("settings", "message"),
     [
         ({}, "found none of them; expected input=<panoramas>, back="),
-        ({"input": "in"}, "output: found null"),
-        ({**_IN, "format": "gif"}, r"\.gif.*expected .*\.png"),
+        ({"input": "in"}, "found input; expected .* and output="),
+        ({**_IN, "format": "gif"}, "format: found gif; expected 'png', "),
         (
             {**_IN, "interpolation": "nearest", "format": "jpg"},
             "found jpg; .* other formats change pix",

@@ -228,23 +228,4 @@ def test_poses_of_panoramas_are_those_of_their_images(project: Path, tmp_path: P
         np.testing.assert_allclose(points, expected, atol=1e-9)
 
 
-def test_models_of_something_else(project: Path, tmp_path: Path, refused: Refused) -> None:
-    settings = {"output": tmp_path / "poses.json", "cameras": project}
-    assert "expected a folder with a sparse COLMAP model" in refused(poses=project, **settings)
-    (tmp_path / "empty").mkdir()
-    pycolmap.Reconstruction().write(tmp_path / "empty")
-    assert "found none of the panoramas" in refused(poses=tmp_path / "empty", **settings)
-    settings["cameras"] = tmp_path
-    assert "rig_config.json: found No such file" in refused(poses=tmp_path / "empty", **settings)
-    assert not (tmp_path / "poses.json").exists()
-
-
 # Refused settings.
-
-
-def test_settings_that_make_no_project(panoramas: Path, tmp_path: Path, refused: Refused) -> None:
-    settings = {"input": panoramas, "output": tmp_path / "out", "colmap": True}
-    write_pixels(tmp_path / "mask.jpg", smooth(16))
-    message = refused(mask=tmp_path / "mask.jpg", **settings)
-    assert "mask.jpg: found JPEG or WebP, which blur masks" in message
-    assert not (tmp_path / "out").exists()

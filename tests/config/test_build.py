@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import pytest
-from omegaconf import DictConfig
 
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
@@ -32,25 +30,6 @@ class Handing(Kept):
 def pair(first: Any, second: Any = None) -> tuple[Any, Any]:
     """Return both arguments."""
     return first, second
-
-
-def test_conventions_of_hydra() -> None:
-    inner = {"_target_": f"{ME}.pair", "first": 1}
-    kept = build_from_config({"_target_": f"{ME}.Kept", "_args_": [1, inner], "x": [inner]}, "x")
-    assert kept.positional == (1, (1, None))
-    assert kept.named == {"x": [(1, None)]}
-    left = {"_target_": f"{ME}.Kept", "_recursive_": False, "x": inner}
-    assert build_from_config(left, "x").named == {"x": inner}
-    for convert, kind in ((None, dict), ("all", dict), ("none", DictConfig)):
-        section = {"_target_": f"{ME}.Kept", "x": {"y": [1]}} | (
-            {} if convert is None else {"_convert_": convert}
-        )
-        assert type(build_from_config(section, "x").named["x"]) is kind
-    later = build_from_config({"_target_": f"{ME}.pair", "_partial_": True, "first": 1}, "x")
-    assert type(later) is partial
-    assert (later.func, later.keywords, later(second=2)) == (pair, {"first": 1}, (1, 2))
-    given = build_from_config({"_target_": f"{ME}.pair", "first": 1}, "x", first=inner, second=2)
-    assert given == (inner, 2), "handed on as they are"
 
 
 @pytest.mark.parametrize(

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 from omegaconf import OmegaConf
 
 from tangent_train.config.help import annotate, command_settings, description, read_settings
-from tangent_train.config.settings import SETTINGS, validate
+from tangent_train.config.settings import SETTINGS
 from tangent_train.errors import SettingError
 from tangent_train.files import config_folder
 from tests.running import command_of, composed, composed_settings, run_python
@@ -136,7 +135,6 @@ def test_settings_of_one_name_are_explained_apart() -> None:
     [
         ("train", "--help", "backbone_lr_factor: 1.0       # factor of the learning rate"),
         ("train", "levl=5", "Did you mean level?"),
-        ("train", "experiment=demmo", "Available options in 'experiment'"),
         ("train", "resume=nowhere", "nowhere: found no config.yaml"),
         ("export", "output=x.onnx", "checkpoint: found nothing; expected network"),
         ("report", "--help", "runs/paper/semseg_s7_b0_rgbd --output"),
@@ -155,8 +153,3 @@ def test_answers_before_anything_heavy_is_imported(
     done = run_python(tmp_path, "-c", code)
     assert message in done.stdout + done.stderr
     assert "heavy 0" in done.stdout
-
-
-def test_plain_mappings_are_validated_too() -> None:
-    values: dict[str, Any] = {"checkpoint": str(CONFIGS), "output": "x.onnx", "image_size": [4, 8]}
-    assert validate("export", values).image_size == (4, 8)

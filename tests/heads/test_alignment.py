@@ -288,26 +288,6 @@ def test_views_are_sampled_where_the_canvas_is(name: str) -> None:
     np.testing.assert_allclose(samples.ray_length, 1 / cosines, rtol=1e-2)
 
 
-@pytest.mark.parametrize("kind", KINDS[1:])
-def test_rendered_views_of_a_room_agree_after_the_alignment(kind: Kind) -> None:
-    """End to end, with depth of every pixel and bilinear samples: nearly exact."""
-    grid, rng, points = TangentGrid(0, 6), np.random.default_rng(9), sphere_points(SHAPE)[::4]
-    views = PinholeViews(grid)
-    lengths = views.ray_lengths().astype(float)
-    distance = _room()(grid.directions())
-    scale = np.exp(rng.normal(0, 0.5, 20))[:, None, None]
-    output = _output(distance, lengths, kind)
-    output = output * scale + rng.normal(0, 0.5, scale.shape) * kind.startswith("relative")
-    found = align_views([sample_views(output, views, SHAPE, points)], kind)
-    part = slice(3, 17)
-    raw, lengths_of_rays = torch.from_numpy(output[part, None]), torch.from_numpy(lengths)
-    applied = found.applied(raw, part, lengths_of_rays)[:, 0].numpy()
-    if kind == "relative_disparity":
-        applied = -np.log(applied)
-    errors = applied - np.log(distance[part])
-    assert np.quantile(np.abs(errors - np.median(errors)), 0.99) < 2e-3
-
-
 def test_a_grid_removes_smooth_errors_of_views() -> None:
     """Corrections of the logarithm, bilinear between 5 × 5 nodes, are applied where fitted."""
     grid, rng, points = TangentGrid(0, 5), np.random.default_rng(10), sphere_points(SHAPE)[::4]

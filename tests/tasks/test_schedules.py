@@ -13,7 +13,6 @@ import lightning
 import pytest
 import torch
 from torch.optim import lr_scheduler
-from transformers import get_scheduler
 
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, LastCheckpoint
 from tangent_train.tasks.optimization import Schedule, warmup_cosine
@@ -61,19 +60,13 @@ def _train(
     return rates.found
 
 
-_EVERY_STEP: dict[str, Any] = {"max_lr": LR, "total_steps": None}
 SCHEDULES: dict[str, Any] = {
     "none": None,
-    "cosine": partial(lr_scheduler.CosineAnnealingLR, T_max=4),
     "steps": partial(lr_scheduler.StepLR, step_size=1, gamma=0.5),
-    "one cycle": Schedule(partial(lr_scheduler.OneCycleLR, **_EVERY_STEP), "step"),
     "warm-up and cosine": Schedule(
         partial(warmup_cosine, warmup_share=0.25, total_steps=_NULL), "step"
     ),
     "every other step": Schedule(partial(lr_scheduler.CosineAnnealingLR, T_max=6), "step", 2),
-    "cosine of transformers": partial(
-        get_scheduler, "cosine", num_warmup_steps=1, num_training_steps=4
-    ),
 }
 
 

@@ -121,17 +121,3 @@ def test_shards_fill_a_cache_and_only_missing_files_are_decoded(
     monkeypatch.setattr(Stanford2D3DS, "read", noted)
     Stanford2D3DS(root, erp, cache=cache).prepare_data()
     assert len(decoded) == 1
-
-
-def test_settings_of_the_decoding_have_caches_of_their_own(
-    root: Path, erp: Any, tmp_path: Path
-) -> None:
-    choices: tuple[dict[str, Any], ...] = (
-        {},
-        {"classes": 8},
-        {"unknown": "any_black"},
-        {"fold": 2},
-    )
-    for changes in choices:
-        Stanford2D3DS(root, erp, cache=tmp_path / "cache", **changes).prepare_data()
-    assert len(list((tmp_path / "cache").iterdir())) == 3, "folds share the files"

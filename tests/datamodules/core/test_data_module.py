@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import multiprocessing
 import pickle
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -23,7 +21,7 @@ from datamodules.core.label_map import class_weights
 from datamodules.core.loading import EpochSampler
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS
 from tangent_train.errors import SettingError
-from tangent_train.rendering import EquirectRepresentation, TangentRepresentation
+from tangent_train.rendering import TangentRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import names_of
 
@@ -59,23 +57,6 @@ def test_the_same_samples_for_any_number_of_workers(
     assert alone[0] != alone[1]
 
 
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="needs fork")
-def test_workers_start_after_opencv_has_used_threads(make_module: MakeModule) -> None:
-    # cv2.setNumThreads(1) in a forked worker never returned.
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(2)
-    cv2.resize(np.zeros((2048, 4096, 3), np.uint8), (1000, 500), interpolation=cv2.INTER_AREA)
-    prepare = make_module().train_dataloader().worker_init_fn
-    worker = multiprocessing.get_context("fork").Process(target=prepare, args=(0,))
-    worker.start()
-    worker.join(20)
-    stuck = worker.is_alive()
-    worker.kill()
-    worker.join()
-    cv2.setNumThreads(before)
-    assert not stuck
-
-
 def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     make_module: MakeModule, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,19 +79,6 @@ def test_rotated_panoramas_are_seen_upright_where_up_is_known(
     rotated_up = known.dataset("test").read(0).up
     assert rotated_up is not None
     assert aware.up @ rotated_up == pytest.approx(0.8)
-
-
-def test_up_is_estimated_from_the_file_of_a_small_panorama(
-    stanford_root: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    seen: list[NDArray[np.uint8]] = []
-    estimate = "datamodules.core.image_module.estimate_up"
-    monkeypatch.setattr(estimate, lambda rgb, *_: seen.append(rgb))
-    for level in (3, 4):  # the files have 32 rows
-        representation = EquirectRepresentation(level)
-        module = Stanford2D3DS(stanford_root, representation, test_rotation=30, upright="auto")
-        rotated = module.dataset("test").read(0).rgb
-    np.testing.assert_array_equal(seen, [rotated, rotated])
 
 
 def test_a_network_estimates_up_of_test_panoramas_that_were_read_before(
@@ -239,14 +207,6 @@ def test_overfitting_takes_the_same_views_in_every_epoch_of_both_splits(
     path = tmp_path / "within.ckpt"
     trainer.fit(resumed, datamodule=make_module(batch_size=1), ckpt_path=path)
     assert resumed.batches["train"] == [second, first, second]
-    task = Seen()
-    limits: dict[str, Any] = {"limit_train_batches": 3, "limit_val_batches": 1}
-    Trainer(max_epochs=2, **limits, **quiet).fit(task, datamodule=module)
-    assert [len(task.batches[split]) for split in ("train", "val")] == [6, 2]
-    assert len(set(task.batches["train"])) > 3, "another order and other views"
-    task = Seen()
-    Trainer(fast_dev_run=1, **quiet).fit(task, datamodule=module)
-    assert len(task.batches["train"]) == 1
 
 
 def test_images_have_the_precision_of_the_run(

@@ -12,24 +12,18 @@ import torch
 from numpy.typing import NDArray
 
 from datamodules.cityscapes import Cityscapes
-from datamodules.core.files import SPLITS
 from datamodules.core.image_module import ImageDataModule, PhotoDataModule, draw_rotation
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
-from datamodules.folder.labeled import FolderPanoramas, FolderPhotos
-from datamodules.matterport360 import Matterport360
+from datamodules.folder.labeled import FolderPanoramas
 from datamodules.stanford2d3ds.panoramas import Stanford2D3DS, Stanford2D3DSPerspective
-from datamodules.structured3d import Structured3D, Structured3DPerspective
-from datamodules.synthia.omnisynthia import OmniSynthia, SynthiaPerspective
-from tangent_train.errors import DataError, SettingError
+from datamodules.synthia.omnisynthia import SynthiaPerspective
+from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions
 from tangent_train.io.pixel_files import write_depth_m
 from tangent_train.rendering import EquirectRepresentation, PerspectiveRepresentation
 from tests.conftest import fabricate
 from tests.datamodules.data_files import read_png, write_png
 from tests.datamodules.folder.folder_format import save, write_data_set
-from tests.datamodules.folder.photo_format import write_cameras, write_photos
-from tests.datamodules.matterport_format import write_matterport
-from tests.datamodules.structured3d_format import write_structured3d
 from tests.datamodules.synthia_format import write_views
 
 _AREAS = dict.fromkeys(("1", "2", "3", "4", "5a", "5b", "6"), ("office_1",))
@@ -53,31 +47,10 @@ class Source(NamedTuple):
     settings: Mapping[str, Any] = {}
 
 
-def _folder_photos(root: Path) -> None:
-    write_photos(root, scenes=5)
-    write_cameras(root, {".": {"fx": 60, "fy": 50, "cx": 20, "cy": 30.5}})
-    for path in (root / "images").rglob("*.*"):
-        values = read_png(root / "labels" / path.relative_to(root / "images").with_suffix(".png"))
-        write_png(root / "depth" / path.parent.name / f"{path.stem}.png", values.astype(np.uint16))
-
-
-_SCENES = (0, 1, 2, 3000, 3250)
 SOURCES = {
     "stanford2d3ds": Source(
         *(Stanford2D3DS, lambda root: fabricate(root, _AREAS, height=40)),
         "area_*/pano/depth/*.png",
-    ),
-    "structured3d": Source(
-        *(Structured3D, lambda root: write_structured3d(root, _SCENES, height=40)),
-        "*/*/*/panorama/full/depth.png",
-    ),
-    "matterport360": Source(
-        Matterport360, lambda root: write_matterport(root, height=40), "*/depth/*.png"
-    ),
-    "sfss": Source(
-        *(Matterport360, lambda root: write_matterport(root, height=40)),
-        "*/panorama/undistorted_depth_images/*.png",
-        {"release": "sfss"},
     ),
     "folder": Source(
         *(FolderPanoramas, lambda root: write_data_set(root, scenes=5, height=40, depth=True)),
@@ -88,10 +61,6 @@ SOURCES = {
         *(Stanford2D3DSPerspective, lambda root: fabricate(root, _AREAS, photos=1)),
         "area_*/data/depth/*.png",
     ),
-    "structured3d_perspective": Source(
-        *(Structured3DPerspective, lambda root: write_structured3d(root, _SCENES, photos=True)),
-        "*/*/*/perspective/full/*/depth.png",
-    ),
     "synthia_perspective": Source(
         *(
             SynthiaPerspective,
@@ -99,7 +68,6 @@ SOURCES = {
         ),
         "*/Depth/Stereo_Left/*/*.png",
     ),
-    "folder_photos": Source(FolderPhotos, _folder_photos, "depth/*/*.png"),
 }
 
 
@@ -162,26 +130,6 @@ def test_store_and_memory_equal_the_files(made: tuple[Source, Path], tmp_path: P
     target.zero_()
     assert data.dataset("test")[0].labels.max() > 0, "a copy of what is in memory"
     assert len(list(tmp_path.iterdir())) == 2
-
-
-def test_missing_and_broken_depth_is_named(tmp_path: Path, made: tuple[Source, Path]) -> None:
-    source, _ = made
-    source.write(tmp_path)
-    data = _data(source, tmp_path)
-    every = [files for split in SPLITS for files in data.splits()[split]]
-    gone, cut, *_ = (files.depth for files in every)
-    gone.unlink()
-    cut.write_bytes(cut.read_bytes()[:-20])
-    problems, _ = _data(source, tmp_path).check()
-    found = sorted(str(problem.file) for problem in problems.listed())
-    assert [name.removesuffix(".png") for name in found] == sorted(
-        str(path).removesuffix(".png") for path in (gone, cut)
-    )
-    with pytest.raises(DataError, match=r"depth"):
-        _data(source, tmp_path).prepare_data()
-    left = _data(source, tmp_path, skip_broken=True)
-    left.prepare_data()
-    assert sum(map(len, left.splits().values())) == len(every) - 2
 
 
 def _pixels(
@@ -259,7 +207,6 @@ def test_unlikely_depth_is_warned_of_and_counted(tmp_path: Path) -> None:
     ("kind", "settings", "message"),
     [
         (Cityscapes, {}, "data.labels: found distance; .*disparities are not read"),
-        (OmniSynthia, {}, "data.labels: found distance; .*z-depth of the four views"),
         (Stanford2D3DS, {"inputs": ["rgb", "depth"]}, "data.inputs: .*no depth: it is the target"),
         (Stanford2D3DS, {"classes": 8}, "data.classes: found 8; expected null"),
     ],

@@ -65,9 +65,7 @@ def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"val_fraction": 1}, "data.val_fraction: found 1; expected less than 1"),
         ({"inputs": ["rgb", "sound"]}, "data.inputs: found sound; expected 'rgb', 'depth' or"),
-        ({"batch_size": 0}, "data.batch_size: found 0; expected greater than"),
         ({"test_rotation": "yaw"}, "data.test_rotation: found yaw"),
         ({"classes": 4}, "data.classes: found 4; expected 3"),
         ({"colour": 1}, "data.colour: found 1; expected Unexpected keyword argument"),

@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import csv
-import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 
 from tangent_train.checkpoints.loaded import load_network
-from tangent_train.io.pixel_files import read_depth_m, write_pixels
-from tests.cli.tiny_runs import SMALL_ROOMS, Run, predicted, results, run_in
-from tests.inference.trained import sphere, write_depth_checkpoint
-from tests.slow.cli.test_sweeps import OLD_SQLALCHEMY
+from tests.cli.tiny_runs import SMALL_ROOMS, Run, results, run_in
+from tests.inference.trained import write_depth_checkpoint
 
 SETTINGS = (
     "experiment=rooms/depth",
@@ -130,46 +126,6 @@ def test_fine_tuning_starts_from_a_run_and_keeps_the_kind_of_an_imported_network
     trained = load_network(Path("relative/checkpoints/best.ckpt"))
     assert trained.depth_kind == "relative_disparity"
     assert results(Path("relative"))["protocol"]["alignment"] == "affine in disparity"
-
-
-def test_an_imported_network_is_evaluated(run: Run) -> None:
-    write_depth_checkpoint(Path("metric.ckpt"), depth_kind="metric_z")
-    data = ["data=synthrooms", "data.inputs=[rgb]", "task=depth", "level=4"]
-    data += ["data.rooms.views=wide"]  # those of the experiment
-    data += [s for s in SETTINGS if s.startswith(("data.rooms", "data.root"))]
-    run(
-        "evaluate",
-        "checkpoint=metric.ckpt",
-        *data,
-        "task.head.alignment=median",
-        "hydra.run.dir=im",
-    )
-    assert results(Path("im"))["protocol"]["alignment"] == "median in distance"
-
-
-def test_an_exported_network_predicts_the_same_depth(run: Run) -> None:
-    write_pixels(Path("in/hall.png"), sphere(32))
-    checkpoint = "whole/checkpoints/best.ckpt"
-    run("predict", f"checkpoint={checkpoint}", "input=in", "output=out", "write=[depth]")
-    run("export", f"checkpoint={checkpoint}", "output=network.safetensors")
-    exported = ("checkpoint=network.safetensors", "input=in", "output=exported", "write=[depth]")
-    run("predict", *exported)
-    assert predicted(Path("out")).keys() == {"hall"}
-    depth, other = (read_depth_m(Path(n) / "depth" / "hall.png", 1000) for n in ("out", "exported"))
-    np.testing.assert_allclose(depth, other, atol=2e-3)
-    assert 0.1 < np.nanmedian(depth) < 20
-
-
-@OLD_SQLALCHEMY
-def test_a_sweep_searches_for_the_smallest_error(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hydra._internal.utils.is_under_debugger", lambda: False)
-    once = (*SETTINGS, "panels=0", "trainer.max_epochs=1")
-    study = ("sweep=optuna", "hydra.sweeper.n_trials=2", "hydra.sweep.dir=study")
-    with pytest.raises(SystemExit, match="expected minimize, for val/absrel"):
-        run("train", "-m", *study, *once)
-    run("train", "-m", *study, *once, "hydra.sweeper.direction=minimize")
-    scores = [json.loads((Path("study") / n / "validation.json").read_text())["best"] for n in "01"]
-    assert f"{min(scores)}" in (Path("study") / "optimization_results.yaml").read_text()
 
 
 @pytest.mark.usefixtures("stages")

@@ -11,7 +11,6 @@ import pytest
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.io.pixel_files import read_depth_m, write_pixels
 from tests.cli.tiny_runs import Run, predicted, run_command
-from tests.datamodules.data_files import read_png
 from tests.inference.trained import sphere, write_checkpoint, write_depth_checkpoint
 
 ROWS = 64
@@ -47,18 +46,3 @@ def test_folders_of_images_with_depth(run: Run, tmp_path: Path, kind: str) -> No
     write_checkpoint(tmp_path / "rgbd.ckpt", channels=4)
     run("predict", "checkpoint=rgbd.ckpt", "input=in", "output=labels", "depth=out/depth")
     assert predicted(Path("labels")).keys() == {"hall", "flat/kitchen"}
-
-
-def test_tangent_images_and_projects_of_depth(run: Run, tmp_path: Path) -> None:
-    """Rendered back, most pixels are what they were; none is a mixture of two."""
-    run("predict", "checkpoint=depth.ckpt", "input=in", "output=out", "write=[depth]")
-    images = ("input=out/depth", "interpolation=nearest", "base_level=0", "level=7")
-    run("render", *images, "output=tangent")
-    run("render", "back=tangent", "output=again")
-    depth, again = (read_png(tmp_path / name / "hall.png") for name in ("out/depth", "again"))
-    assert (depth == again).mean() > 0.8
-    assert set(np.unique(again)) <= set(np.unique(depth))
-    run("render", *images, "output=project", "colmap=true")
-    face = read_png(next((tmp_path / "project" / "images").rglob("hall.png")))
-    assert face.dtype == np.uint16
-    assert set(np.unique(face)) <= {0, *np.unique(depth).tolist()}

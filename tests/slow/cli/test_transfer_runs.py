@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import json
 import shutil
-from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
 
-from datamodules.cityscapes import CLASSES
-from tangent_train.results.published import facts
 from tests.cli.pretended_runs import HERE, OF_SEED_0, SETTINGS
-from tests.cli.tiny_runs import Run, results
+from tests.cli.tiny_runs import Run
 from tests.datamodules.folder.folder_format import write_classes, write_data_set
 from tests.datamodules.folder.photo_format import write_photos
-from tests.datamodules.street_format import write_cityscapes, write_densepass
 
 
 def test_real_runs_from_photos_to_panoramas(
@@ -70,29 +66,3 @@ def test_classes_are_compared_before_training(tmp_path: Path, run: Run) -> None:
     with pytest.raises(SystemExit, match=message):
         run("transfer", *_SETTINGS)
     assert not list(Path("runs").rglob("P"))
-
-
-@pytest.mark.usefixtures("stages")
-def test_an_imported_network_is_evaluated_on_photos_and_panoramas(run: Run, tmp_path: Path) -> None:
-    """Cityscapes to DensePASS with 13 classes, without training."""
-    from tests.photo_networks import huggingface_networks as networks
-
-    panoramas = write_densepass(tmp_path / "panoramas", names=(1,))
-    photos = write_cityscapes(tmp_path / "photos")
-    size = {"height": 32, "width": 32}
-    networks.saved(partial(networks.segformer, CLASSES), tmp_path / "segformer", size=size)
-    run("import", "library=huggingface", "model=segformer", "output=segformer.ckpt")
-    experiment = "field/cityscapes_densepass_13"
-    arguments = [f"experiment={experiment}", "checkpoint=segformer.ckpt", "level=6"]
-    arguments += [f"data.root={panoramas}", f"photos.data.root={photos}", "panels=0"]
-    arguments += ["data.num_workers=0", "photos.data.num_workers=0", "trainer.accelerator=cpu"]
-    run("transfer", *arguments, "label_map=cityscapes_to_densepass13")
-    folder = tmp_path / "runs" / "transfer" / experiment / "seed_0"
-    assert {path.name for path in folder.iterdir()} == {"P", "S"}
-    assert not list(folder.glob("*/checkpoints"))
-    found = results(folder / "S")
-    small = {"size": "256 × 128", "images": "1 of 100"}
-    assert found["protocol"] == facts("densepass_13") | small
-    assert found["label_map"] == "cityscapes_to_densepass13"
-    report = (folder.parent / "transfer.md").read_text()
-    assert "Trans4PASS+ (S), trained on Cityscapes: 51.4 and" in report
