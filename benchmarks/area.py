@@ -15,7 +15,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.io.gpano import PanoramaArea
 
 WHOLE, PART = "whole panorama", "35° above and below the horizon"
@@ -46,7 +46,7 @@ def area(quick: bool) -> Iterator[Table]:
         },
         image_size=(2**level, 2**level),
     )
-    predictor = Predictor(trained, head_of(trained), PanoramaViews(trained))
+    predictor = Predictor(trained, head_of(trained), ViewSelector(trained))
     alternatives = [
         Alternative(of, partial(predictor.predict, image), of == PART)
         for of, image in images.items()

@@ -18,7 +18,7 @@ from tangent_train.geometry import equirect_directions
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, views_per_forward
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews, photo_network_settings
+from tangent_train.inference.views import ViewSelector, photo_network_settings
 
 
 class RoomDepth(nn.Module):
@@ -52,7 +52,7 @@ def depth(quick: bool) -> Iterator[Table]:
     x, y, z = np.moveaxis(equirect_directions((rows, 2 * rows)), -1, 0)
     near = 1 / np.minimum.reduce([3 / np.abs(x), 2 / np.abs(y), 1.4 / np.abs(z)])
     rgb = np.stack([300 * near, 128 + 100 * y, 0 * z], axis=-1).astype(np.uint8)
-    chosen = PanoramaViews(trained)
+    chosen = ViewSelector(trained)
     count = sum(map(len, chosen.representation.view_sets()))
     random = torch.rand(views_per_forward((side, side)), 3, side, side)
     network = HuggingFaceDepthNetwork({"model_type": "depth_anything"}).eval().requires_grad_(False)

@@ -12,8 +12,7 @@ from tangent_train.imports import check_own_packages
 
 if TYPE_CHECKING:
     from tangent_train.geometry import RingGrid, TangentGrid
-    from tangent_train.inference.api import load
-    from tangent_train.inference.applying import apply
+    from tangent_train.inference.api import apply, load
     from tangent_train.rendering import (
         equirect_to_tangent,
         tangent_to_equirect,
@@ -35,7 +34,7 @@ check_own_packages()
 _HOMES = {
     "RingGrid": "geometry",
     "TangentGrid": "geometry",
-    "apply": "inference.applying",
+    "apply": "inference.api",
     "load": "inference.api",
 }
 

@@ -15,11 +15,11 @@ from tests.running import run_python
 
 def test_names_come_from_their_packages() -> None:
     from tangent_train import geometry, rendering
-    from tangent_train.inference import api, applying
+    from tangent_train.inference import api
 
     assert tangent_train.TangentGrid is geometry.TangentGrid
     assert tangent_train.load is api.load
-    assert tangent_train.apply is applying.apply
+    assert tangent_train.apply is api.apply
     for name in ("equirect_to_tangent", "tangent_to_equirect", "tangent_to_labels"):
         assert getattr(tangent_train, name) is getattr(rendering, name)
     for package in (tangent_train, models):

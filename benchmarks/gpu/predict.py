@@ -23,9 +23,9 @@ from tangent_train.cli.processes import command_line
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import TangentGrid, equirect_shape
 from tangent_train.heads import head_of
-from tangent_train.inference.engine import Predictor, view_scores, views_per_forward
+from tangent_train.inference.engine import Predictor, scored_views, views_per_forward
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.photo_networks import PhotoNetwork, import_network
 
 
@@ -70,7 +70,8 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
     random = random.contiguous(memory_format=torch.channels_last)
 
     def scores(views: Callable[[slice], torch.Tensor]) -> list[torch.Tensor]:
-        parts = view_scores(trained.network, views, grid.num_images, per_forward)
+        sets = [(range(grid.num_images), views, None)]
+        parts = scored_views(trained.network, sets, per_forward)
         return [part for _, part in parts]
 
     def labeled(predictor: Predictor) -> None:
@@ -80,7 +81,7 @@ def _rows(trained: LoadedNetwork, level: int, rounds: int) -> list[Row]:
         Alternative("the network", lambda: scores(lambda part: random[: part.stop - part.start]))
     ]
     for blend in ("feather", "nearest"):
-        views = PanoramaViews(trained, blend=blend)
+        views = ViewSelector(trained, blend=blend)
         call = partial(labeled, Predictor(trained, head_of(trained), views, DEVICE.type))
         alternatives.append(Alternative(f"Predictor, {blend}", call, is_ours=True))
     with torch.autocast(DEVICE.type, torch.bfloat16, enabled=DEVICE.type == "cuda"):

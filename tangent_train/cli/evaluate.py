@@ -14,7 +14,7 @@ from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.run import Run, build_data, build_head, build_task
 from tangent_train.config.settings import EvaluateSettings, typed_names
 from tangent_train.errors import SettingError
-from tangent_train.inference.label_maps import load_label_map, map_classes
+from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
 
 _OF_TRAINING = {
@@ -48,7 +48,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     if settings.label_map is not None:
         label_map = load_label_map(settings.label_map)
         mapped = map_classes(loaded, label_map, settings.unmapped, data.class_names[1:])
-        loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped}."]
+        loaded, notes = mapped.loaded, [f"Label map {settings.label_map}: {mapped.description}."]
     if loaded.class_names != tuple(data.class_names):
         raise SettingError(
             f"data, for {settings.checkpoint}",

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from importlib import import_module
 from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,10 +18,6 @@ from tangent_train.files import check_new
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.photo_networks import PhotoNetwork
-
-
-_OF_LIBRARIES = ("model", "weights", "file", "classes", "depth")
-"""Settings that only some of the functions `load` take."""
 
 
 _OUTPUTS: dict[ScoreKind | DepthKind, str] = {
@@ -85,17 +78,15 @@ def import_network(settings: ImportSettings) -> None:
 
 def _load(settings: ImportSettings) -> PhotoNetwork:
     """Return the network, from the library or the option that the settings name."""
-    from tangent_train.photo_networks import own_files
+    from tangent_train.photo_networks.libraries import LOADERS
 
-    if (settings.library or settings.network) is None:
-        raise SettingError("library", found="null", expected="a library, or network=<option>")
-    load: Callable[..., PhotoNetwork] = own_files.load_onnx
-    if settings.library is None:
-        load = partial(own_files.load_config, settings.network or {})
-    elif settings.library != "onnx":
-        load = import_module(f"tangent_train.photo_networks.{settings.library}").load
-    given = {n: getattr(settings, n) for n in signature(load).parameters if n in _OF_LIBRARIES}
-    network = load(**given, normalization=settings.normalization)
+    load = LOADERS[settings.library]
+    given = {name: getattr(settings, name) for name in signature(load).parameters}
+    needed = next(iter(given))
+    if given[needed] is None:
+        expected = f"a value, for library={settings.library or 'null'}"
+        raise SettingError(needed, found="null", expected=expected)
+    network = load(**given)
     read = _READ | given.keys()
     check_read(settings, (read | _OF_CLASSES) if network.depth_kind is None else read - {"classes"})
     return network
@@ -103,7 +94,7 @@ def _load(settings: ImportSettings) -> PhotoNetwork:
 
 def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) -> str:
     """Description of an imported network."""
-    from tangent_train.inference.views import PanoramaViews
+    from tangent_train.inference.views import ViewSelector
 
     names, kind = trained.class_names[1:], trained.depth_kind
     mean, std = (
@@ -123,7 +114,7 @@ def _understood(path: Path, trained: LoadedNetwork, settings: ImportSettings) ->
             f"the network returns {_OUTPUTS[kind or trained.score_kind]}",
             f"normalization of images from 0 to 1: mean {mean}, std {std}",
             f"image size: {size}{multiple}",
-            f"panoramas: {PanoramaViews(trained).description()}",
+            f"panoramas: {ViewSelector(trained).description()}",
             *[trust] * bool(trained.trust),
         ]
     )

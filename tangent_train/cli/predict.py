@@ -12,13 +12,15 @@ from typing import Any
 
 import numpy as np
 
+from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.heads import PredictedImage, head_of
 from tangent_train.heads.pictures import evenly_spread
-from tangent_train.inference.engine import Predictor
+from tangent_train.inference.api import load_label_map, map_classes
+from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.images import (
     DepthFolder,
     InputImage,
@@ -26,9 +28,7 @@ from tangent_train.inference.images import (
     read_photo,
     with_up,
 )
-from tangent_train.inference.label_maps import load_label_map, map_classes
-from tangent_train.inference.up_likelihood import UpLikelihood
-from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
@@ -118,7 +118,7 @@ class _Prediction:
         if settings.label_map is not None:
             label_map = load_label_map(settings.label_map)
             mapped = map_classes(original, label_map, settings.unmapped)
-            print_text(f"Label map {settings.label_map}: {mapped}.")
+            print_text(f"Label map {settings.label_map}: {mapped.description}.")
             loaded = mapped.loaded
         head: Any = head_of(loaded)
         kinds = head.file_kinds(settings.write)
@@ -130,13 +130,15 @@ class _Prediction:
         check_read(settings, _read(settings, loaded) | of_head)
         head = head_of(loaded, **{name: getattr(settings, name) for name in of_head})
         self.folder = PredictionFolder(settings.output, head, kinds)
-        given = settings.levels, settings.base_level, settings.blend, settings.rotations
-        views: PanoramaViews | PhotoViews
-        if settings.projection == "perspective":
-            views = PhotoViews(loaded, *given)
-        else:
-            views = PanoramaViews(loaded, *given, settings.views, settings.fill)
+        chosen = settings.levels, settings.base_level, settings.blend, settings.rotations
+        views = ViewSelector(loaded, *chosen, settings.views, settings.fill)
+        if settings.projection == "equirectangular":
             print_text(f"A panorama is predicted in {views.description(settings.area)}.")
+        else:
+            rows, columns = max(crops.image_size for crops in views.crops)
+            print_text(f"Photos are predicted in crops of {columns} × {rows}.")
+        if settings.upright == "auto":
+            loaded.check_predicts(PIXEL_CLASSES, "Use upright=pose, or null.")
         self._settings, self._head, self._masks = settings, head, Masks(settings.mask)
         device, batch_size = settings.device, settings.view_batch_size
         self._predictor = Predictor(loaded, head, views, device, batch_size)
@@ -147,9 +149,6 @@ class _Prediction:
                 expected = "a folder of depth images, which the network takes"
                 raise SettingError("depth", found="null", expected=expected)
             self._depth = DepthFolder(settings.depth, settings.depth_scale)
-        if settings.upright == "auto" and loaded.depth_kind is not None:
-            expected = "pose or null: depth networks do not estimate the up direction"
-            raise SettingError("upright", found="auto", expected=expected)
 
     def count(self, inputs: Inputs) -> None:
         """Let the head count in some of the images, see `Head.count`."""
@@ -213,9 +212,9 @@ class _Prediction:
 def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     """Return the names of the settings that are read besides those of the head."""
     names = {"checkpoint", "input", "every", "output", "label_map", "projection"}
-    names |= {"levels", "base_level", "blend", "rotations", "write", "report", "shard"}
+    names |= {"levels", "base_level", "blend", "write", "report", "shard"}
     names |= {"view_batch_size", "device", "trust"}
-    panoramas = {"area", "fill", "views", "upright", "mask"}
+    panoramas = {"area", "fill", "views", "upright", "mask", "rotations"}
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()

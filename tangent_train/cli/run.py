@@ -35,7 +35,7 @@ from tangent_train.config.settings import RunSettings
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
-from tangent_train.inference.up_likelihood import UpLikelihood
+from tangent_train.inference.engine import UpLikelihood
 from tangent_train.results import evaluation
 from tangent_train.results.page import write_report
 from tangent_train.results.published import published_rows, published_table

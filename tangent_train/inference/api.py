@@ -1,11 +1,25 @@
-"""Trained networks in Python: labels and depth of files, images in memory and tensors."""
+"""The Python API: load trained networks, map their classes, and apply them or any function.
+
+A label map gives the classes of one data set as those of another. It is a JSON file with the names
+of source classes for every target class::
+
+    {"source": "ADE20K", "classes": {"wall": ["wall", "painting"], "floor": ["floor", "rug"]}}
+
+The probability of a target class is the sum of the probabilities of its source classes.
+
+Names are compared without case, and with hyphens and underscores as spaces. If a network names a
+class by several synonyms ("windowpane, window"), only the first is compared; a map may list several
+names (``"windowpane", "window"``). A network may lack some of the source classes. A target class
+without source classes in the network is not predicted.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache, partial
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -14,28 +28,39 @@ from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
 from datamodules.core.image_module import Upright
-from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
-from tangent_train.checkpoints.kinds import Align
+from datamodules.core.label_map import (
+    DISTANCE,
+    PIXEL_CLASSES,
+    LabelMap,
+    plain_name,
+    read_label_map,
+)
+from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError, width_height
+from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
-from tangent_train.inference.engine import Predictor
+from tangent_train.heads.alignment import AlignedMosaic
+from tangent_train.inference.engine import Predictor, UpLikelihood, views_per_forward
 from tangent_train.inference.images import (
     InputImage,
     Picture,
-    described,
     read_panorama,
     read_photo,
     with_up,
 )
-from tangent_train.inference.label_maps import Unmapped, load_label_map, map_classes
-from tangent_train.inference.up_likelihood import UpLikelihood
-from tangent_train.inference.views import Levels, PanoramaViews, PhotoViews, ViewChoice
+from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
 from tangent_train.io.gpano import Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
-from tangent_train.rendering import Blend
-from tangent_train.rendering.checks import check_choice
+from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
+from tangent_train.rendering.checks import blend_of, check_choice, check_panorama
+from tangent_train.rendering.forward import Pixels
+from tangent_train.rendering.mosaic import MeanMosaic
+from tangent_train.rendering.representations.views import PinholeViews
+
+Unmapped = Literal["unknown", "never"]
+"""Treatment of source classes that are not in a map: label 0 where they win, or they never win."""
 
 Depth = Tensor | NDArray[Any] | None
 """``(H, W)`` floats in meters, 0 or NaN where missing."""
@@ -67,7 +92,7 @@ def load(
     Args:
         path: A checkpoint, or a file written by ``tangent-export`` or ``tangent-import``.
         label_map: Map to the classes of another data set: its name or a JSON file, see
-            `label_maps.load_label_map`.
+            `load_label_map`.
         unmapped: Treatment of classes that are not in the map: ``unknown`` gives label 0 where they
             win; with ``never`` they cannot win.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
@@ -93,21 +118,15 @@ def load(
         DataError: A file cannot be used.
         SettingError: A setting does not suit the network.
     """
-    original = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
-    loaded = original
+    original = loaded = load_network(Path(path), (trust,) if isinstance(trust, str) else trust)
     if label_map is not None:
         loaded = map_classes(original, load_label_map(label_map), unmapped).loaded
     # A setting of another head is an unexpected argument.
     given = {"min_confidence": min_confidence, "align": align}
     head = head_of(loaded, **{name: value for name, value in given.items() if value})
-    chosen, how = (loaded, levels, base_level, blend, rotations), (device, view_batch_size)
-    panoramas = Predictor(loaded, head, PanoramaViews(*chosen, views, fill), *how)
-    return Network(
-        loaded,
-        panoramas,
-        lambda: Predictor(loaded, head, PhotoViews(*chosen), *how),
-        UpLikelihood(original, panoramas.device),
-    )
+    selector = ViewSelector(loaded, levels, base_level, blend, rotations, views, fill)
+    predictor = Predictor(loaded, head, selector, device, view_batch_size)
+    return Network(loaded, predictor, UpLikelihood(original, predictor.device))
 
 
 class Network:
@@ -119,8 +138,7 @@ class Network:
 
     Args:
         loaded: The network.
-        panoramas: Predictor for panoramas.
-        photos: Function that creates the predictor for photos.
+        predictor: Predicts panoramas and photos.
         up_likelihood: Evidence for the direction of up, from the network's confidence.
 
     Attributes:
@@ -130,18 +148,12 @@ class Network:
     """
 
     def __init__(
-        self,
-        loaded: LoadedNetwork,
-        panoramas: Predictor,
-        photos: Callable[[], Predictor],
-        up_likelihood: UpLikelihood,
+        self, loaded: LoadedNetwork, predictor: Predictor, up_likelihood: UpLikelihood
     ) -> None:
         self.loaded = loaded
         self.class_names = loaded.class_names
         self.palette = class_colors(len(loaded.class_names))
-        self._panoramas = panoramas
-        self._photos = cache(photos)
-        self._up_likelihood = up_likelihood
+        self._predictor, self._up_likelihood = predictor, up_likelihood
 
     def __repr__(self) -> str:
         """Return classes or kind of depth, inputs, views and device in one line."""
@@ -153,7 +165,7 @@ class Network:
         return (
             f"<Network of {predicts}, inputs {', '.join(loaded.inputs)}, "
             f"trained at level {loaded.level} on {columns}×{rows} images of {kind}, "
-            f"on {self._panoramas.device}>"
+            f"on {self._predictor.device}>"
         )
 
     def labels(
@@ -192,12 +204,9 @@ class Network:
             SettingError: The image cannot be used, or the network needs another input.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        how: dict[str, Any] = {"depth": depth, "fov": fov, "area": area, "upright": upright}
-        mosaic, read = self._predict(image, max_tilt_deg=max_tilt_deg, **how)
-        labels = _cut(mosaic.pixels().cpu().numpy(), image, read, mask, 0)
-        if isinstance(image, Tensor):
-            return torch.from_numpy(labels.astype(np.int64)).to(image.device)
-        return labels
+        given = self._read(image, depth, fov, area, upright, max_tilt_deg)
+        found = self._predictor.predict(given).pixels().cpu().numpy()
+        return _as_given(_masked(found, given, image, mask, 0), image)
 
     def depth(
         self,
@@ -227,16 +236,9 @@ class Network:
             SettingError: See `labels`; or the views cannot be aligned in this way.
         """
         self.loaded.check_predicts(DISTANCE, "Use labels() or probabilities() of this network.")
-        if upright == "auto":
-            raise SettingError(
-                "upright",
-                found="auto",
-                expected="pose or None for depth networks: auto needs the confidence of classes",
-                remedy="Use pose for files with GPano tags, or a network of classes to align it.",
-            )
-        found, read = self._predict(image, fov=fov, area=area, upright=upright)
-        depth = _cut(found.pixels().cpu().numpy(), image, read, mask, np.nan)
-        return torch.from_numpy(depth).to(image.device) if isinstance(image, Tensor) else depth
+        given = self._read(image, None, fov, area, upright)
+        found = self._predictor.predict(given).pixels().cpu().numpy()
+        return _as_given(_masked(found, given, image, mask, np.nan), image)
 
     def probabilities(self, image: Picture, **settings: Any) -> Any:
         """Return the probability of every class at every pixel.
@@ -255,59 +257,258 @@ class Network:
             SettingError: See `labels`.
         """
         self.loaded.check_predicts(PIXEL_CLASSES, "Use depth() of this network.")
-        mosaic, read = self._predict(image, averaged=True, **settings)
+        given = self._read(image, **settings)
+        mosaic = self._predictor.predict(given, averaged=True)
         found = mosaic.probabilities(slice(None))[..., : len(self.class_names) - 1].cpu().numpy()
-        found = np.ascontiguousarray(read.cut(found))
-        if isinstance(image, Tensor):
-            return torch.from_numpy(found).movedim(-1, 0).contiguous().to(image.device)
-        return found
+        return _as_given(np.ascontiguousarray(given.cut(found)), image)
 
-    def _predict(
+    def _read(
         self,
-        image: Any,
-        *,
-        depth: Any = None,
+        image: Picture,
+        depth: Depth = None,
         fov: float | None = None,
         area: Sequence[float] | None = None,
         upright: Upright = None,
         max_tilt_deg: float = 60.0,
-        averaged: bool = False,
-    ) -> tuple[Any, InputImage]:
-        """Predict a photo or a panorama; return the mosaic and the image."""
-        of_size = partial(self._depth, depth)
+    ) -> InputImage:
+        """Return a photo, or a panorama with its zenith."""
+        is_given = depth is not None or "depth" in self.loaded.inputs
+        of_size = partial(self._depth, depth) if is_given else None
         if fov is not None:
-            if (area, upright) != (None, None):
-                raise SettingError("area and upright", found="one", expected="None for photos")
-            photo = read_photo(image, fov, of_size)
-            return self._photos().predict(photo, averaged=averaged), photo
+            return read_photo(image, fov, of_size)
         check_choice("upright", upright or "pose", ("pose", "auto"))
         panorama = read_panorama(image, area, upright, of_size)
         if upright == "auto":
             panorama = with_up(panorama, max_tilt_deg, self._up_likelihood)
-        return self._panoramas.predict(panorama, averaged=averaged), panorama
+        return panorama
 
-    def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16] | None:
+    def _depth(self, depth: Any, size: tuple[int, int]) -> NDArray[np.uint16]:
         """Return depth in steps of 1/512 m, of the size of the image."""
-        if depth is None and "depth" not in self.loaded.inputs:
-            return None
-        array = depth.numpy(force=True) if isinstance(depth, Tensor) else depth
-        fits = isinstance(array, np.ndarray) and (array.shape, array.dtype.kind) == (size, "f")
-        if not fits or "depth" not in self.loaded.inputs:
+        array = depth.numpy(force=True) if isinstance(depth, Tensor) else np.asarray(depth)
+        is_read = "depth" in self.loaded.inputs
+        if not is_read or (array.shape, array.dtype.kind) != (size, "f"):
             raise SettingError(
                 "depth",
-                found="none" if depth is None else described(depth),
+                found="none" if depth is None else f"shape {array.shape} of {array.dtype}",
                 expected=f"floats in meters, {width_height(size)}, for a network that takes depth",
             )
         return meters_to_steps(np.nan_to_num(array.astype(np.float32), posinf=0).clip(min=0))
 
 
-def _cut(
-    result: NDArray[Any], image: Any, read: InputImage, mask: Any, unknown: float
+def _masked(
+    result: NDArray[Any], given: InputImage, image: Any, mask: Any, unknown: float
 ) -> NDArray[Any]:
     """Return the result ``(H, W)`` for the area of a panorama, with masked pixels unknown."""
-    if read.area is None:
+    if given.area is None:
         return result
     masks = Masks(mask.numpy(force=True) if isinstance(mask, Tensor) else mask)
     name = Path(image).stem if isinstance(image, str | Path) else ""
-    is_shown = masks.read(name, read.area) > 0
-    return read.area.cut(np.where(is_shown, result, result.dtype.type(unknown)))
+    is_shown = masks.read(name, given.area) > 0
+    return given.cut(np.where(is_shown, result, result.dtype.type(unknown)))
+
+
+def _as_given(result: NDArray[Any], image: Any) -> Any:
+    """Return a result ``(H, W[, K])``; for tensors, on their device and channels first."""
+    if not isinstance(image, Tensor):
+        return result
+    tensor = torch.from_numpy(result.astype(np.int64) if result.dtype.kind == "u" else result)
+    return (tensor if result.ndim == 2 else tensor.movedim(-1, 0).contiguous()).to(image.device)
+
+
+@torch.no_grad()
+def apply(
+    function: Callable[[Pixels], Pixels],
+    panorama: Pixels,
+    grid: PinholeGrid,
+    blend: Blend = "feather",
+    *,
+    images_per_call: int | None = None,
+    align: Align | None = None,
+    kind: DepthKind | None = None,
+) -> Pixels:
+    """Apply a function of images to a panorama: scores, depth, features, masks.
+
+    The images are rendered a few at a time with `equirect_to_tangent`, and their results are
+    rendered back as with `tangent_to_equirect`. Besides the result, only the images of one call are
+    held in memory. There are no gradients.
+
+    With `align`, the results are depth. They are converted to distances along the rays and brought
+    to one scale: views are compared, and blended, in the logarithm of distance, or for disparity in
+    disparity along the ray. The depth of all images is held in memory.
+
+    Args:
+        function: Maps some images of the panorama's kind and dtype to a result of as many pixels:
+            arrays ``(n, h, w[, C])`` to ``(n, h, w[, K])``, or tensors ``(n, C, h, w)`` to
+            ``(n, h, w)`` or ``(n, K, h, w)``. Called with all images of the grid, in its order.
+        panorama: An array ``(H, W[, C])``, or a floating-point tensor ``(C, H, W)``.
+        grid: The images.
+        blend: Blending of results that are floats, as in `tangent_to_equirect`. Of whole numbers
+            and booleans (labels, masks), each pixel is copied from its owner.
+        images_per_call: Images per call of the function; None for as many as fit into 2^20 pixels.
+        align: Correction of the depth of each image: ``scale``, ``affine`` (a scale and a shift),
+            ``grid`` (also a coarse grid of scales) or ``none``. None for results that are not
+            depth.
+        kind: Kind of depth that the function returns, see `DepthKind`; only with `align`, which
+            takes ``metric_z`` by default.
+
+    Returns:
+        An array ``(H, W[, K])``, or a tensor ``(H, W)`` or ``(K, H, W)`` on the panorama's device:
+        float32 if the function returns floats, else the function's dtype. With `align`, distances
+        ``(H, W)``, NaN where unknown: meters, or for relative kinds a median of 1, by solid angle.
+
+    Raises:
+        SettingError: The panorama cannot be used, or the function returns results of another kind
+            or shape.
+
+    >>> brightness = lambda images: images.mean(axis=-1)
+    >>> from tangent_train.geometry import TangentGrid
+    >>> apply(brightness, np.full((32, 64, 3), 0.5), TangentGrid(0, 4))[0, 0]
+    np.float32(0.5)
+    """
+    blend = blend_of(blend, is_overlapping=grid.is_overlapping)
+    check_panorama(panorama, "bilinear")
+    step = images_per_call or views_per_forward(grid.size)
+    rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
+    shape, views = (rows, columns), PinholeViews(grid)
+    kept: list[NDArray[Any]] = []
+    mosaic: Any = None
+    for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):
+        images = equirect_to_tangent(panorama, grid, faces)
+        results = _as_array(function(images), images, is_depth=align is not None)
+        if results.dtype.kind != "f":
+            kept.append(results)
+            continue
+        flat = results.reshape(*results.shape[:3], -1).astype(np.float32)
+        if mosaic is None and align is not None:
+            mosaic = AlignedMosaic(shape, kind or "metric_z", blend, align)
+        elif mosaic is None:
+            mosaic = MeanMosaic(shape, blend, flat.shape[-1], skips_unknown=False)
+        part = views[faces[0] : faces[-1] + 1]
+        mosaic.add(torch.from_numpy(np.moveaxis(flat, -1, 1)), part)
+    if align is not None:
+        array = mosaic.distances().numpy()
+    elif mosaic is not None:
+        array = mosaic.values().movedim(0, -1).reshape(*shape, *results.shape[3:]).numpy()
+    else:
+        array = tangent_to_equirect(np.concatenate(kept), grid, shape, interpolation="nearest")
+    if not isinstance(panorama, Tensor):
+        return array
+    result = torch.from_numpy(array)
+    return (result if array.ndim == 2 else result.movedim(-1, 0)).to(panorama.device)
+
+
+def _as_array(returned: Any, images: Tensor | NDArray[Any], *, is_depth: bool) -> NDArray[Any]:
+    """Return the function's result for some images as an array ``(n, h, w[, K])``."""
+    is_tensor, array = isinstance(images, Tensor), np.zeros(0)
+    if is_tensor and isinstance(returned, Tensor):
+        array = (returned.float() if returned.is_floating_point() else returned).numpy(force=True)
+        array = np.moveaxis(array, 1, -1) if array.ndim == 4 else array
+    elif not is_tensor and isinstance(returned, np.ndarray):
+        array = returned
+    size = images.shape[-2:] if is_tensor else images.shape[1:3]
+    fits = array.ndim in (3, 4) and array.shape[:3] == (len(images), *size)
+    is_one = array.dtype.kind == "f" and array.shape[3:] in ((), (1,))
+    if fits and array.dtype.kind in "buif" and (is_one or not is_depth):
+        return array
+    raise SettingError(
+        "result of the function",
+        found=f"{type(returned).__name__} of shape {array.shape} and {array.dtype}",
+        expected=f"{'depth' if is_depth else 'numbers'} for {len(images)} images of "
+        f"{size[1]}×{size[0]} pixels, as {type(images).__name__}",
+    )
+
+
+class MappedNetwork(NamedTuple):
+    """A network with the classes of a map.
+
+    Attributes:
+        loaded: The network.
+        classes: Classes of the original network in each target class.
+        description: Classes that were mapped, are missing and remain, in one line.
+    """
+
+    loaded: LoadedNetwork
+    classes: Mapping[str, Sequence[str]]
+    description: str
+
+
+def load_label_map(given: str | Path) -> LabelMap:
+    """Load a label map.
+
+    Args:
+        given: Name of a map of this package, such as ``ade20k_to_stanford2d3ds``, or the path of a
+            file with the suffix ``.json``.
+
+    Raises:
+        SettingError: There is no map of this name.
+        DataError: The file is missing or is not a valid label map.
+    """
+    folder = Path(__file__).with_name("label_maps")
+    shipped = sorted(path.stem for path in folder.glob("*.json"))
+    if str(given) in shipped:
+        return read_label_map(folder / f"{given}.json")
+    if Path(given).suffix.lower() != ".json":
+        check_choice("label_map", str(given), (*shipped, "a file my_map.json"))
+    return read_label_map(Path(given))
+
+
+def map_classes(
+    loaded: LoadedNetwork,
+    label_map: LabelMap,
+    unmapped: Unmapped = "unknown",
+    targets: Sequence[str] | None = None,
+) -> MappedNetwork:
+    """Return a network with the classes of a map instead of its own.
+
+    Args:
+        loaded: The network.
+        label_map: The map.
+        unmapped: Treatment of classes that are not in the map. Unknown classes of an imported
+            network remain unknown.
+        targets: All target classes in order, without unknown; None for the classes of the map.
+
+    Raises:
+        SettingError: The map contains no class of the network, or a target that is not in
+            `targets`; or unmapped classes of a network that returns labels shall never win.
+    """
+    loaded.check_predicts(PIXEL_CLASSES, "Leave label_map out.")
+    targets = label_map.names if targets is None else targets
+    target_of = {
+        str(key): label_map.names[label - 1] for key, label in label_map.labels.items() if label
+    }
+    names = loaded.class_names[1:]
+    mapped = [target_of.get(plain_name(name)) for name in names]
+    rest = [name for name, target in zip(names, mapped, strict=True) if target is None]
+    foreign = set(label_map.names) - set(targets)
+    if foreign or len(rest) == len(names):
+        raise SettingError(
+            "label_map",
+            found=f"target classes {', '.join(label_map.names)}",
+            expected=f"a map from {', '.join(names)} to {', '.join(targets)}",
+        )
+    check_choice("unmapped", unmapped, ("unknown", "never"))
+    if rest and loaded.score_kind == "labels":
+        check_choice("unmapped", unmapped, ("unknown",))  # labels have no second best class
+    groups = loaded.groups or [[k] for k in range(len(names))]
+
+    def scores(target: str | None) -> tuple[int, ...]:
+        chosen = [group for group, of in zip(groups, mapped, strict=False) if of == target]
+        return tuple(k for group in chosen for k in group)
+
+    unknown = tuple(k for group in groups[len(names) :] for k in group)
+    unknown += scores(None) if unmapped == "unknown" else ()
+    given = [*map(scores, targets), *([unknown] if unknown else [])]
+    classes = {
+        target: [name for name, of in zip(names, mapped, strict=True) if of == target]
+        for target in targets
+    }
+    known = set(map(plain_name, names))
+    described = {
+        "not predicted": [target for target, of in classes.items() if not of],
+        "not in the network": [name for name in target_of if name not in known],
+        "unknown where they win" if unmapped == "unknown" else "never win": rest,
+    }
+    parts = [f"{target} ← {', '.join(of)}" for target, of in classes.items() if of]
+    parts += [f"{text}: {', '.join(of)}" for text, of in described.items() if of]
+    changed = replace(loaded, class_names=("unknown", *targets), groups=tuple(given))
+    return MappedNetwork(changed, classes, "; ".join(parts))

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,32 +19,41 @@ import torch
 from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import STEPS_PER_M, resize_depth
 from datamodules.core.inputs import MAX_DEPTH_M, normalize
+from models.distortion_aware import make_ordinary
 from tangent_train.checkpoints.outputs import OutputNetwork, network_for_views, plain_output
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError
+from tangent_train.geometry import TangentGrid
+from tangent_train.inference.images import InputImage
+from tangent_train.inference.views import ViewSelector
+from tangent_train.orientation.gravity import upright_rotation
+from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.resampling import resize
 from tangent_train.rendering.sampling import sphere_rays
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Callable, Iterable, Iterator
 
     from numpy.typing import NDArray
     from torch import Tensor, nn
 
-    from datamodules.core.inputs import Input
     from tangent_train.checkpoints.loaded import LoadedNetwork
     from tangent_train.heads import Head
-    from tangent_train.inference.images import InputImage
-    from tangent_train.inference.views import PanoramaViews, PhotoViews
     from tangent_train.rendering import Interpolation
     from tangent_train.rendering.representations.views import Views
 
     ViewImages = Callable[[slice], Tensor]
     """Returns some of the views as normalized images ``(n, C, h, w)``."""
 
-    ViewSet = tuple[Views, ViewImages, Tensor | None]
-    """Views that cover the whole image, their images, and rays if the network takes them."""
+    ViewSet = tuple[Any, ViewImages, Tensor | None]
+    """Views that cover the whole image, a `Views` or `range`; their images; and rays if the network
+    takes them."""
 
 _PIXELS_PER_FORWARD = 2**20
+
+_FOV_DEG = 135.0  # the corners show ceiling and floor, which reveal a wrong direction
+_EXPONENT = 3.0  # fitted to real panoramas of one home, and to synthetic rooms
+_COUNTED = 20  # more, smaller views do not add evidence
+_LEAST = 1e-4
 
 
 def sees_rays(network: nn.Module) -> bool:
@@ -59,47 +68,27 @@ def views_per_forward(image_size: tuple[int, int]) -> int:
 
 
 @torch.no_grad()
-def view_scores(
-    network: Callable[..., Any],
-    images: ViewImages,
-    count: int,
-    per_forward: int,
-    rays: Tensor | None = None,
-) -> Iterator[tuple[slice, Tensor]]:
-    """Compute the scores of the views of one image, a few views at a time.
+def scored_views(
+    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
+) -> Iterator[tuple[Any, Tensor]]:
+    """Yield views of one image with their scores, a few at a time.
 
     Args:
         network: Maps images ``(n, C, h, w)`` to scores ``(n, K, h, w)``, or to a dict that contains
-            them under ``"out"``.
-        images: Function that returns views.
-        count: Number of views N.
-        per_forward: Number of views per call of the network.
-        rays: ``(N, 3, 3)`` viewing rays, see `Views.rays`, for networks with cross-image attention.
-            These are called once, with all views: ``network(images, rays[None])``.
-
-    Yields:
-        A slice of the views and their float32 scores ``(n, K, h, w)``.
-    """
-    step = per_forward if rays is None else count
-    for start in range(0, count, step):
-        part = slice(start, min(start + step, count))
-        returned = network(images(part), *(() if rays is None else (rays[None],)))
-        yield part, plain_output(returned).float()
-
-
-def scored_views(
-    network: Callable[..., Any], sets: Iterable[ViewSet], per_forward: int
-) -> Iterator[tuple[Views, Tensor]]:
-    """Yield views of one image with their scores, a few at a time, see `view_scores`.
-
-    Args:
-        network: See `view_scores`.
+            them under ``"out"``. A network with cross-image attention is called once for a set with
+            rays, with all views: ``network(images, rays[None])``.
         sets: Sets of views.
         per_forward: Number of views per call of the network.
+
+    Yields:
+        Views, and their float32 scores ``(n, K, h, w)``.
     """
     for views, images, rays in sets:
-        for part, scores in view_scores(network, images, len(views), per_forward, rays):
-            yield views[part], scores
+        step = per_forward if rays is None else len(views)
+        for start in range(0, len(views), step):
+            part = slice(start, min(start + step, len(views)))
+            returned = network(images(part), *(() if rays is None else (rays[None],)))
+            yield views[part], plain_output(returned).float()
 
 
 def upright_rays(
@@ -117,35 +106,6 @@ def upright_rays(
         if rotation is not None:
             rays = rotation.T.astype(np.float32) @ rays
         yield torch.from_numpy(rays).to(device) if len(rays) else None
-
-
-def input_planes(
-    image: InputImage, shape: tuple[int, int], inputs: Sequence[Input], device: torch.device | str
-) -> tuple[Tensor, list[tuple[Tensor, Interpolation]]]:
-    """Return the inputs of a network on a device, as images of the whole panorama or photo.
-
-    Args:
-        image: The panorama or photo.
-        shape: Rows and columns to which it is resized.
-        inputs: Inputs of the network.
-        device: A torch device.
-
-    Returns:
-        RGB ``(3, H, W)``, float32 from 0 to 255; and other inputs ``(1, H, W)`` with their
-        interpolation: depth as in `render_inputs`, and elevation.
-    """
-    rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(device).movedim(-1, 0).float()
-    others: list[tuple[Tensor, Interpolation]] = []
-    if "depth" in inputs and image.depth is not None:
-        steps = np.minimum(resize_depth(image.depth, shape), int(MAX_DEPTH_M * STEPS_PER_M))
-        others.append((torch.from_numpy(steps.view(np.int16))[None].to(device), "nearest"))
-    if "elevation" in inputs:
-        up = np.array((0.0, 0.0, 1.0)) if image.up is None else image.up
-        columns, rows = sphere_rays(shape)
-        level, lines = (torch.from_numpy(a).to(device) for a in (up[:2] @ columns, rows))
-        elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
-        others.append((elevation[None].float(), "bilinear"))
-    return resize(rgb, shape, "bilinear").round_(), others
 
 
 def renders_arrays(device: torch.device | str) -> bool:
@@ -178,20 +138,34 @@ class RenderedViews:
         contiguous = torch.contiguous_format
         self._format = contiguous if weights is None else torch.channels_last
         self._dtype = torch.float32 if weights is None else weights.dtype
-        self._loaded = loaded
-        arrays = renders_arrays(device)
-        self._image = image.resized(shape) if arrays else image
-        self._planes = None if arrays else input_planes(image, shape, loaded.inputs, device)
+        self._loaded, self._shape, self._device = loaded, shape, device
+        self._arrays = renders_arrays(device)
+        self._image = image.resized(shape) if self._arrays else image
+        self._planes = () if self._arrays else tuple(self._input_planes())
+
+    def _input_planes(self) -> Iterator[tuple[Tensor, Interpolation]]:
+        """Yield the inputs on the device: RGB ``(3, H, W)`` from 0 to 255; others ``(1, H, W)``."""
+        image, shape, inputs = self._image, self._shape, self._loaded.inputs
+        rgb = torch.from_numpy(np.ascontiguousarray(image.rgb)).to(self._device).movedim(-1, 0)
+        yield resize(rgb.float(), shape, "bilinear").round_(), "bilinear"
+        if "depth" in inputs and image.depth is not None:
+            steps = np.minimum(resize_depth(image.depth, shape), int(MAX_DEPTH_M * STEPS_PER_M))
+            yield torch.from_numpy(steps.view(np.int16))[None].to(self._device), "nearest"
+        if "elevation" in inputs:
+            up = np.array((0.0, 0.0, 1.0)) if image.up is None else image.up
+            columns, rows = sphere_rays(shape)
+            level, lines = (torch.from_numpy(a).to(self._device) for a in (up[:2] @ columns, rows))
+            elevation = torch.outer(lines[:, 0], level) + lines[:, 1:] * float(up[2])
+            yield elevation[None].float(), "bilinear"
 
     def __call__(self, views: Views) -> Tensor:
         """Return normalized views ``(n, C, h, w)``."""
         inputs = self._loaded.inputs
-        if self._planes is None:
-            rendered = render_inputs(self._image, views, inputs)
+        if self._arrays:
+            rendered: Any = render_inputs(self._image, views, inputs)
         else:
-            rgb, others = self._planes
-            colors = views.render(rgb, "bilinear").round().movedim(1, -1)
-            rendered = colors, *(views.render(plane, how)[:, 0] for plane, how in others)
+            colors, *others = (views.render(plane, how) for plane, how in self._planes)
+            rendered = colors.round().movedim(1, -1), *(plane[:, 0] for plane in others)
         images = normalize(rendered, self._loaded.normalization, inputs)
         return images.to(self._dtype).contiguous(memory_format=self._format)
 
@@ -206,7 +180,7 @@ class Predictor:
     Args:
         loaded: The network; it is moved to the device.
         head: The meaning of its output, see `head_of`.
-        view_sets: Selects the views of an image.
+        views: Selects the views of an image.
         device: A torch device, or ``auto``: a GPU if there is one, else the CPU.
         view_batch_size: Number of views per call of the network, which limits memory; None for
             as many as fit into 2^20 pixels. A network with cross-image attention takes all views of
@@ -216,36 +190,33 @@ class Predictor:
         device: Device of the network, the views and the mosaic.
 
     Raises:
-        SettingError: The device does not exist, or `view_batch_size` is less than 1.
+        SettingError: The device does not exist.
     """
 
     def __init__(
         self,
         loaded: LoadedNetwork,
         head: Head,
-        view_sets: PanoramaViews | PhotoViews,
+        views: ViewSelector,
         device: str = "cpu",
         view_batch_size: int | None = None,
     ) -> None:
         if device == "auto":
             device = "cuda" if torch.cuda.is_available() else "cpu"
         try:
-            self.device = torch.zeros(1, device=device).device  # refuses a missing device
-            loaded.network.to(self.device).to(memory_format=torch.channels_last)
+            self.device = torch.zeros(1, device=device).device  # with the number of a GPU
         except (RuntimeError, AssertionError) as error:  # AssertionError: torch without CUDA
-            raise SettingError(
-                "device", found=f"{device} ({error})", expected="cpu, or a device of this machine"
-            ) from error
-        self._per_forward = views_per_forward(view_sets.image_size)
-        if view_batch_size is not None:
-            self._per_forward = at_least("view_batch_size", view_batch_size, 1)
-        aware = getattr(view_sets, "distortion_aware", None)
-        network: Any = network_for_views(loaded.network, aware)
-        self._sees_rays = sees_rays(network)
-        if self._sees_rays:
-            network = partial(network, view_batch_size=self._per_forward)
+            expected = "cpu, or a device of this machine"
+            raise SettingError("device", found=f"{device} ({error})", expected=expected) from error
+        loaded.network.to(self.device).to(memory_format=torch.channels_last)
         self.head = head
-        self._network, self._loaded, self._view_sets = network, loaded, view_sets
+        self._loaded, self._views, self._view_batch_size = loaded, views, view_batch_size
+        self._sees_rays = sees_rays(loaded.network)
+
+    @cached_property
+    def _network_of_panoramas(self) -> Any:
+        aware = getattr(self._views.representation, "distortion_aware", None)
+        return network_for_views(self._loaded.network, aware)
 
     @torch.no_grad()
     def predict(
@@ -265,28 +236,104 @@ class Predictor:
         Returns:
             The mosaic of the head, see `Head.mosaic`.
         """
-        sets = self._sets(image)
+        sets: list[ViewSet] = []
+        for source, shape, views, rotation in self._views(image):
+            rendered = RenderedViews(self._loaded, source, shape, self.device)
+            rays: Iterable[Tensor | None] = [None] * len(views)
+            if self._sees_rays:
+                rays = upright_rays(views, rotation, self.device)
+            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
         mosaic = self.head.mosaic(
             image.shape,
-            self._view_sets.blend,
+            self._views.blend(image),
             averaged=averaged or len(sets) > 1,
             device=self.device,
             valid=image.valid,
             camera_matrix=image.camera_matrix,
         )
+        per_forward = self._view_batch_size or views_per_forward(self._views.image_size(image))
+        network = self._network_of_panoramas if image.is_panorama else self._loaded.network
+        if self._sees_rays:
+            network = partial(network, view_batch_size=per_forward)
         count = sum(len(views) for views, _, _ in sets)
-        for views, outputs in scored_views(self._network, sets, self._per_forward):
+        for views, outputs in scored_views(network, sets, per_forward):
             mosaic.add(outputs, views)
             progress(len(views) / count)
         return mosaic
 
-    def _sets(self, image: InputImage) -> list[ViewSet]:
-        """Return the sets of views of an image."""
-        sets: list[ViewSet] = []
-        for shown, shape, views, rotation in self._view_sets(image):
-            rendered = RenderedViews(self._loaded, shown, shape, self.device)
-            rays: Iterable[Tensor | None] = [None] * len(views)
-            if self._sees_rays:
-                rays = upright_rays(views, rotation, self.device)
-            sets += [(part, rendered.of(part), of) for part, of in zip(views, rays, strict=True)]
-        return sets
+
+class UpLikelihood:
+    """Estimates how likely directions are to be up, from the confidence of a network.
+
+    A network that was trained on upright images is most confident on upright images. For each
+    direction it gets four horizontal views of 135° that are upright for that direction. A network
+    with cross-image attention gets all views of its representation, with which it was more often
+    right, and a network of whole spheres gets its view. The uncertainty of a view is the mean of 1
+    − confidence over its pixels. The likelihood of a direction is the product of uncertainty⁻³ over
+    up to 20 views.
+
+    Args:
+        loaded: The network.
+        device: Device of the network.
+    """
+
+    def __init__(self, loaded: LoadedNetwork, device: torch.device | str = "cpu") -> None:
+        self.loaded, self._device = loaded, device
+        self._sees_rays = sees_rays(loaded.network)
+        self._takes_own_views = loaded.is_spherical or self._sees_rays
+
+    def __call__(self, image: Any, ups_xyz: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return log-likelihoods of directions, up to a common constant.
+
+        Args:
+            image: A panorama: an `InputImage`, or an `Image` of a data set.
+            ups_xyz: ``(n, 3)`` directions in its frame.
+
+        Returns:
+            ``(n,)`` log-likelihoods. All are 0 for a network with elevation as an input, because
+            that depends on the direction itself.
+        """
+        if "elevation" in self.loaded.inputs:
+            return np.zeros(len(ups_xyz))
+        rows = min(image.rgb.shape[0], 2 ** (self.loaded.level + 1))
+        panorama = InputImage(image.rgb, image.depth)
+        rendered = RenderedViews(self.loaded, panorama, (rows, 2 * rows), self._device)
+        uncertainties = np.array([self._uncertainties(rendered, up) for up in ups_xyz])
+        counted = min(uncertainties.shape[1], _COUNTED)
+        return -_EXPONENT * counted * np.log(uncertainties + _LEAST).mean(axis=1)
+
+    def _uncertainties(
+        self, rendered: RenderedViews, up: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Return the mean uncertainty of each view."""
+        representation, network, rays = self._representation, self._network, None
+        per_forward = views_per_forward(representation.image_size)
+        views = representation.with_rotation(upright_rotation(up)).view_sets()[0]
+        if not self._takes_own_views:
+            views = views[:4]  # of a cube, without up and down
+        if self._sees_rays:
+            network = partial(network, view_batch_size=per_forward)
+            rays = torch.from_numpy(representation.view_sets()[0].rays()).to(self._device)
+        sets = [(views, rendered.of(views), rays)]
+        found = [
+            1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
+            for _, scores in scored_views(network, sets, per_forward)
+        ]
+        return torch.cat(found).cpu().numpy()
+
+    @cached_property
+    def _network(self) -> Any:
+        """The network for pinhole images."""
+        return make_ordinary(self.loaded.network)
+
+    @cached_property
+    def _representation(self) -> Any:
+        """The views of an upright panorama."""
+        loaded = self.loaded
+        if self._takes_own_views:
+            return ViewSelector(loaded).representation
+        quarter = round(2 / TangentGrid(0, loaded.level).pitch)  # pixels of 90° at its level
+        least = quarter if loaded.fixed_size is None else max(loaded.fixed_size)
+        side = -(-least // loaded.size_multiple) * loaded.size_multiple
+        beyond = 1 - 1 / math.tan(math.radians(_FOV_DEG / 2))
+        return CubemapRepresentation(loaded.level, side, margin=round(side / 2 * beyond))

@@ -22,6 +22,7 @@ from tangent_train.checkpoints.loaded import (
 from tangent_train.errors import SettingError, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
+from tangent_train.rendering.checks import check_choice
 
 SUFFIXES = (".onnx", ".safetensors")
 
@@ -32,8 +33,6 @@ _BATCHES = (1, 3)
 """Batch sizes that are compared; the graph is traced with batch size 2."""
 
 _LEAST_TRACED = 32
-
-_SAFETENSORS = "A .safetensors file takes every network."
 
 
 class Export(NamedTuple):
@@ -72,13 +71,19 @@ def export_network(
         SettingError: A setting does not fit the format, the network cannot be exported, or the
             scores or the depth differ by more than `TOLERANCE` of their range.
     """
+    check_choice("output", path.suffix.lower(), SUFFIXES)
     is_onnx = path.suffix.lower() == ".onnx"
-    _check(loaded, path)
+    is_aware = make_ordinary(loaded.module) is not loaded.module
+    is_aware |= bool(loaded.representation.get("distortion_aware"))
     sizes = [image_size or loaded.fixed_size]
     if is_onnx and sizes == [None]:
         sizes.append(loaded.image_size)
-    failure: Exception | None = None
-    for size in sizes:
+    failure: object = None
+    if loaded.settings is None:
+        failure = "an exported network contains only the computation"
+    elif is_onnx and is_aware:
+        failure = "distortion-aware convolutions would be right for one size only"
+    for size in sizes if failure is None else ():
         try:
             with atomic_path(path) as temporary:
                 if is_onnx:
@@ -94,29 +99,8 @@ def export_network(
         "output",
         found=f"{path.name}, which cannot be written ({first_line(failure)})",
         expected="a network that torch's exporter supports",
-        remedy=_SAFETENSORS,
-    ) from failure
-
-
-def _check(loaded: LoadedNetwork, path: Path) -> None:
-    if path.suffix.lower() not in SUFFIXES:
-        expected = f"a name ending in {' or '.join(SUFFIXES)}"
-        raise SettingError("output", found=path.name, expected=expected)
-    if loaded.settings is None:
-        raise SettingError(
-            "checkpoint",
-            found="an exported network, which contains only the computation",
-            expected="a checkpoint of tangent-train, or a safetensors file",
-        )
-    is_aware = make_ordinary(loaded.module) is not loaded.module
-    is_aware |= bool(loaded.representation.get("distortion_aware"))
-    if path.suffix.lower() == ".onnx" and is_aware:
-        raise SettingError(
-            "output",
-            found=f"{path.name}, for distortion-aware convolutions",
-            expected="ordinary convolutions: the sampling would be right for one size only",
-            remedy=_SAFETENSORS,
-        )
+        remedy="A .safetensors file takes every network of a checkpoint.",
+    )
 
 
 def _write_onnx(
@@ -165,21 +149,22 @@ def _write_safetensors(loaded: LoadedNetwork, path: Path) -> None:
 def _verified(loaded: LoadedNetwork, fixed_size: tuple[int, int] | None, path: Path) -> Export:
     """Read the file as a user would, and compare its output with PyTorch's."""
     exported = load_network(path, loaded.trust)
-    rows, columns = loaded.image_size
-    step = loaded.size_multiple
-    rows, columns = (max(step, side // step * step) for side in (rows, columns))
+    step, largest = loaded.size_multiple, 0.0
+    rows, columns = (max(step, side // step * step) for side in loaded.image_size)
     sizes = [(rows, columns), (rows + step, columns + 2 * step)]
-    largest = 0.0
     for size in sizes if fixed_size is None else [fixed_size]:
         for count in _BATCHES:
             images = _random_images(loaded, count, size)
             expected, found = loaded.network(images), exported.network(images)
             span = float(expected.max() - expected.min())
+            torch.testing.assert_close(
+                found,
+                expected,
+                rtol=0,
+                atol=TOLERANCE * span,
+                msg=lambda text: "its output differs from PyTorch's: " + " ".join(text.split()),
+            )
             difference = float((found - expected).abs().max())
-            if not difference <= TOLERANCE * span:  # "not" also refuses NaN
-                raise ArithmeticError(
-                    f"its output differs from PyTorch's by {difference:.2g}, of {span:.2g}"
-                )
             largest = max(largest, difference / span if span else 0.0)
     return Export(exported, largest)
 

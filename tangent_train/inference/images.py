@@ -13,6 +13,7 @@ from PIL import Image
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps, resize_depth
+from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.io.gpano import PanoramaArea, read_area, read_up
@@ -25,10 +26,10 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from datamodules.core.image_module import Upright
-    from tangent_train.inference.up_likelihood import UpLikelihood
+    from tangent_train.inference.engine import UpLikelihood
 
-    DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16] | None]
-    """Returns depth for an image of a size, in steps of 1/512 m; None without depth."""
+    DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16]]
+    """Returns depth of an image of a size, in steps of 1/512 m."""
 
 Picture = str | Path | Image.Image | NDArray[Any] | Tensor
 """A file; a Pillow image; or RGB from 0 to 255, an array ``(H, W, 3)`` or tensor ``(3, H, W)`` of
@@ -61,6 +62,11 @@ class InputImage:
     def shape(self) -> tuple[int, int]:
         """Rows and columns."""
         return self.rgb.shape[0], self.rgb.shape[1]
+
+    @property
+    def is_panorama(self) -> bool:
+        """True for a panorama, False for a photo."""
+        return self.camera_matrix is None
 
     @property
     def valid(self) -> NDArray[np.bool_] | None:
@@ -139,16 +145,15 @@ def read_panorama(
         SettingError: The angles do not fit the image, the value is not an image, or an image in
             memory has no pose.
     """
-    rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
+    rgb, path = _read(image)
     size = rgb.shape[0], rgb.shape[1]
     if upright == "pose" and path is None:
         expected = "the path of a file: images in memory and videos have no GPano tags"
         raise SettingError("upright", found="pose", expected=expected)
     area = read_area(path or _IN_MEMORY, size, angles)
-    steps = None if depth is None else depth(size)
+    steps = None if depth is None else area.place(depth(size))
     up = None if upright is None or path is None else read_up(path)
-    placed = None if steps is None else area.place(steps)
-    return InputImage(area.place(rgb), placed, up, area=area)
+    return InputImage(area.place(rgb), steps, up, area=area)
 
 
 def with_up(image: InputImage, max_tilt_deg: float, up_likelihood: UpLikelihood) -> InputImage:
@@ -161,6 +166,7 @@ def with_up(image: InputImage, max_tilt_deg: float, up_likelihood: UpLikelihood)
     """
     if image.up is not None:
         return image
+    up_likelihood.loaded.check_predicts(PIXEL_CLASSES, "Leave upright=auto out: use pose.")
     return replace(image, up=estimate_up(image.rgb, max_tilt_deg, partial(up_likelihood, image)))
 
 
@@ -178,7 +184,7 @@ def read_photo(
         DataError: A file cannot be used, or the field of view is unknown.
         SettingError: The value is not an image.
     """
-    rgb, path = _rgb(image), Path(image) if isinstance(image, str | Path) else None
+    rgb, path = _read(image)
     size = rgb.shape[0], rgb.shape[1]
     if fov_deg is None and path is not None:
         fov_deg = photo_fov_deg(path)
@@ -193,25 +199,20 @@ def read_photo(
     return InputImage(rgb, None if depth is None else depth(size), camera_matrix=matrix)
 
 
-def _rgb(image: Any) -> NDArray[np.uint8]:
-    """Return an image as ``(H, W, 3)`` uint8."""
-    if isinstance(image, str | Path | Image.Image):
-        return read_rgb(Path(image) if isinstance(image, str) else image)
-    is_tensor = isinstance(image, Tensor)
-    array = image.numpy(force=True) if is_tensor else image
-    fits = isinstance(array, np.ndarray) and array.ndim == 3 and array.dtype == np.uint8
-    channels = 0 if is_tensor else -1
-    if fits and array.shape[channels] == 3 and array.size:
-        return np.ascontiguousarray(np.moveaxis(array, channels, -1))
+def _read(image: Any) -> tuple[NDArray[np.uint8], Path | None]:
+    """Return an image as ``(H, W, 3)`` uint8, and the path of a file."""
+    if isinstance(image, str | Path):
+        return read_rgb(Path(image)), Path(image)
+    if isinstance(image, Image.Image):
+        return read_rgb(image), None
+    array = image.numpy(force=True) if isinstance(image, Tensor) else np.asarray(image)
+    if isinstance(image, Tensor) and array.ndim == 3:
+        array = np.moveaxis(array, 0, -1)
+    if array.dtype == np.uint8 and array.shape[2:] == (3,):
+        return np.ascontiguousarray(array), None
     raise SettingError(
         "image",
-        found=described(image),
+        found=f"{type(image).__name__} {tuple(np.shape(image))} of {array.dtype}",
         expected="RGB from 0 to 255: a uint8 tensor (3, H, W) or array (H, W, 3); a Pillow image; "
         "or the path of a file",
     )
-
-
-def described(value: Any) -> str:
-    """Return class, shape and dtype of a value, for messages."""
-    kind = type(value).__name__
-    return f"{kind} {tuple(value.shape)} of {value.dtype}" if hasattr(value, "dtype") else kind

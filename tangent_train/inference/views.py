@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import cv2
@@ -15,16 +16,12 @@ from datamodules.core.depth import distance_from_z_depth, resize_depth
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError, counted, width_height
 from tangent_train.files import config_folder
-from tangent_train.geometry import PinholeGrid, TangentGrid
+from tangent_train.geometry import TangentGrid
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.orientation.gravity import upright_rotation
-from tangent_train.rendering import (
-    EquirectRepresentation,
-    IcosphereRepresentation,
-    PerspectiveRepresentation,
-    Representation,
-)
+from tangent_train.rendering import PerspectiveRepresentation
+from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import resize
@@ -85,28 +82,24 @@ class SourceViews(NamedTuple):
     rotation: NDArray[np.float64] | None = None
 
 
-class PanoramaViews:
-    """Selects views of panoramas, by default as in training; scores of several sets are averaged.
+class ViewSelector:
+    """Selects the views of panoramas and photos, by default as in training.
 
-    Networks trained on photos get tangent images of base level 1, at the level that matches the
-    angular resolution of their crops.
+    Scores of several sets of views are averaged. Networks trained on photos get tangent images of
+    base level 1 of panoramas, at the level that matches the angular resolution of their crops.
+    Photos are divided into crops with the size and angular resolution of the training images.
 
     Args:
         loaded: The network.
-        levels: See `Levels`. All are rendered from a panorama of the highest level.
-        base_level: Base level b of tangent images; None as trained.
-        blend: Blending of overlapping views.
-        rotations: Number of rotations about the vertical to average over.
-        views: See `ViewChoice`.
+        levels: See `Levels`. All are rendered from an image of the highest level.
+        base_level: Base level b of tangent images, whose size crops of photos get too; None as
+            trained.
+        blend: Blending of overlapping views. With ``feather``, crops of photos overlap by at least
+            a quarter.
+        rotations: Number of rotations about the vertical to average over; not used for photos.
+        views: Views of panoramas, see `ViewChoice`.
         fill: Colors outside the area of a partial panorama, in views that leave it; None as
             trained.
-
-    Attributes:
-        representation: Representation of upright panoramas.
-        distortion_aware: See `EquirectRepresentation`; False for other representations.
-
-    Raises:
-        SettingError: The network does not support such views.
     """
 
     def __init__(
@@ -119,15 +112,46 @@ class PanoramaViews:
         views: ViewChoice = None,
         fill: Fill | None = None,
     ) -> None:
-        settings = panorama_settings(loaded, levels, base_level, views)
-        settings["rotations"] = rotations
-        if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
-            settings["blend"] = blend
-        self.representation = _built(loaded, settings)
-        self.image_size = self.representation.image_size
-        self.distortion_aware = getattr(self.representation, "distortion_aware", False)
-        self.blend = self.representation.blend
+        self._loaded, self._levels, self._base_level = loaded, levels, base_level
+        self._blend, self._rotations, self._views = blend, rotations, views
         self._fill = fill or loaded.fill
+
+    @cached_property
+    def representation(self) -> Any:
+        """Representation of upright panoramas.
+
+        Raises:
+            SettingError: The network does not support such views.
+        """
+        given = self._loaded, self._levels, self._base_level, self._views
+        settings = panorama_settings(*given) | {"rotations": self._rotations}
+        if settings["_target_"] not in (_EQUIRECT, _ICOSPHERE):
+            settings["blend"] = self._blend
+        return _built(self._loaded, settings)
+
+    @cached_property
+    def crops(self) -> list[PerspectiveRepresentation]:
+        """Common camera of the crops of photos for each level.
+
+        Raises:
+            SettingError: The network does not support such crops.
+        """
+        loaded = self._loaded
+        if "elevation" in loaded.inputs:
+            expected = "a panorama: the elevation of pixels, which the network takes, is unknown"
+            raise SettingError("image", found="a photo", expected=expected)
+        levels = level_list(self._levels, loaded.photo_level or loaded.level)
+        return [_photo_representation(loaded, level, self._base_level) for level in levels]
+
+    def blend(self, image: InputImage) -> Blend:
+        """Return the blending of the views of an image."""
+        blend: Blend = self.representation.blend if image.is_panorama else self._blend
+        return blend
+
+    def image_size(self, image: InputImage) -> tuple[int, int]:
+        """Return rows and columns of the largest views of an image."""
+        used = [self.representation] if image.is_panorama else self.crops
+        return max(each.image_size for each in used)
 
     def description(self, area: Sequence[float] | None = None) -> str:
         """Return number and size of the views; of pinhole images also their angle and resolution.
@@ -135,17 +159,28 @@ class PanoramaViews:
         Args:
             area: Area that the panoramas show, see `check_area`; None for the whole sphere.
         """
-        rows, columns = self.image_size
+        rows, columns = self.representation.image_size
         sets = self.representation.view_sets(PanoramaArea.on_canvas(area, _MASK_ROWS).valid)
         text = f"{counted(sum(map(len, sets)), 'views')} of {columns} × {rows}"
         grids = (views.grid for views in sets if isinstance(views, PinholeViews))
-        parts = "; ".join(dict.fromkeys(map(_described, grids)))
+        parts = "; ".join(
+            dict.fromkeys(
+                f"{grid.width_deg:.0f}° wide, {math.radians(1 / grid.pitch):.1f} pixels per degree "
+                "in the middle"
+                for grid in grids
+            )
+        )
         return f"{text} ({parts})" if parts else text
 
     def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Return the sets of views of the valid pixels of one panorama."""
-        representation: Representation = self.representation
-        rotation = None
+        """Return the views of the valid pixels of a panorama, or crops that cover a photo.
+
+        Photos smaller than a crop are mirrored at their borders.
+        """
+        if not image.is_panorama:
+            overlap = _OVERLAP if self._blend == "feather" else 0.0
+            return [_covered(image, crops, overlap) for crops in self.crops]
+        representation, rotation = self.representation, None
         if image.area is not None:
             image = replace(image, rgb=image.area.filled(image.rgb, self._fill))
         if image.up is not None:
@@ -154,51 +189,6 @@ class PanoramaViews:
         rows = representation.erp_height
         shape = (rows, 2 * rows) if image.shape[0] > rows else image.shape
         return [SourceViews(image, shape, representation.view_sets(image.valid), rotation)]
-
-
-def _described(grid: PinholeGrid) -> str:
-    density = math.radians(1 / grid.pitch)
-    return f"{grid.width_deg:.0f}° wide, {density:.1f} pixels per degree in the middle"
-
-
-class PhotoViews:
-    """Selects crops of photos with the size and angular resolution of the training images.
-
-    Args:
-        loaded: The network.
-        levels: See `Levels`.
-        base_level: Base level b of tangent images whose size the crops get; None as trained.
-        blend: ``feather``: crops overlap by at least a quarter and are averaged.
-        rotations: 1; photos cannot be averaged over rotations.
-
-    Raises:
-        SettingError: The network does not support such crops, or `rotations` is not 1.
-    """
-
-    def __init__(
-        self,
-        loaded: LoadedNetwork,
-        levels: Levels = None,
-        base_level: int | None = None,
-        blend: Blend = "feather",
-        rotations: int = 1,
-    ) -> None:
-        if rotations != 1:
-            raise SettingError("rotations", found=rotations, expected="1 for photos")
-        if "elevation" in loaded.inputs:
-            expected = "a panorama: the elevation of pixels, which the network takes, is unknown"
-            raise SettingError("image", found="a photo", expected=expected)
-        self._crops = [
-            _photo_representation(loaded, level, base_level)
-            for level in level_list(levels, loaded.photo_level or loaded.level)
-        ]
-        self.image_size = max(crops.image_size for crops in self._crops)
-        self.blend: Blend = blend
-
-    def __call__(self, image: InputImage) -> list[SourceViews]:
-        """Return crops that cover the photo. Photos smaller than a crop are mirrored at borders."""
-        overlap = _OVERLAP if self.blend == "feather" else 0.0
-        return [_covered(image, crops, overlap) for crops in self._crops]
 
 
 def wide_levels(side: int) -> list[int]:
@@ -251,11 +241,10 @@ def view_settings(views: str | Mapping[str, Any]) -> dict[str, Any]:
         SettingError: There is no such option.
     """
     changes = {"option": views} if isinstance(views, str) else dict(views)
-    folder, option = config_folder() / "representation", changes.pop("option", None)
-    files = sorted(folder.glob("*.yaml"))
+    option = str(changes.pop("option", None))
+    files = sorted((config_folder() / "representation").glob("*.yaml"))
     known = {file.stem: file for file in files if not file.stem.startswith(_NOT_VIEWS)}
-    if option not in known:
-        raise SettingError("views", found=views, expected=f"an option: {', '.join(known)}")
+    check_choice("views", option, tuple(known))
     section: Any = OmegaConf.to_container(OmegaConf.load(known[option]))
     bases = [name for name in section.pop("defaults", ()) if name != "_self_"]
     inherited = view_settings(bases[0]) if bases else {}
@@ -276,31 +265,27 @@ def photo_network_settings(
             level are given.
 
     Raises:
-        SettingError: The views do not have these settings.
+        SettingError: There are no such views.
     """
     is_default = levels is None and base_level is None
     settings = view_settings(views or (_VIEWS if is_default else "tangent"))
     is_tangent = settings["_target_"] == _TANGENT
-    chosen = (
-        wide_levels(side)[: 2 if is_tangent else 1] if levels is None else level_list(levels, 0)
-    )
+    usual = wide_levels(side)[: 2 if is_tangent else 1]
+    chosen = usual if levels is None else level_list(levels, 0)
     settings["level"] = max(chosen)
-    if is_tangent:
-        if settings["dim"] is None and settings["crop_multiple"] is None:
-            settings |= images_of_side(side, settings["level"], base_level)
-        return settings | {"levels": chosen}
-    _check_single(chosen, base_level)
-    size = "rows" if settings["_target_"] == _EQUIRECT else "dim"
-    return settings | {size: side if settings[size] is None else settings[size]}
+    if not is_tangent:
+        size = "rows" if settings["_target_"] == _EQUIRECT else "dim"
+        settings[size] = settings[size] or side
+        return settings | _only_of_tangent_images(chosen, base_level)
+    if settings["dim"] is None and settings["crop_multiple"] is None:
+        settings |= images_of_side(side, settings["level"], base_level)
+    return settings | {"levels": chosen}
 
 
-def _check_single(levels: Sequence[int], base_level: int | None) -> None:
-    """Refuse settings that only tangent images have."""
-    if base_level is not None:
-        raise SettingError("base_level", found=base_level, expected="tangent images")
-    if len(levels) > 1:
-        expected = "one level, or tangent images (views=tangent)"
-        raise SettingError("levels", found=list(levels), expected=expected)
+def _only_of_tangent_images(levels: Sequence[int], base_level: int | None) -> dict[str, Any]:
+    """Return settings that other representations refuse."""
+    given = {"base_level": base_level, "levels": levels if len(levels) > 1 else None}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def panorama_settings(
@@ -309,7 +294,7 @@ def panorama_settings(
     base_level: int | None = None,
     views: ViewChoice = None,
 ) -> dict[str, Any]:
-    """Return the settings of the representation of panoramas, see `PanoramaViews`.
+    """Return the settings of the representation of panoramas, see `ViewSelector`.
 
     Args:
         loaded: The network.
@@ -318,27 +303,24 @@ def panorama_settings(
         views: See `ViewChoice`.
 
     Raises:
-        SettingError: The representation does not have these settings.
+        SettingError: There are no such views.
     """
     side, settings = loaded.photo_side, dict(loaded.representation)
     if side is not None and views is not None:
         return photo_network_settings(side, levels, base_level, views)
-    chosen = [loaded.level] if levels is None else level_list(levels, loaded.level)
-    level = max(chosen)
+    chosen = level_list(levels, loaded.level)
+    level, was_tangent = max(chosen), settings["_target_"] == _TANGENT
     if views is not None:
         settings = view_settings(views)
-    elif settings["_target_"] == PERSPECTIVE or (
-        base_level is not None and settings["_target_"] != _TANGENT
-    ):
+    elif settings["_target_"] == PERSPECTIVE or (base_level is not None and not was_tangent):
         settings = {"_target_": _TANGENT, "base_level": _BASE_LEVEL}
     if level != loaded.level and views is None:
         settings |= {"erp_height": None} | ({"dim": None} if "dim" in settings else {})
     settings["level"] = level
     if settings["_target_"] != _TANGENT:
-        _check_single(chosen, base_level)
         if side is not None and "dim" in settings:
             settings["dim"] = settings["dim"] or side
-        return settings
+        return settings | _only_of_tangent_images(chosen, base_level)
     if base_level not in (None, settings["base_level"]):
         settings |= {"base_level": base_level, "dim": None, "faces_per_panorama": None}
     if levels is not None:
@@ -346,21 +328,14 @@ def panorama_settings(
     if side is not None:
         dim = settings.get("dim")
         # The network divides larger images.
-        settings |= (
-            images_of_side(side, level, base_level) if dim is None else {"dim": max(dim, side)}
-        )
+        fewest = images_of_side(side, level, base_level)
+        settings |= fewest if dim is None else {"dim": max(dim, side)}
     return settings
 
 
-def _built(
-    loaded: LoadedNetwork, settings: dict[str, Any]
-) -> PinholeRepresentation | EquirectRepresentation | IcosphereRepresentation:
-    """Build the representation from settings.
-
-    Raises:
-        SettingError: The network does not support its image size.
-    """
-    built: Any = build_from_config(settings, "representation")
+def _built(loaded: LoadedNetwork, settings: dict[str, Any]) -> Any:
+    """Build a representation whose image size the network supports."""
+    built = build_from_config(settings, "representation")
     check_size(loaded, built.image_size)
     return built
 

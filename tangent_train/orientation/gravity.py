@@ -79,7 +79,7 @@ def estimate_up(
             Choose it slightly above the camera's tilt: with a larger value, another axis of the
             room may be taken for up.
         likelihood: Other evidence about directions, such as the confidence of a network
-            (`inference.up_likelihood`). It is called at most once, for the likely directions
+            (`inference.engine.UpLikelihood`). It is called at most once, for the likely directions
             of the best frame.
 
     Returns:

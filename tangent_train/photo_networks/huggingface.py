@@ -15,14 +15,16 @@ from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
 from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
+from tangent_train.files import read_json
 from tangent_train.imports import hide_output, offline
 from tangent_train.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,
     class_names_in,
     names_of,
+    saved_folder,
+    tensors_in,
 )
-from tangent_train.photo_networks.saved import json_in, saved_folder, tensors_in
 
 _NAMES = 'id2label with the name of every score, {"0": "wall", "1": "floor"}'
 _TASK = "the task is semantic"
@@ -42,13 +44,10 @@ _FAMILIES: dict[str, Sequence[DepthKind]] = {
     "glpn": _METRIC,
     "tipsv2_dpt": _METRIC,
     "zoedepth": _METRIC,
+    "chmv2": (),  # heights of trees in aerial images
+    "prompt_depth_anything": (),  # continues the depth image of a sensor
 }
-"""Possible kinds of networks in transformers, the usual one first."""
-
-_REFUSED = {
-    "chmv2": "heights of trees in aerial images, which are not distances from the camera",
-    "prompt_depth_anything": "depth that continues the depth image of a sensor, a second input",
-}
+"""Possible kinds of networks in transformers, the usual one first; none for other quantities."""
 
 _DEPTH_NAMES = (
     "Set depth=, e.g. relative_disparity for MiDaS and its DPT (Intel/dpt-large), metric_z for "
@@ -56,7 +55,6 @@ _DEPTH_NAMES = (
 )
 
 _VOCABULARIES = ("tokenizer.json", "vocab.json")
-_BYTE = 255
 _SIDE = 32
 """Rows and columns of the images with which an image processor is tested."""
 
@@ -68,10 +66,9 @@ _LISTED = 4
 
 
 def load(
-    *,
     model: str | None,
-    classes: Path | None,
-    normalization: Any,
+    classes: Path | None = None,
+    normalization: Any = None,
     depth: DepthKind | None = None,
 ) -> PhotoNetwork:
     """Load a network of transformers for semantic or universal segmentation, or for depth.
@@ -86,37 +83,30 @@ def load(
 
     Raises:
         DataError: A file is missing, or cannot be fetched or used.
-        SettingError: A setting is invalid, or transformers is not installed.
+        SettingError: The kind of depth is unknown, or transformers is not installed.
     """
     folder = saved_folder(model)
+    path = folder / "config.json"
+    config = read_json(path, "the config of a model")
     with offline():
-        return _from_folder(folder, classes, normalization, depth)
-
-
-def _from_folder(
-    folder: Path, classes: Path | None, normalization: Any, depth: DepthKind | None
-) -> PhotoNetwork:
-    config, path = json_in(folder, "config.json"), folder / "config.json"
-    described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
-    kind = declared_kind(config, path, depth) if _predicts_depth(config, path, depth) else None
-    labels = config.get("id2label")
-    if isinstance(labels, dict):
-        labels = {index: str(name).strip() for index, name in labels.items()}
-    names = names_of(labels, path, _NAMES) if kind is None else ()
-    processor = _processor(folder)
-    settings = {"config": described, "bgr": bool(processor.get("do_flip_channel_order"))}
-    if kind is None:
-        settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
-    else:
-        padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
-        settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
-    if described["model_type"] == "oneformer":
-        settings["task"] = _task(folder, config)
-    network = build_from_file(settings, "network", path)
-    if len(names) == 1 and network.is_universal:
-        expected = "at least two classes: with one, masks contain it in every pixel"
-        raise DataError(path, found="masks of one class", expected=expected)
-    _load_tensors(network, tensors_in(folder), folder)
+        described = architecture(config | dict.fromkeys(_LEFT_OUT, False))
+        processor = _processor(folder, described["model_type"])
+        settings = {"config": described, "bgr": processor["do_flip_channel_order"]}
+        kind: DepthKind | None = None
+        names: tuple[str, ...] = ()
+        if _predicts_depth(config, path, depth):
+            kind = declared_kind(config, path, depth)
+            padded = described["model_type"] == _PADDED and bool(processor.get("do_pad"))
+            settings |= {"_target_": "models.HuggingFaceDepthNetwork", "padded": padded}
+        else:
+            labels = dict(config.get("id2label") or {})
+            labels = {index: str(name).strip() for index, name in labels.items()}
+            names = names_of(labels, path, _NAMES)
+            settings |= {"_target_": "models.HuggingFaceNetwork", "num_classes": len(names)}
+        if described["model_type"] == "oneformer":
+            settings["task"] = _task(folder, config)
+        network = build_from_file(settings, "network", path)
+        _load_tensors(network, tensors_in(folder), folder)
     settings["config"] = architecture(network.network.config.to_dict())
     given = None if normalization is None else Normalization.of(normalization, 3)
     return PhotoNetwork(
@@ -124,7 +114,7 @@ def _from_folder(
         settings=settings,
         score_names=names if classes is None else class_names_in(classes),
         normalization=given or Normalization(processor["mean"], processor["std"]),
-        image_size=_image_size(processor, folder),
+        image_size=_image_size(processor),
         score_kind="logits",
         depth_kind=kind,
     )
@@ -150,7 +140,7 @@ def _predicts_depth(config: Mapping[str, Any], path: Path, depth: DepthKind | No
     )
 
 
-def _processor(folder: Path) -> dict[str, Any]:
+def _processor(folder: Path, model_type: str) -> dict[str, Any]:
     """Return settings of the image processor, with the defaults of its class.
 
     ``do_flip_channel_order``, ``mean`` and ``std`` (for images from 0 to 1) are measured. Settings
@@ -159,38 +149,43 @@ def _processor(folder: Path) -> dict[str, Any]:
     Raises:
         DataError: There is no usable image processor.
     """
-    path, content = _processor_file(folder)
-    kind = _processor_class(content, folder)
+    path, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
+    expected = "the image processor of the network: its normalization and image size"
+    content = read_json(shared, expected).get("image_processor") if shared.is_file() else None
+    content = content or read_json(path, expected)
+    kind = _processor_class(content, model_type)
     known = {
         name: value
         for name, value in content.items()
         if name in kind.valid_kwargs.__annotations__ and not isinstance(value, str)
     }
+    reason, response = "its channels are not scaled", None
     try:
         with hide_output():
             processor = kind(**known)
-            order, black, gain = _response(processor)
+            response = _response(processor)
     except Exception as error:  # processors raise many kinds about their settings
+        reason = first_line(error)
+    if response is None:
         raise DataError(
             path,
-            found=f"no normalization in {content} ({first_line(error)})",
+            found=f"no normalization in {content} ({reason})",
             expected=f"settings of {kind.__name__} that scale three channels",
-        ) from error
+        )
+    order, black, gain = response
     numbers = {"mean": (-black / gain)[order], "std": (1 / gain)[order]}
     rounded = {n: [float(f"{value:.6g}") for value in values] for n, values in numbers.items()}
     settings: dict[str, Any] = processor.to_dict()
     return settings | rounded | {"do_flip_channel_order": bool(order[0])}
 
 
-def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]]:
+def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[Any]] | None:
     """Measure how an image processor normalizes colors.
 
     Returns:
         For each input channel of the network: index of the image's channel, value for black, and
-        difference between full intensity and black.
-
-    Raises:
-        ArithmeticError: The processor does not scale three channels, in their order or reversed.
+        difference between full intensity and black. None if the processor does not scale three
+        channels, in their order or reversed.
     """
     known = processor.valid_kwargs.__annotations__
     switched_off = {name: False for name in _NOT_OF_COLORS if name in known}
@@ -201,31 +196,13 @@ def _response(processor: Any) -> tuple[NDArray[np.intp], NDArray[Any], NDArray[A
     ranges = np.array(primary) - black  # (channel of the image, channel of the network)
     order = np.abs(ranges).argmax(axis=0)
     gain = ranges[order, np.arange(len(order))]
-    error = np.abs(mixed - black - gain * colors[-1][order] / _BYTE).max()
+    error = np.abs(mixed - black - gain * colors[-1][order] / 255).max()
     in_order = order.tolist() in ([0, 1, 2], [2, 1, 0])
-    is_finite = np.isfinite(pixels).all()
-    if not (in_order and is_finite and gain.min() > 0 and error < 1e-3 * gain.max()):
-        raise ArithmeticError(f"maps {colors[-1].tolist()} to {mixed.round(3).tolist()}")
-    return order, black, gain
+    is_scaled = np.isfinite(pixels).all() and gain.min() > 0 and error < 1e-3 * gain.max()
+    return (order, black, gain) if in_order and is_scaled else None
 
 
-def _processor_file(folder: Path) -> tuple[Path, dict[str, Any]]:
-    path, shared = folder / "preprocessor_config.json", folder / "processor_config.json"
-    if shared.is_file():
-        inside = json_in(folder, shared.name).get("image_processor")
-        if isinstance(inside, dict):
-            return shared, inside
-    if not path.is_file():
-        raise DataError(
-            folder,
-            found=f"no {path.name}",
-            expected="the image processor of the network: its normalization and image size",
-            remedy="Copy this file from the model from which this one was fine-tuned.",
-        )
-    return path, json_in(folder, path.name)
-
-
-def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
+def _processor_class(content: Mapping[str, Any], model_type: str) -> Any:
     """Return the class named in a file, also by its older name, or the network's default."""
     import transformers  # loads its classes on demand
     from transformers import IMAGE_PROCESSOR_MAPPING, AutoConfig
@@ -235,49 +212,34 @@ def _processor_class(content: Mapping[str, Any], folder: Path) -> Any:
     name = str(content.get("image_processor_type") or older.replace("Extractor", "Processor"))
     kind = getattr(transformers, name.removesuffix("Fast"), None)
     if not (isinstance(kind, type) and issubclass(kind, BaseImageProcessor)):
-        model = AutoConfig.for_model(json_in(folder, "config.json")["model_type"])
-        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(model)]
+        kinds: Any = IMAGE_PROCESSOR_MAPPING[type(AutoConfig.for_model(model_type))]
         kind = kinds.get("torchvision") or kinds["pil"]
     return kind
 
 
-def _image_size(processor: Mapping[str, Any], folder: Path) -> tuple[int, int]:
+def _image_size(processor: Mapping[str, Any]) -> tuple[int, int]:
     """Return rows and columns of the images after the image processor."""
     given = processor.get("size") if processor.get("do_resize") else None
     if processor.get("do_center_crop") and processor.get("crop_size"):
         given = processor["crop_size"]
     if given is None:
         return USUAL_SIZE
-    shortest = given.get("shortest_edge", given.get("longest_edge"))
-    rows, columns = given.get("height", shortest), given.get("width", shortest)
-    if not (isinstance(rows, int) and isinstance(columns, int) and min(rows, columns) > 0):
-        raise DataError(
-            folder / "preprocessor_config.json",
-            found=f"size: {given}",
-            expected="height and width, or shortest_edge, in pixels",
-        )
-    return rows, columns
+    side = given.get("shortest_edge", given.get("longest_edge"))
+    return int(given.get("height", side)), int(given.get("width", side))
 
 
 def _task(folder: Path, config: Mapping[str, Any]) -> list[int]:
     """Return the tokens that select OneFormer's semantic task (``OneFormerProcessor``)."""
     from transformers import AutoTokenizer
 
-    expected = "the tokenizer of OneFormer, which takes its task as text"
-    if not any((folder / name).is_file() for name in _VOCABULARIES):
+    if not any((folder / name).is_file() for name in _VOCABULARIES):  # else tokens are "unknown"
+        expected = "the tokenizer of OneFormer, which takes its task as text"
         raise DataError(folder, found=f"no {' or '.join(_VOCABULARIES)}", expected=expected)
+    tokenizer = AutoTokenizer.from_pretrained(
+        folder, local_files_only=True, trust_remote_code=False
+    )
     length = config.get("task_seq_len", 77)
-    try:
-        tokenizer = AutoTokenizer.from_pretrained(
-            folder, local_files_only=True, trust_remote_code=False
-        )
-        text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
-    except Exception as error:  # tokenizers raise many kinds about their files
-        raise DataError(
-            folder,
-            found=f"an unusable tokenizer ({first_line(error)})",
-            expected=expected,
-        ) from error
+    text = tokenizer(_TASK, padding="max_length", max_length=length, truncation=True)
     masked = zip(text["input_ids"], text["attention_mask"], strict=True)
     return [token * mask for token, mask in masked]
 
@@ -315,19 +277,15 @@ def declared_kind(config: Mapping[str, Any], path: Path, given: DepthKind | None
         given: The user's setting ``depth``, which must not contradict the config.
 
     Raises:
-        DataError: The network returns something else, or needs another input.
-        SettingError: The config does not determine the kind, or contradicts `given`.
+        SettingError: The config does not determine the kind, or contradicts `given`; or the network
+            returns something else, or needs another input.
     """
     name = str(config.get("model_type"))
     if name == "depth_anything":
         name = str(config.get("depth_estimation_type", "relative"))
-    if name in _REFUSED:
-        raise DataError(path, found=f"{name}: {_REFUSED[name]}", expected="depth of photos")
-    kinds = _FAMILIES.get(name, ())
-    if given is None and not kinds:
-        expected = f"one of {', '.join(get_args(DepthKind))}, which {path} does not contain"
-        raise SettingError("depth", found="none", expected=expected, remedy=_DEPTH_NAMES)
-    if given is not None and kinds and given not in kinds:
-        expected = f"{' or '.join(kinds)}, because {path} has {name}"
-        raise SettingError("depth", found=given, expected=expected)
-    return given or kinds[0]
+    kinds = _FAMILIES.get(name, get_args(DepthKind))
+    usual = given or (kinds[0] if name in _FAMILIES and kinds else None)
+    if usual is None or usual not in kinds:
+        expected = f"{' or '.join(kinds) or 'depth of photos'}, because {path} has {name}"
+        raise SettingError("depth", found=given or "none", expected=expected, remedy=_DEPTH_NAMES)
+    return usual

@@ -10,7 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
+from datamodules.core.inputs import normalize_channels
+from datamodules.core.label_map import DISTANCE
 from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.loaded import (
@@ -81,31 +82,21 @@ def import_network(
         OSError: The disk is full.
     """
     multiple, only_size = declared_sizes(network.module)
-    if image_size is not None and only_size not in (None, image_size):
-        raise SettingError(
-            "image_size",
-            found=width_height(image_size),
-            expected=f"{width_height(only_size)}, the only size that the network takes",
-        )
     fixed = image_size or only_size
     size = fixed or network.image_size
     output = _output(network, size)
-    described: dict[str, Any] = {
-        "class_names": (),
-        "predicts": DISTANCE,
-        "depth_kind": network.depth_kind,
-    }
+    described: dict[str, Any] = {"class_names": (), "predicts": DISTANCE}
     if network.depth_kind is None:
         kind = score_kind or network.score_kind or usual_kind(output, len(network.score_names))
         count = output.shape[1]
         names, groups = _groups(network.score_names, kind, count, unknown_classes, unknown_wins)
         described = {"class_names": names, "groups": groups, "score_kind": kind}
-        described["predicts"] = PIXEL_CLASSES
     # A network of a fixed size gets square images of its longer side, see `NetworkDescription`.
     seen = photo_network_settings(max(size) if fixed else min(size), levels, base_level, views)
     loaded = LoadedNetwork(
         module=network.module,
         **described,
+        depth_kind=network.depth_kind,
         inputs=("rgb",),
         normalization=network.normalization,
         level=seen["level"],
@@ -131,29 +122,23 @@ def import_network(
 def _output(network: PhotoNetwork, size: tuple[int, int]) -> Tensor:
     """Return the output ``(1, K, h, w)`` for an image of noise; label maps and depth have K = 1."""
     image = torch.rand(1, 3, *size, generator=torch.Generator().manual_seed(0))
-    mean, std = (
-        torch.tensor(values, dtype=torch.float32)[:, None, None]
-        for values in (network.normalization.mean, network.normalization.std)
-    )
+    images = normalize_channels(image, [1, 1, 1], network.normalization)
     try:
-        output = plain_output(network.module.eval()((image - mean) / std)).float()
+        output = plain_output(network.module.eval()(images)).float()
     except Exception as error:  # networks raise many kinds about images that they do not take
-        raise SettingError(
-            "network",
-            found=f"{type(error).__name__} ({first_line(error)}) for an RGB image of "
-            f"{width_height(size)}",
-            expected="scores, labels or depth",
-            remedy="If it needs another size, set image_size=[rows,columns].",
-        ) from error
-    output = output if output.ndim == image.ndim else output[:, None]
-    fits = output.shape[2:] == size and (network.depth_kind is None or output.shape[1] == 1)
-    if not fits or not output.isfinite().any():
-        raise SettingError(
-            "output of the network",
-            found=f"{tuple(output.shape)}, {int(output.isfinite().sum())} numbers are finite",
-            expected=f"scores (1, K, {size[0]}, {size[1]}); labels or depth with K = 1",
-        )
-    return output
+        found = f"{type(error).__name__} ({first_line(error)})"
+    else:
+        output = output if output.ndim == image.ndim else output[:, None]
+        fits = output.shape[2:] == size and (network.depth_kind is None or output.shape[1] == 1)
+        if fits and output.isfinite().any():
+            return output
+        found = f"{tuple(output.shape)}, {int(output.isfinite().sum())} numbers are finite"
+    raise SettingError(
+        "output of the network",
+        found=f"{found} for an RGB image of {width_height(size)}",
+        expected="scores (1, K, h, w) of the image's size; labels or depth with K = 1",
+        remedy="If it needs another size, set image_size=[rows,columns].",
+    )
 
 
 def usual_kind(output: Tensor, named: int) -> ScoreKind:
@@ -197,45 +182,31 @@ def _groups(
     unknown_classes: Collection[str],
     unknown_wins: bool,
 ) -> tuple[list[str], Groups | None]:
-    """Return names of the labels, and the scores of each, see `NetworkDescription.groups`."""
-    score_names, unknown = list(map(composed, score_names)), set(map(composed, unknown_classes))
-    if missing := unknown - set(score_names):
-        raise SettingError(
-            "unknown_classes",
-            found=", ".join(sorted(missing)),
-            expected=f"names among {', '.join(score_names)}",
-        )
-    scores, rest = _scores_of(len(score_names), kind, count)
-    classes = {name: k for k, name in zip(scores, score_names, strict=True) if name not in unknown}
-    if not classes or (not unknown_wins and (len(classes) == 1 or kind == "labels")):
-        raise SettingError(
-            "unknown_classes",
-            found=f"{', '.join(sorted(unknown)) or 'none'} with unknown_wins={unknown_wins}",
-            expected="other classes that can be predicted; unknown_wins=true for label maps",
-        )
-    rest = rest + [k for k, name in zip(scores, score_names, strict=True) if name in unknown]
-    names = ["unknown", *classes]
-    if not rest and scores == list(range(count)):
-        return names, None
-    return names, [[k] for k in classes.values()] + ([rest] if rest and unknown_wins else [])
-
-
-def _scores_of(named: int, kind: ScoreKind, count: int) -> tuple[list[int], list[int]]:
-    """Return indices of the named classes' scores, and of scores without a class, see `ScoreKind`.
+    """Return names of the labels, and the scores of each, see `NetworkDescription.groups`.
 
     Of two names for a single score, the first is the background.
     """
-    if kind == "labels":
-        return list(range(named)), [named]
-    if count == 1 and named <= _MASK_NAMES:
-        return ([0], [1]) if named == 1 else ([1, 0], [])
-    if named != count:
-        raise SettingError(
-            "class names of the network",
-            found=f"{named}, for {count} score{'s' * (count > 1)}",
-            expected="one for each score, or two for a single score, the background first",
-        )
-    return list(range(count)), []
+    names, unknown = list(map(composed, score_names)), set(map(composed, unknown_classes))
+    is_mask = kind != "labels" and count == 1 and len(names) <= _MASK_NAMES
+    scores, rest = list(range(len(names))), [len(names)] if kind == "labels" else []
+    if is_mask:  # index 1 is "not of the class", see `ScoreKind`
+        scores, rest = ([0], [1]) if len(names) == 1 else ([1, 0], [])
+    classes = {name: k for k, name in zip(scores, names, strict=True) if name not in unknown}
+    has_second = len(classes) > 1 and kind != "labels"
+    fits = {
+        f"names of {count} scores": kind == "labels" or is_mask or len(names) == count,
+        f"unknown_classes among {', '.join(names)}": unknown <= set(names),
+        "other classes besides unknown_classes": bool(classes),
+        "unknown_wins=true, or a second best class": unknown_wins or has_second,
+    }
+    for expected in (text for text, is_met in fits.items() if not is_met):
+        found = f"{len(names)}, and unknown_classes {', '.join(sorted(unknown)) or 'none'}"
+        raise SettingError("class names of the network", found=found, expected=expected)
+    rest += [k for k, name in zip(scores, names, strict=True) if name in unknown]
+    labels = ["unknown", *classes]
+    if not rest and scores == list(range(count)):
+        return labels, None
+    return labels, [[k] for k in classes.values()] + ([rest] if rest and unknown_wins else [])
 
 
 def _write_checkpoint(loaded: LoadedNetwork, path: Path) -> None:

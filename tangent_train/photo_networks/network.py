@@ -1,4 +1,4 @@
-"""A photo network from another library or file, and the names of its scores."""
+"""A photo network from another library, the names of its scores, and its saved files."""
 
 from __future__ import annotations
 
@@ -7,11 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from torch import nn
+from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
+from models.pretrained import read_tensors
 from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError, first_line
 from tangent_train.files import read_json
 
 USUAL_SIZE = (512, 512)
@@ -43,6 +44,11 @@ class PhotoNetwork:
     depth_kind: DepthKind | None = None
 
 
+_WEIGHTS = "model.safetensors"
+_SHARDS = "model-*-of-*.safetensors"
+_FILES = ("*.json", _WEIGHTS, _SHARDS, "merges.txt")
+
+
 def class_names_in(path: Path | None, depth: DepthKind | None = None) -> tuple[str, ...]:
     """Read the names of a network's scores, in their order; return none for a depth network.
 
@@ -52,28 +58,21 @@ def class_names_in(path: Path | None, depth: DepthKind | None = None) -> tuple[s
         depth: Kind of depth; None for a network that predicts classes.
 
     Raises:
-        SettingError: No file is given.
-        DataError: The file has other content.
+        DataError: The file is missing, or has other content.
     """
     if depth is not None:
         return ()
     expected = 'a JSON list of class names in the order of the scores, ["wall", "floor"]'
-    if path is None:
-        raise SettingError(
-            "classes",
-            found="none",
-            expected=f"a file with {expected}",
-            remedy=f"For a depth network, set depth= to one of {', '.join(get_args(DepthKind))}.",
-        )
-    return names_of(read_json(path, expected), path, expected)
+    content = None if path is None else read_json(path, expected)
+    return names_of(content, path or "classes", expected)
 
 
-def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
+def names_of(content: Any, source: object, expected: str) -> tuple[str, ...]:
     """Return names from the content of a file, see `class_names_in`.
 
     Args:
         content: A list of names, or a dict that maps each index to a name.
-        path: File of the names, for the message.
+        source: File of the names or setting, for the message.
         expected: Expected content, for the message.
 
     Raises:
@@ -83,5 +82,58 @@ def names_of(content: Any, path: Path, expected: str) -> tuple[str, ...]:
     if isinstance(content, dict):
         names = [content.get(str(index)) for index in range(len(content))]
     if not names or not all(isinstance(name, str) and name for name in names):
-        raise DataError(path, found=str(content)[:80], expected=expected)
+        kinds = f"For a depth network, set depth= to one of {', '.join(get_args(DepthKind))}."
+        raise DataError(source, found=str(content or "none")[:80], expected=expected, remedy=kinds)
     return tuple(names)
+
+
+def saved_folder(model: str | Path | None) -> Path:
+    """Return the folder of a saved model, which is fetched from the hub if necessary.
+
+    Args:
+        model: A folder written by ``save_pretrained`` of transformers or of
+            segmentation-models-pytorch, or a name on the hub, ``owner/name``.
+
+    Raises:
+        DataError: The model is neither a folder nor can it be fetched.
+    """
+    name = str(model)
+    if Path(name).is_dir():
+        return Path(name)
+    try:
+        from huggingface_hub import snapshot_download
+
+        return Path(snapshot_download(name, allow_patterns=list(_FILES)))
+    except Exception as error:  # no connection, no such name, or the model needs a login
+        fetch = f"hf download {name} --local-dir {name.rpartition('/')[2] or 'network'}"
+        raise DataError(
+            name,
+            found="no such folder, and no way to fetch it "
+            f"({type(error).__name__}: {first_line(error)})",
+            expected="a folder, or the name of a model on huggingface.co that you may read",
+            remedy=f"On a machine with access, run `{fetch}` (after `hf auth login` if the model "
+            "requires agreement to terms), and set model= to the path of that folder.",
+        ) from error
+
+
+def tensors_in(folder: Path) -> dict[str, Tensor]:
+    """Read the weights of a saved model by name, floats as float32.
+
+    Args:
+        folder: Folder of the model.
+
+    Raises:
+        DataError: There are no safetensors files, or they are unreadable.
+    """
+    whole = folder / _WEIGHTS
+    paths = [whole] if whole.is_file() else sorted(folder.glob(_SHARDS))
+    if not paths:
+        raise DataError(
+            folder,
+            found=f"no {_WEIGHTS}",
+            expected="weights as safetensors: reading other formats may run code",
+            remedy="If you trust the files, load them with from_pretrained(…) of their library and "
+            "write them with save_pretrained(…), which creates safetensors.",
+        )
+    tensors = {name: t for path in paths for name, t in read_tensors(path)[""].items()}
+    return {n: t.float() if t.is_floating_point() else t for n, t in tensors.items()}

@@ -18,7 +18,7 @@ from datamodules.core.dataset import Sample, valid_mask
 from tangent_train.checkpoints.outputs import network_for_views
 from tangent_train.errors import SettingError
 from tangent_train.heads import Head
-from tangent_train.inference.engine import scored_views, sees_rays, upright_rays, view_scores
+from tangent_train.inference.engine import scored_views, sees_rays, upright_rays
 from tangent_train.tasks.divergence import check_loss, check_weights
 from tangent_train.tasks.optimization import Schedule, freeze, parameter_groups
 
@@ -372,7 +372,9 @@ class PixelTask(Task):
     def predict_crops(self, images: Tensor, truth: Tensor, lengths: Tensor) -> Tensor:
         """Predict the crops of a photo ``(n, h, w)``; see `predict_panorama`."""
         predictions, step = [], self.eval_view_batch_size
-        for part, outputs in view_scores(self, images.__getitem__, len(truth), step):
+        crops = range(len(truth))
+        for numbers, outputs in scored_views(self, [(crops, images.__getitem__, None)], step):
+            part = slice(numbers.start, numbers.stop)
             predictions.append(self.head.crop_pixels(outputs, lengths[part]))
             self.add_validation_loss(outputs, self.head.targets(truth[part], lengths[part]))
         return torch.cat(predictions)

@@ -157,7 +157,10 @@ def test_an_exported_network_has_the_figures_of_its_run(
     ("changes", "message"),
     [
         ({"label_map": None}, r"found class names .*'beam'.*; expected .*'dark'.*label_map="),
-        ({"label_map": {"classes": {"floor": ["pink"]}}}, "found no class of the map in a network"),
+        (
+            {"label_map": {"classes": {"floor": ["pink"]}}},
+            "a map from dark, green, bright to beam",
+        ),
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected 'unknown' or 'never'"),
         ({"task": "task=depth"}, "checkpoint: found a network that predicts pixel_classes"),
         ({"data": "data=synthshapes"}, "data.inputs: found"),

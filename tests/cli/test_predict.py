@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tangent_train.geometry import rotation_about
-from tangent_train.inference.engine import Predictor
+from tangent_train.inference.engine import Predictor, UpLikelihood
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.up_likelihood import UpLikelihood
 from tangent_train.io.pixel_files import write_pixels
 from tests.cli.tiny_runs import Predict, predicted
 from tests.datamodules.data_files import read_png
@@ -225,7 +224,7 @@ def test_a_share_of_each_class_is_kept_below_the_least_confidence(
         ({"align": "scale"}, "align: found scale; expected null: nothing reads it"),
         ({"projection": "perspective", "mask": -30}, "mask: found -30.0; expected null: nothing"),
         ({"projection": "perspective", "rotations": 2}, "rotations: found"),
-        ({"label_map": "night"}, "label_map: found night; expected ade20k_to_cityscapes"),
+        ({"label_map": "night"}, "label_map: found 'night'; expected 'ade20k_to_cityscapes'"),
     ],
 )
 def test_impossible_settings_are_refused_before_any_work(

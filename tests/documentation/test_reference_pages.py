@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.geometry import TangentGrid
-from tangent_train.inference.label_maps import __file__ as label_maps
+from tangent_train.inference.api import __file__ as label_maps
 from tangent_train.io.camera_files import CameraFile, write_cameras
 from tangent_train.metrics.scores import ScoreColumn
 from tangent_train.results.evaluation import EvaluationResult
@@ -70,5 +70,5 @@ def test_file_formats_names_every_field_of_cameras(tmp_path: Path) -> None:
 
 
 def test_file_formats_names_every_label_map() -> None:
-    maps = {path.stem for path in Path(label_maps).with_suffix("").glob("*.json")}
+    maps = {path.stem for path in Path(label_maps).with_name("label_maps").glob("*.json")}
     assert not missing(maps, "file_formats.md")

@@ -12,7 +12,7 @@ from torch import nn
 
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.rendering import TangentRepresentation
 from tangent_train.results.evaluation import evaluation_result
 from tangent_train.tasks import PixelTask
@@ -33,7 +33,7 @@ def test_a_head_and_its_metric_are_enough() -> None:
 
     loaded: Any = trained_network(TANGENT)
     loaded.__dict__["network"] = nn.Conv2d(3, 1, 1)
-    mosaic = Predictor(loaded, head, PanoramaViews(loaded)).predict(InputImage(sphere(32)))
+    mosaic = Predictor(loaded, head, ViewSelector(loaded)).predict(InputImage(sphere(32)))
     with torch.no_grad():
         weight = loaded.network.weight.flatten().numpy()
     found = head.predicted(mosaic, InputImage(sphere(32))).pixels

@@ -12,15 +12,13 @@ import torch
 from torch import nn
 
 from datamodules.core.dataset import valid_mask
-from datamodules.core.label_map import class_weights
 from datamodules.folder.labeled import FolderPanoramas
 from tangent_train.config.build import build_from_config
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.io.gpano import PanoramaArea
-from tangent_train.rendering import TangentRepresentation
 from tangent_train.tasks import PixelTask
 from tests.datamodules.folder.folder_format import save, write_classes
 from tests.inference.trained import (
@@ -147,38 +145,11 @@ def test_prediction_is_evaluation(tmp_path: Path, kind: str, up: Any) -> None:
         valid=valid_mask(batch.valid[0]),
     )
     trained = trained_network(KINDS[of], module=network, fill="reflect")
-    views = PanoramaViews(trained, blend=KINDS[of].get("blend", "feather"))
-    if "rotations" in KINDS[of]:
-        views = PanoramaViews(trained, None, None, views.blend, 2)
+    same: dict[str, Any] = {n: KINDS[of][n] for n in ("blend", "rotations") if n in KINDS[of]}
+    views = ViewSelector(trained, **same)
     black = data.canvas.place(data.canvas.cut(panorama.rgb))
     image = InputImage(black, up=zenith, area=data.canvas)
     labels = Predictor(trained, head_of(trained), views).predict(image).labels()
     cut = data.canvas.cut
     assert len(np.unique(cut(labels.numpy()))) > 1
     np.testing.assert_array_equal(cut(labels.numpy()) + 1, cut(expected.numpy()))
-
-
-@pytest.mark.parametrize("rotation", ["none", "so3"])
-def test_batches_are_collated_and_losses_ignore_the_fill(
-    tmp_path: Path, rotation: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
-    task = _task("tangent", nn.Conv2d(3, 3, 1))
-    task.representation = TangentRepresentation(0, 5, random_rotation=rotation)
-    losses = []
-    for fill in ("black", "reflect"):
-        data = _data(write_both(tmp_path)[1], task, fill=fill, batch_size=2)
-        batch: Any = data.on_after_batch_transfer(next(iter(data.train_dataloader())), 0)
-        assert batch.images.shape[:2] == batch.labels.shape[:2]
-        needed = data.representation.view_sets(data.canvas.valid)[0]
-        assert batch.images.shape[:2] == (2, len(needed))
-        images, labels = task.training_pairs(batch)
-        losses.append(
-            float(task.loss_sum((images,), labels).detach()) / float(task.head.loss_norm(labels))
-        )
-        weights = data.class_weights("log")
-    assert capsys.readouterr().out == "", (
-        "a quarter of the area is unknown, two thirds of the sphere"
-    )
-    assert losses[0] == pytest.approx(losses[1], rel=0.02)
-    stored = [np.bincount(np.asarray(data.dataset("train").labels(k)).ravel()) for k in range(2)]
-    assert torch.equal(weights, class_weights(np.sum(stored, axis=0)[1:], "log"))

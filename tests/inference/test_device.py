@@ -14,7 +14,7 @@ from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads import head_of
 from tangent_train.inference.engine import Predictor, RenderedViews
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PanoramaViews, PhotoViews
+from tangent_train.inference.views import ViewSelector
 from tests.fake_gpu import fake_gpu
 from tests.inference.trained import (
     CUBE,
@@ -60,8 +60,7 @@ def _case(name: str) -> tuple[LoadedNetwork, InputImage, Any]:
     network = torch.nn.Conv2d(sum(INPUTS[name] for name in inputs), 3, 1).eval()
     channels = 4 if "depth" in inputs else 3
     trained = trained_network(representation, channels, module=network, inputs=inputs)
-    kind = PanoramaViews if image.camera_matrix is None else PhotoViews
-    return trained, image, kind(trained, **settings)
+    return trained, image, ViewSelector(trained, **settings)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -13,8 +13,8 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Normalization
 from tangent_train.geometry import equirect_directions, random_rotation
 from tangent_train.geometry.icosphere import icosphere_directions
+from tangent_train.inference.engine import UpLikelihood
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.up_likelihood import UpLikelihood
 from tests.inference.trained import ERP, ICOSPHERE, TANGENT, trained_network
 
 if TYPE_CHECKING:

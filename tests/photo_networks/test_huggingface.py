@@ -13,9 +13,8 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from models.huggingface import architecture
 from tangent_train.errors import DataError, SettingError
-from tangent_train.photo_networks import huggingface, import_network
+from tangent_train.photo_networks import huggingface
 from tests.photo_networks import huggingface_networks as networks
 
 
@@ -77,9 +76,6 @@ def test_a_network_for_images_of_one_size_is_imported(tmp_path: Path) -> None:
     networks.saved(networks.eomt, tmp_path)
     trained = networks.imported(tmp_path)
     assert trained.fixed_size == trained.image_size == (64, 64)
-    network = huggingface.load(model=str(tmp_path), classes=None, normalization=None)
-    with pytest.raises(SettingError, match=r"image_size: found 64 × 65 .*expected 64 × 64"):
-        import_network(network, tmp_path / "large.ckpt", image_size=(65, 64))
 
 
 def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
@@ -102,11 +98,6 @@ def test_one_label_is_of_a_class_and_its_background(tmp_path: Path) -> None:
     networks.assert_same(scores.softmax(dim=0)[:1], logits.sigmoid())
     assert 0.2 < float((logits > 0).float().mean()) < 0.8
     assert torch.equal(scores.argmax(dim=0) == 0, logits[0] > 0)
-    networks.saved(networks.mask2former, tmp_path / "masks")
-    config = {"id2label": {"0": "sky"}, "label2id": {"sky": 0}}
-    networks.change_json(tmp_path / "masks" / "config.json", **config)
-    with pytest.raises(DataError, match="found masks of one class; expected at least two classes"):
-        networks.imported(tmp_path / "masks")
 
 
 _PROCESSORS = (
@@ -151,10 +142,10 @@ def test_an_image_processor_is_the_librarys_whatever_its_file_leaves_out(
             pixels = np.asarray(processor(photo, return_tensors="np", **sizes)["pixel_values"])
         except (TypeError, ValueError):  # e.g. a normalization without numbers
             with pytest.raises(DataError, match="no normalization in"):
-                huggingface._processor(tmp_path)
+                huggingface._processor(tmp_path, "segformer")
             continue
         expected = np.moveaxis(pixels.reshape(-1, *pixels.shape[-3:])[0], 0, -1)[16, 16]
-        found = huggingface._processor(tmp_path)
+        found = huggingface._processor(tmp_path, "segformer")
         normalized = (color / 255 - found["mean"]) / found["std"]
         normalized = normalized[::-1] if found["do_flip_channel_order"] else normalized
         np.testing.assert_allclose(normalized, expected, rtol=1e-4, atol=1e-4, err_msg=f"{change}")
@@ -194,7 +185,6 @@ def test_float16_weights_are_stored_as_float32(folder: Path) -> None:
         ("config.json", {"model_type": "bert"}, "model_type: found bert; expected a network for"),
         ("config.json", {"hidden_act": "https://x.org/gelu"}, "config.json: found network.config"),
         ("preprocessor_config.json", {"image_std": [0, 1, 1]}, "no normalization in"),
-        ("preprocessor_config.json", {"size": {"height": 0, "width": 4}}, "found size: "),
     ],
 )
 def test_settings_that_do_not_fit_are_refused(
@@ -212,14 +202,11 @@ def test_missing_files_are_named(folder: Path, tmp_path: Path) -> None:
         networks.imported(folder)
     (folder / "pytorch_model.bin").rename(weights)
     (folder / "preprocessor_config.json").rename(tmp_path / "elsewhere.json")
-    with pytest.raises(DataError, match=r"no preprocessor_config\.json.*Copy this file"):
+    with pytest.raises(DataError, match=r"preprocessor_config\.json: found .*image processor"):
         networks.imported(folder)
     nested = {"image_processor": json.loads((tmp_path / "elsewhere.json").read_text())}
     (folder / "processor_config.json").write_text(json.dumps(nested))
     assert networks.imported(folder).image_size == (64, 64)
-    (folder / "config.json").write_text("[1, 2]")
-    with pytest.raises(DataError, match=r"config\.json: found list; expected a JSON object"):
-        networks.imported(folder)
 
 
 def test_a_model_that_cannot_be_fetched_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -248,8 +235,3 @@ def test_models_of_the_hub_are_fetched_without_code(
     assert tuple(network.score_names) == networks.NAMES
     (patterns,) = requested.values()
     assert not [p for p in patterns if p.endswith((".py", ".bin", "*"))]
-
-
-def test_settings_that_transformers_does_not_declare_are_dropped() -> None:
-    config = {"model_type": "segformer", "depths": [1, 1, 1, 1], "auto_map": {"x": "y"}, "own": 3}
-    assert architecture(config) == {"model_type": "segformer", "depths": [1, 1, 1, 1]}

@@ -14,16 +14,15 @@ from onnx import helper
 from torch import Tensor
 
 from datamodules.core.label_map import LabelMap
-from models.onnx_network import OnnxNetwork
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.errors import SettingError
 from tangent_train.heads import head_of
+from tangent_train.inference.api import map_classes
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.label_maps import map_classes
-from tangent_train.inference.views import PanoramaViews
+from tangent_train.inference.views import ViewSelector
 from tangent_train.photo_networks import import_network
-from tangent_train.photo_networks.own_files import load_onnx
+from tangent_train.photo_networks.libraries import load_onnx
 from tests.models.onnx_files import write_linear
 
 COLORS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [0, 0, 0]], np.float32)
@@ -106,11 +105,6 @@ def test_a_single_score_separates_two_classes(names: list[str], nodes: Any, tmp_
     np.testing.assert_array_equal(labels == k + 1, expected > 0.5)
 
 
-def test_the_kind_can_be_stated(tmp_path: Path) -> None:
-    path = write_linear(tmp_path / "net.onnx", WEIGHT, BIAS, SIGMOID)
-    assert _imported(path, score_kind="probabilities").score_kind == "probabilities"
-
-
 @pytest.mark.parametrize("softmax", [True, False])
 def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path: Path) -> None:
     """Each class has one color; without the logarithm, no class has a probability above 0.05."""
@@ -122,7 +116,7 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
     rgb = np.broadcast_to(colors[17].astype(np.uint8), (32, 64, 3))
     merged = LabelMap.of({f"{k}": [f"{k}", f"{k + 30}"] for k in range(30)})
     for network in (loaded, map_classes(loaded, merged).loaded):
-        predictor = Predictor(network, head_of(network, min_confidence=0.5), PanoramaViews(network))
+        predictor = Predictor(network, head_of(network, min_confidence=0.5), ViewSelector(network))
         mosaic = predictor.predict(InputImage(rgb))
         assert set(np.unique(network.labels(mosaic.labels()))) == {18}
 
@@ -130,9 +124,17 @@ def test_sixty_classes_are_certain_where_the_network_is(softmax: bool, tmp_path:
 @pytest.mark.parametrize(
     ("names", "settings", "message"),
     [
-        (NAMES[:4], {}, r"class names of the network: found 4, for 5 scores"),
-        (NAMES, {"unknown_classes": ["x"]}, "unknown_classes: found x; expected names among"),
-        (NAMES, {"unknown_classes": NAMES}, "unknown_classes: found a, b, c, d, e with"),
+        (NAMES[:4], {}, r"found 4, .*expected names of 5 scores"),
+        (
+            NAMES,
+            {"unknown_classes": ["x"]},
+            "x; expected unknown_classes among a, b",
+        ),
+        (
+            NAMES,
+            {"unknown_classes": NAMES},
+            "a, b, c, d, e; expected other classes",
+        ),
         (NAMES, {"image_size": (0, 4)}, "for an RGB image of 4 × 0"),
     ],
 )
@@ -141,12 +143,3 @@ def test_settings_that_do_not_fit_are_refused(
 ) -> None:
     with pytest.raises(SettingError, match=message):
         _imported(write_linear(tmp_path / "net.onnx", WEIGHT, BIAS), names, **settings)
-
-
-def test_outputs_that_are_not_numbers_are_refused(tmp_path: Path) -> None:
-    path = write_linear(tmp_path / "net.onnx", WEIGHT * np.nan, BIAS)
-    with pytest.raises(
-        SettingError, match=r"output of the network: found .*, 0 numbers are finite"
-    ):
-        _imported(path)
-    assert OnnxNetwork(path).fixed_size is None

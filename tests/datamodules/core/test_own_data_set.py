@@ -68,7 +68,7 @@ def test_labels_past_the_classes_are_found(tmp_path: Path) -> None:
         ({"inputs": ["rgb", "sound"]}, "data.inputs: found sound; expected 'rgb', 'depth' or"),
         ({"test_rotation": "yaw"}, "data.test_rotation: found yaw"),
         ({"classes": 4}, "data.classes: found 4; expected 3"),
-        ({"colour": 1}, "data.colour: found 1; expected Unexpected keyword argument"),
+        ({"colour": 1}, "data.colour: found 1; expected a known setting"),
         ({"level": 3}, "data.level: found 3; expected null"),
     ],
 )

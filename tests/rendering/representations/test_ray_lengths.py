@@ -10,7 +10,7 @@ import pytest
 
 from tangent_train.config.build import build_from_config
 from tangent_train.inference.images import InputImage
-from tangent_train.inference.views import PhotoViews, view_settings
+from tangent_train.inference.views import ViewSelector, view_settings
 from tangent_train.rendering import (
     CubemapRepresentation,
     PerspectiveRepresentation,
@@ -75,7 +75,7 @@ def test_resized_and_mirrored_photos_keep_their_camera() -> None:
             large = InputImage(
                 np.zeros((30 * scale, 41 * scale, 3), np.uint8), camera_matrix=camera
             )
-        (source,) = PhotoViews(trained_network(TANGENT))(large)
+        (source,) = ViewSelector(trained_network(TANGENT))(large)
         (crops,) = source.sets
         boxes: Any = crops.canvas_boxes  # type: ignore[attr-defined]
         expected = [_lengths(large.camera_matrix, box, crops.size) for box in boxes]  # type: ignore[attr-defined]
