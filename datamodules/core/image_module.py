@@ -40,14 +40,13 @@ from tangent_train.geometry.sphere import check_area
 from tangent_train.io.gpano import (
     Fill,
     PanoramaArea,
-    area_of_angles,
     black_outside,
-    check_area_size,
+    check_resolution,
+    read_area,
     read_up,
 )
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_image_size, read_pixels, read_rgb
-from tangent_train.io.png import check_panorama_size
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
@@ -69,7 +68,6 @@ TestRotation = Annotated[float, Field(ge=0, le=180)] | Literal["so3"] | None
 PanoramaJudge = Callable[[Image, "NDArray[np.float64]"], "NDArray[np.float64]"]
 """Returns log-likelihoods ``(n,)`` that directions ``(n, 3)`` of a panorama are up."""
 
-_PARTIAL = "If all images show the same part, give data.area=[west,east,south,north] in degrees."
 _USUAL_M = (0.05, 100)  # median distances; others are probably in other units
 
 
@@ -380,10 +378,7 @@ class PanoramaDataModule(ImageDataModule):
 
     def check_size(self, files: ImageFiles, size: tuple[int, int]) -> None:
         """See `ImageDataModule`: enough pixels, in the shape of the area, and a mask."""
-        if self.canvas.is_whole:
-            check_panorama_size(files.rgb, size, self.erp_height, _PARTIAL)
-        else:
-            check_area_size(files.rgb, size, check_area(self.area), self.canvas)
+        check_resolution(files.rgb, size, self.canvas, self.area)
         if self._masks.of_each:
             self._masks.check(files.name, self.canvas)
 
@@ -418,7 +413,8 @@ class PanoramaDataModule(ImageDataModule):
         evidence = judge and partial(judge, image._replace(rgb=rgb))
         if len(rgb) < MOST_ROWS:
             rgb = read_rgb(files.rgb)
-            whole = area_of_angles((rgb.shape[0], rgb.shape[1]), check_area(self.area)).full_shape
+            size = rgb.shape[0], rgb.shape[1]
+            whole = read_area(files.rgb, size, check_area(self.area)).full_shape
             canvas = PanoramaArea.on_canvas(self.area, min(whole[0], MOST_ROWS))
             rgb = canvas.place(resize(rgb, canvas.image_shape, "bilinear"))
             rgb = rgb if rotation is None else rotate_equirect(rgb, rotation, "bilinear")

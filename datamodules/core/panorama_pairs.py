@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from datamodules.core.data_module import print_on_rank_zero
 from tangent_train.errors import SettingError
 from tangent_train.geometry import PanoramaPose
-from tangent_train.io.gpano import read_area
+from tangent_train.io.gpano import PanoramaArea, check_resolution, read_area
 from tangent_train.io.image_files import image_paths, short_names
 from tangent_train.io.pixel_files import read_rgb
-from tangent_train.io.png import check_panorama_size
 
 
 class PairedPanorama(NamedTuple):
@@ -133,7 +132,7 @@ def paired_shape(path: Path, rgb: NDArray[np.uint8], erp_height: int | None) -> 
         SettingError: The image has fewer rows than `erp_height`.
     """
     size = (rgb.shape[0], rgb.shape[1])
-    check_panorama_size(path, size, erp_height or 1)
+    check_resolution(path, size, PanoramaArea.on_canvas(None, erp_height or 1), None)
     return size if erp_height is None else (erp_height, 2 * erp_height)
 
 

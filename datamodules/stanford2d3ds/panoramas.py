@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from datamodules.core.data_module import data_set
+from datamodules.core.depth import STEPS_PER_M, meters_to_steps
 from datamodules.core.files import ImageFiles, Problems, Split, draw_groups
 from datamodules.core.image_module import ImageDataModule, PanoramaDataModule, PhotoDataModule
 from datamodules.core.label_map import LabelMap
@@ -46,8 +47,7 @@ from datamodules.stanford2d3ds import files as stanford
 from tangent_train.errors import DataError
 from tangent_train.files import read_json
 from tangent_train.geometry import PanoramaPose
-from tangent_train.io.pixel_files import read_pixels
-from tangent_train.io.png import check_png
+from tangent_train.io.pixel_files import read_depth_m
 
 GET_IT = (
     "Get Stanford2D3DS from http://buildingparser.stanford.edu/dataset.html and point data.root at "
@@ -241,12 +241,9 @@ def read_depth(path: Any) -> NDArray[np.uint16]:
     """Read depth in steps of 1/512 m, 0 where missing.
 
     Raises:
-        DataError: The file is broken, or not 16-bit gray.
+        DataError: The file is broken, or holds no depth.
     """
-    check_png(path, 16, ["gray"])
-    steps: NDArray[np.uint16] = read_pixels(path, indices=True)
-    steps[steps == stanford.MISSING_DEPTH] = 0
-    return steps
+    return meters_to_steps(read_depth_m(path, STEPS_PER_M))
 
 
 class _PoseRecord(BaseModel):

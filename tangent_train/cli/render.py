@@ -24,20 +24,23 @@ from tangent_train.io.camera_files import (
     CameraFile,
     read_cameras,
     read_rig,
+    write_cameras,
     write_poses,
+    write_rig,
 )
-from tangent_train.io.colmap_project import ColmapProject, flat_names
+from tangent_train.io.gpano import read_area
 from tangent_train.io.inputs import Inputs, Job, work_on
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import LOSSY_SUFFIXES, read_image_size, write_pixels
 from tangent_train.io.tangent_folders import (
+    TangentResults,
     face_name,
-    panorama_area,
+    flat_name,
     read_placed,
+    result_files,
     shrink_to_level,
-    write_tangent_folder,
+    write_views,
 )
-from tangent_train.io.tangent_results import TangentResults, result_files
 from tangent_train.keypoints.colmap import panorama_poses
 from tangent_train.manifest import Manifest
 from tangent_train.rendering.figure import tangent_figure
@@ -72,32 +75,41 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         expected = "png, tif or npy with interpolation=nearest: other formats change pixels"
         raise SettingError("format", found=settings.format, expected=expected)
     grid, faces, level = _views(settings, 512)  # refuses views before any panorama
-    names, masks, project = inputs.names, Masks(None), None
+    names, masks = inputs.names, Masks(None)
     if settings.colmap:  # a camera has images of one size
         grid, faces, level = _views(settings, _most_rows(settings, inputs))
-        project = ColmapProject(output, grid, level, faces, suffix, kind)
-        flat, masks = flat_names(names), Masks(settings.mask)
+        masks = Masks(settings.mask)
         if settings.mask_classes:
             masks = class_masks(Path(str(settings.mask)), settings.mask_classes)
         content = {**content, "level": level}
+    prefixes = {f"{face_name(grid, face)}/": face for face in faces}
     manifest = Manifest.open(output, content)
 
     def work(job: Job, progress: Callable[[float], object]) -> None:
         image, area = read_placed(job.path, kind, settings.area, job.value)
-        if project is not None:
-            project.write_images(flat[job.name], image, masks.read(job.name, area), progress)
-            return
         shape = image.shape[0], image.shape[1]
-        grid, faces, level = _views(settings, shape[0])
-        files = tuple(f"{face_name(grid, face)}{suffix}" for face in faces)
-        cameras = CameraFile(job.path.name, shape, grid, faces, files)
-        image = shrink_to_level(image, level) if kind == "bilinear" else image
-        write_tangent_folder(output / job.name, image, cameras, kind, progress)
+        view = (grid, faces, level) if settings.colmap else _views(settings, shape[0])
+        image = shrink_to_level(image, view[2]) if kind == "bilinear" else image
+        if settings.colmap:
+            end = f"{flat_name(job.name)}{suffix}"
+            images = {output / "images" / (p + end): face for p, face in prefixes.items()}
+            write_views(image, grid, images, kind, progress)
+            counts = masks.read(job.name, area)
+            of_images = {output / "masks" / f"{p}{end}.png": face for p, face in prefixes.items()}
+            write_views(counts, grid, of_images, "nearest", lambda _: None)
+            return
+        files = tuple(f"{face_name(view[0], face)}{suffix}" for face in view[1])
+        cameras = CameraFile(job.path.name, shape, view[0], view[1], files)
+        folder = output / job.name
+        paths = {folder / file: face for file, face in zip(files, view[1], strict=True)}
+        write_views(image, view[0], paths, kind, progress)
+        write_cameras(folder / CAMERAS_FILE, cameras)
 
     failed = _render_missing(manifest, names, inputs.jobs, work)
-    if project is not None:
-        finished = manifest.finished
-        project.write_rig({flat[n]: finished[n]["file"] for n in names if n in finished})
+    if settings.colmap:
+        done = {name: manifest.finished[name] for name in names if name in manifest.finished}
+        panoramas = {f"{flat_name(name)}{suffix}": item["file"] for name, item in done.items()}
+        write_rig(output / RIG_FILE, grid, prefixes, panoramas)
     _print_written(output, names, failed)
 
 
@@ -160,7 +172,7 @@ def _most_rows(settings: RenderSettings, inputs: Inputs) -> int:
     for path in [*sizes, *inputs.images.values()]:
         with suppress(DataError, SettingError):
             size = sizes.get(path) or read_image_size(path)
-            rows.append(panorama_area(path, size, settings.area).full_shape[0])
+            rows.append(read_area(path, size, settings.area).full_shape[0])
     return max(rows, default=512)
 
 

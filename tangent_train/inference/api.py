@@ -187,7 +187,7 @@ class Network:
                 an input: distance from the center for panoramas, z-depth for photos.
             fov: Horizontal field of view of a photo in degrees; None for a panorama.
             area: West, east, south and north of a part of a panorama in degrees, see
-                `area_of_angles`. None to use the GPano tags of a file, or the whole sphere
+                `read_area`. None to use the GPano tags of a file, or the whole sphere
                 (W = 2 H) without tags.
             upright: Align a panorama with gravity: ``pose`` uses the GPano tags of a file; ``auto``
                 uses them too, or an estimate from the image without tags.

@@ -16,7 +16,7 @@ from datamodules.core.depth import meters_to_steps, resize_depth
 from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry import camera_matrix_from_fov
-from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, read_up, whole_area
+from tangent_train.io.gpano import PanoramaArea, read_area, read_up
 from tangent_train.io.image_files import NamedFiles, find_depth
 from tangent_train.io.pixel_files import photo_fov_deg, read_depth_m, read_rgb
 from tangent_train.orientation.gravity import estimate_up
@@ -132,7 +132,7 @@ def read_panorama(
 
     Args:
         image: The panorama; only files have GPano tags.
-        angles: Part of the sphere that it covers, see `area_of_angles`; None to use its GPano tags.
+        angles: Part of the sphere that it covers, see `read_area`; None to use its GPano tags.
         upright: Source of the zenith: ``pose`` and ``auto`` read GPano tags (without tags,
             `with_up` estimates it for ``auto``); None for z.
         depth: Function that returns its depth.
@@ -150,10 +150,7 @@ def read_panorama(
     if upright == "pose" and path is None:
         expected = "the path of a file: images in memory and videos have no GPano tags"
         raise SettingError("upright", found="pose", expected=expected)
-    if angles is not None:
-        area = area_of_angles(size, angles)
-    else:
-        area = whole_area(_IN_MEMORY, size) if path is None else read_area(path, size)
+    area = read_area(path or _IN_MEMORY, size, angles)
     steps = None if depth is None else area.place(depth(size))
     up = None if upright is None or path is None else read_up(path)
     return InputImage(area.place(rgb), steps, up, area=area)

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import AfterValidator, BaseModel, Field
 
 from tangent_train.errors import DataError
-from tangent_train.files import write_text
+from tangent_train.files import read_json, write_text
 from tangent_train.geometry import (
     PanoramaPose,
     PinholeGrid,
@@ -34,7 +33,6 @@ CAMERAS_FILE = "cameras.json"
 RIG_FILE = "rig_config.json"
 """Name of the file in a COLMAP project."""
 
-_FORMAT = "tangent images"
 _MOST_PIXELS = 2**20  # limit for rows and columns: a panorama of the size in the file is allocated
 _CONVENTIONS = {
     "pixels": "Pixel centers are whole numbers: (0, 0) is the center of the upper left pixel, "
@@ -63,30 +61,36 @@ _NUMBERS = re.compile(r"\[[-+.,\d\se]+\]")
 
 _EXPECTED = "the cameras of tangent images, as tangent-render writes them beside the images"
 _Side = Annotated[int, Field(ge=2, le=_MOST_PIXELS)]
-_Matrix = Annotated[
-    list[Annotated[list[float], Field(min_length=3, max_length=3)]],
-    Field(min_length=3, max_length=3),
-]
+_Row = tuple[float, float, float]
+_Matrix = tuple[tuple[Annotated[float, Field(gt=0)], float, float], _Row, _Row]
 
 
-class _Source(pydantic.BaseModel):
+def _rotation(matrix: list[list[float]]) -> NDArray[np.float64]:
+    with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused
+        return checked_rotation(matrix)
+
+
+_Rotation = Annotated[list[list[float]], AfterValidator(_rotation)]
+
+
+class _Source(BaseModel):
     file: str
     height: _Side
     width: _Side
 
 
-class _Camera(pydantic.BaseModel):
+class _Camera(BaseModel):
     width: _Side
     height: _Side
     matrix: _Matrix
 
 
-class _Image(pydantic.BaseModel):
+class _Image(BaseModel):
     file: str
     face: int
 
 
-class _CamerasJson(pydantic.BaseModel):
+class _CamerasJson(BaseModel):
     """Fields of a ``cameras.json`` that are read: of tangent images, or of other views."""
 
     format: Literal["tangent images"]
@@ -96,20 +100,22 @@ class _CamerasJson(pydantic.BaseModel):
     base_level: int | None = None
     level: int = 0
     dim: int | None = None
-    icosahedron_rotation: _Matrix | None = None
-    views: list[_Matrix] = []
+    icosahedron_rotation: _Rotation | None = None
+    views: list[_Rotation] = []
     overlapping: bool = False
+
+    @property
+    def faces(self) -> tuple[int, ...]:
+        return tuple(image.face for image in self.images)
 
     def grid(self) -> PinholeGrid:
         """Return the grid that the fields describe."""
         if self.base_level is not None:
-            rotation = self.icosahedron_rotation
-            in_world = None if rotation is None else _in_world(np.array(rotation))
+            rotation: Any = self.icosahedron_rotation
+            in_world = None if rotation is None else _in_world(rotation)
             return TangentGrid(self.base_level, self.level, self.dim, in_world)
-        axes = np.array([to_right_handed(checked_rotation(view).T).T for view in self.views])
+        axes = np.stack([to_right_handed(np.transpose(view)).T for view in self.views])
         size, focal = (self.camera.height, self.camera.width), self.camera.matrix[0][0]
-        if not len(axes) or focal <= 0:
-            raise ValueError(f"{len(axes)} views with a focal length of {focal}")
         return PinholeGrid(axes, size, 1 / focal, is_overlapping=self.overlapping)
 
 
@@ -140,45 +146,34 @@ def write_cameras(path: Path, cameras: CameraFile) -> None:
         cameras: Content of the file. Its section ``conventions`` explains the fields.
     """
     grid = cameras.grid
-    rows, columns = grid.size
     described: dict[str, Any] = {
-        "views": [_world_from_camera(grid, face).tolist() for face in range(grid.num_images)],
+        "views": [_world_from_camera(grid, face) for face in grid.face_indices()],
         "overlapping": grid.is_overlapping,
     }
     if isinstance(grid, TangentGrid):
         rotation = None if grid.rotation is None else _in_world(grid.rotation).tolist()
         described = {"base_level": grid.base_level, "level": grid.level, "dim": grid.dim}
         described |= {"icosahedron_rotation": rotation}
+    (rows, columns), (height, width) = grid.size, cameras.shape
+    matrix, fov_deg = grid.camera_matrix.tolist(), grid.width_deg
     content = {
-        "format": _FORMAT,
+        "format": "tangent images",
         "conventions": _CONVENTIONS,
-        "source": {
-            "file": cameras.source,
-            "height": cameras.shape[0],
-            "width": cameras.shape[1],
-        },
+        "source": {"file": cameras.source, "height": height, "width": width},
         **described,
-        "camera": {
-            "width": columns,
-            "height": rows,
-            "matrix": grid.camera_matrix.tolist(),
-            "fov_deg": grid.width_deg,
-        },
+        "camera": {"width": columns, "height": rows, "matrix": matrix, "fov_deg": fov_deg},
         "images": [
-            {
-                "file": file,
-                "face": face,
-                "world_from_camera": _world_from_camera(grid, face).tolist(),
-            }
+            {"file": file, "face": face, "world_from_camera": _world_from_camera(grid, face)}
             for face, file in zip(cameras.faces, cameras.files, strict=True)
         ],
     }
     _write_json(path, content)
 
 
-def _world_from_camera(grid: PinholeGrid, face: int) -> NDArray[np.float64]:
-    """Return the ``(3, 3)`` rotation from camera axes to the right-handed world of the files."""
-    return to_right_handed(grid.world_from_camera[face].T).T
+def _world_from_camera(grid: PinholeGrid, face: int) -> list[list[float]]:
+    """Return the rotation ``(3, 3)`` from camera axes to the right-handed world of the files."""
+    rotation: list[list[float]] = to_right_handed(grid.world_from_camera[face].T).T.tolist()
+    return rotation
 
 
 def _in_world(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -195,19 +190,25 @@ def read_cameras(path: Path) -> CameraFile:
     Raises:
         DataError: The file is missing, or its content is not valid.
     """
+    content: _CamerasJson = read_json(path, _EXPECTED, kind=_CamerasJson)
     try:
-        content = _CamerasJson.model_validate_json(path.read_bytes())
-        faces, files = zip(*((image.face, image.file) for image in content.images), strict=True)
-        if len(set(faces)) < len(faces) or len({Path(file).stem for file in files}) < len(files):
-            raise ValueError("an image twice")  # noqa: TRY301
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
-            grid = content.grid()
-        grid.face_indices(faces)
-    except (OSError, ValueError, OverflowError, IndexError) as error:  # pydantic's are ValueErrors
-        found = error if isinstance(error, OSError) else str(error).replace("\n", " ")
-        raise DataError(path, found=found, expected=_EXPECTED) from error
-    source = content.source
-    return CameraFile(source.file, (source.height, source.width), grid, faces, files)
+        grid = content.grid()
+        grid.face_indices(content.faces)
+    except (ValueError, IndexError, OverflowError) as error:
+        raise DataError(path, found=error, expected=_EXPECTED) from error
+    shape = content.source.height, content.source.width
+    files = tuple(image.file for image in content.images)
+    return CameraFile(content.source.file, shape, grid, content.faces, files)
+
+
+class _RigCamera(BaseModel):
+    image_prefix: str
+    world_from_camera: _Rotation
+
+
+class _RigJson(BaseModel):
+    cameras: list[_RigCamera]
+    panoramas: dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -245,23 +246,23 @@ def write_rig(
     """
     from scipy.spatial.transform import Rotation  # slow to import
 
-    focal, (rows, columns) = 1 / grid.pitch, grid.size
-    reference = _world_from_camera(grid, next(iter(faces.values())))
+    (rows, columns), first = grid.size, next(iter(faces))
     cameras: list[dict[str, Any]] = []
     for prefix, face in faces.items():
         axes = _world_from_camera(grid, face)
-        from_rig = Rotation.from_matrix(axes.T @ reference)
+        from_rig = np.transpose(axes) @ _world_from_camera(grid, faces[first])
+        quaternion = Rotation.from_matrix(from_rig).as_quat(canonical=True, scalar_first=True)
         of_rig = {
-            "cam_from_rig_rotation": from_rig.as_quat(canonical=True, scalar_first=True).tolist(),
+            "cam_from_rig_rotation": quaternion.tolist(),
             "cam_from_rig_translation": (0, 0, 0),
         }
         cameras.append(
             {
                 "image_prefix": prefix,
-                **(of_rig if cameras else {"ref_sensor": True}),
+                **({"ref_sensor": True} if prefix == first else of_rig),
                 "camera_model_name": "PINHOLE",
-                "camera_params": (focal, focal, columns / 2, rows / 2),
-                "world_from_camera": axes.tolist(),
+                "camera_params": (1 / grid.pitch, 1 / grid.pitch, columns / 2, rows / 2),
+                "world_from_camera": axes,
             }
         )
     _write_json(path, [{"cameras": cameras, "panoramas": panoramas}])
@@ -273,20 +274,10 @@ def read_rig(path: Path) -> RigFile:
     Raises:
         DataError: The file is missing, or another program wrote it.
     """
-    try:
-        (rig,) = json.loads(path.read_bytes())
-        with np.errstate(over="ignore", invalid="ignore"):  # huge numbers are refused as a rotation
-            axes = {
-                str(camera["image_prefix"]): checked_rotation(camera["world_from_camera"])
-                for camera in rig["cameras"]
-            }
-        return RigFile(axes, {name: str(file) for name, file in rig["panoramas"].items()})
-    except (OSError, ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
-        raise DataError(
-            path,
-            found=f"{type(error).__name__}: {error}",
-            expected="the rig that tangent-render wrote with colmap=true",
-        ) from error
+    expected = "the rig that tangent-render wrote with colmap=true"
+    (rig,) = read_json(path, expected, kind=tuple[_RigJson])
+    axes = {camera.image_prefix: camera.world_from_camera for camera in rig.cameras}
+    return RigFile(axes, rig.panoramas)
 
 
 def write_poses(path: Path, poses: Mapping[str, PanoramaPose]) -> None:

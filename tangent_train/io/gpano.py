@@ -8,24 +8,25 @@ position of the image in it, and the pitch and roll of the camera.
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal, Self, TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.geometry.sphere import check_area
-from tangent_train.io.xmp import read_properties
+from tangent_train.io.pixel_files import read_xmp
 from tangent_train.orientation.gravity import up_from_pose
 from tangent_train.rendering.resampling import resize
 
 _Pixel = TypeVar("_Pixel", bound=np.generic)
 
+_RDF = "{http://www.w3.org/1999/02/22-rdf-syntax-ns#}RDF"
 _NAMESPACE = "http://ns.google.com/photos/1.0/panorama/"
 _SIZES = (
     "FullPanoWidthPixels",
@@ -35,14 +36,16 @@ _SIZES = (
     "CroppedAreaLeftPixels",
     "CroppedAreaTopPixels",
 )
-_REAL = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
 _TOLERANCE = 0.02  # tolerance of square pixels: angles and sizes are rounded
 _MOST_COLUMNS = 32768  # columns of the whole panorama
-_SAY_IT = "Give area=[west,east,south,north] in degrees: the part of the sphere that it shows."
 _NOT_WHOLE = (
     "For a part of a panorama, give area=[west,east,south,north] in degrees, or GPano tags in its "
     "XMP data. For a photo, give fov=, its horizontal field of view in degrees; tangent-predict "
     "also needs projection=perspective."
+)
+_SAME_AREA = (
+    "All images of a data set show the same area: give data.area=[west,east,south,north] in degrees"
+    " for a part of a panorama."
 )
 
 Fill = Literal["black", "mean", "edge", "reflect"]
@@ -145,131 +148,106 @@ class PanoramaArea:
         return resize(rows, (height, 1), "nearest")[:, 0], resize(columns, (1, width), "nearest")[0]
 
 
-def read_area(path: Path, size: tuple[int, int]) -> PanoramaArea:
-    """Return the part of the sphere that an image shows: by `tagged_area`, else by `whole_area`.
+def read_area(
+    path: Path,
+    size: tuple[int, int],
+    angles: Sequence[float] | None = None,
+    remedy: str = _NOT_WHOLE,
+) -> PanoramaArea:
+    """Return the part of the sphere that an image shows.
+
+    It is between the angles of the image's outer edges; else by its GPano tags; else the whole
+    sphere. Images resized after the tags were written are assumed to show the same area.
 
     Args:
-        path: JPEG, PNG, TIFF or WebP.
-        size: Rows and columns of the image.
-
-    Raises:
-        DataError: The tags contradict the image, or it is not 2:1 and has no tags.
-    """
-    return tagged_area(path, size) or whole_area(path, size)
-
-
-def tagged_area(path: Path, size: tuple[int, int]) -> PanoramaArea | None:
-    """Return the part of the sphere that an image shows, by its GPano tags.
-
-    Images resized after the tags were written are assumed to show the same area.
-
-    Args:
-        path: JPEG, PNG, TIFF or WebP.
-        size: Rows and columns of the image.
-
-    Returns:
-        The area; None if tags are missing.
-
-    Raises:
-        DataError: The tags contradict the image.
-    """
-    tags = read_properties(path, _NAMESPACE)
-    projection = tags.get("ProjectionType", "equirectangular")
-    if projection.lower() != "equirectangular":
-        raise DataError(
-            path,
-            found=f"GPano:ProjectionType {projection}",
-            expected="equirectangular",
-            remedy="Export the panorama in that projection.",
-        )
-    if not all(name in tags for name in _SIZES):
-        return None
-    full_width, full_height, width, height, left, top = (
-        _number(path, name, tags[name], 1e9) for name in _SIZES
-    )
-    inside = 0 < width <= full_width and height > 0 and top >= 0 and top + height <= full_height
-    agree = partial(math.isclose, rel_tol=_TOLERANCE)
-    if not (
-        inside and agree(full_width, 2 * full_height) and agree(size[1] / width, size[0] / height)
-    ):
-        raise DataError(
-            path,
-            found=f"GPano tags of {width_height((height, width))}, {left:g} from the left and "
-            f"{top:g} from the top of {width_height((full_height, full_width))}, in an image of "
-            f"{width_height(size)}",
-            expected="a part, shaped like this image, of a panorama twice as wide as high",
-            remedy=f"The image may have been cut after they were written. {_SAY_IT}",
-        )
-    if (width, height) == (full_width, full_height) and abs(size[1] - 2 * size[0]) <= 1:
-        return whole_area(path, size)
-    west = left % full_width / full_width
-    return _area(path, size, (west, width / full_width), (top / full_height, height / full_height))
-
-
-def area_of_angles(size: tuple[int, int], angles: Sequence[float]) -> PanoramaArea:
-    """Return the part of the sphere between the angles of an image's outer edges.
-
-    Args:
+        path: File; only JPEG, PNG, TIFF and WebP have tags.
         size: Rows and columns of the image.
         angles: West, east (−180 to 180; west > east for an image across ±180°), south and north
-            (−90 to 90) in degrees.
+            (−90 to 90) in degrees; None to read the tags.
+        remedy: Remedy for an image that is not a whole panorama.
 
     Raises:
-        SettingError: The angles are invalid, or the image would not have square pixels.
-        DataError: The whole panorama would be too large.
+        DataError: The image would not have square pixels, the tags contradict it, or the whole
+            panorama would be too large.
+        SettingError: The angles are invalid.
     """
     west, east, south, north = check_area(angles)
-    width, height = _width_deg(west, east), north - south
-    pixels_deg = width / size[1], height / size[0]
-    if not math.isclose(*pixels_deg, rel_tol=_TOLERANCE):
-        fit = pixels_deg[0] * size[0]
-        raise SettingError(
-            "area",
-            found=f"{list(angles)}, pixels {pixels_deg[0]:.4g}° wide and {pixels_deg[1]:.4g}° high "
-            f"in an image of {width_height(size)}",
-            expected=f"angles that make them square: {fit:.2f}° high"
-            + f", e.g. {-fit / 2:.2f} to {fit / 2:.2f}" * (fit <= 180),
+    left, width = (west + 180) / 360, _width_deg(west, east) / 360
+    top, height = (90 - north) / 180, (north - south) / 180
+    shown = f"square pixels in area={[west, east, south, north]}"
+    tags = _read_properties(path) if angles is None else {}
+    if tags.keys() >= set(_SIZES) or not _is_equirect(tags):
+        shown = f"square pixels in the part of its GPano tags, {tags}"
+        left, width, top, height = _tagged_part(tags)
+    is_whole = width == height == 1
+    if is_whole:
+        shown = "a whole panorama, twice as wide as high"
+    rows = size[1] * height / (2 * width)  # for square pixels
+    is_square = abs(rows - size[0]) <= (0.5 if is_whole else size[0] * _TOLERANCE)
+    if not (is_square and size[1] <= _MOST_COLUMNS * width):
+        raise DataError(
+            path,
+            found=width_height(size),
+            expected=f"{width_height((round(rows, 1), size[1]))}: {shown}; at most {_MOST_COLUMNS} "
+            "columns around the sphere",
+            remedy=remedy,
         )
-    across, down = ((west + 180) / 360, width / 360), ((90 - north) / 180, height / 180)
-    return _area(f"area={list(angles)}", size, across, down)
+    full_height = size[0] if is_whole else max(1, round(size[1] / width / 2))
+    full_width = 2 * full_height
+    exact = height * full_height
+    rows = min(size[0] if abs(exact - size[0]) < 1 else max(1, round(exact)), full_height)
+    first_row, first = min(round(top * full_height), full_height - rows), round(left * full_width)
+    first, shown_columns = first % full_width, full_width if is_whole else min(size[1], full_width)
+    bounds = (first_row, first_row + rows), (first, first + shown_columns)
+    return PanoramaArea((full_height, full_width), *bounds, size)
 
 
-def black_outside(image: NDArray[_Pixel], valid: NDArray[np.bool_] | None) -> NDArray[_Pixel]:
-    """Return a panorama ``(H, W[, C])`` that is 0 at invalid pixels."""
-    if valid is None:
-        return image
-    mask = valid.reshape(valid.shape + (1,) * (image.ndim - 2))
-    return np.where(mask, image, image.dtype.type(0))
+def _is_equirect(tags: Mapping[str, str]) -> bool:
+    return tags.get("ProjectionType", "equirectangular").lower() == "equirectangular"
 
 
-def check_area_size(
-    path: Path, size: tuple[int, int], angles: Sequence[float], canvas: PanoramaArea
+def _tagged_part(tags: Mapping[str, str]) -> tuple[float, float, float, float]:
+    """Return left edge, width, upper edge and height as fractions of the whole, by GPano tags.
+
+    They are NaN if the tags are not those of a part of an equirectangular panorama.
+    """
+    full_width, full_height, width, height, left, top = (
+        _number(tags.get(name, "")) for name in _SIZES
+    )
+    is_inside = 0 < width <= full_width and 0 <= top <= full_height - height < full_height
+    if not (
+        _is_equirect(tags)
+        and is_inside
+        and math.isfinite(left)
+        and math.isclose(full_width, 2 * full_height, rel_tol=_TOLERANCE)
+    ):
+        return (math.nan,) * 4
+    return (
+        left % full_width / full_width,
+        width / full_width,
+        top / full_height,
+        height / full_height,
+    )
+
+
+def check_resolution(
+    path: Path, size: tuple[int, int], canvas: PanoramaArea, angles: Sequence[float] | None
 ) -> None:
     """Check that an image fits the area of its data set, and has enough pixels.
 
     Args:
         path: The image.
         size: Rows and columns of the image.
-        angles: The area, see `check_area`.
         canvas: The area, in pixels of the panoramas that a run reads.
+        angles: The area in degrees; None for the whole sphere.
 
     Raises:
         DataError: Its pixels would not be square.
         SettingError: It has fewer pixels.
     """
-    height, width = canvas.image_shape
-    west, east, south, north = angles
-    ratio = (north - south) / _width_deg(west, east)
-    if not math.isclose(size[0], size[1] * ratio, rel_tol=_TOLERANCE):
-        raise DataError(
-            path,
-            found=width_height(size),
-            expected=f"{width_height((round(size[1] * ratio), size[1]))}, for square pixels in "
-            f"data.area={list(angles)}",
-            remedy="Correct data.area; all images of a data set show the same area.",
-        )
-    if size[0] < height - 1 or size[1] < width - 1:
-        rows = round(size[1] / width * canvas.full_shape[0])
+    whole = check_area(angles) if angles is None else angles
+    rows = read_area(path, size, whole, _SAME_AREA).full_shape[0]
+    if size[1] < canvas.image_shape[1] - 1:
         raise SettingError(
             "representation.erp_height",
             found=canvas.full_shape[0],
@@ -278,27 +256,12 @@ def check_area_size(
         )
 
 
-def whole_area(path: Path, size: tuple[int, int], remedy: str = _NOT_WHOLE) -> PanoramaArea:
-    """Return the area of an image that shows the whole sphere.
-
-    Args:
-        path: Image, for the error message.
-        size: Rows and columns of the image. One column too many is dropped, one too few is
-            repeated: a rounding error of other programs.
-        remedy: Remedy in the error message.
-
-    Raises:
-        DataError: The image is not twice as wide as high.
-    """
-    height, width = size
-    if abs(width - 2 * height) > 1 or width < 2:
-        raise DataError(
-            path,
-            found=width_height(size),
-            expected="a whole panorama, twice as wide as high",
-            remedy=remedy,
-        )
-    return PanoramaArea((height, 2 * height), (0, height), (0, 2 * height), size)
+def black_outside(image: NDArray[_Pixel], valid: NDArray[np.bool_] | None) -> NDArray[_Pixel]:
+    """Return a panorama ``(H, W[, C])`` that is 0 at invalid pixels."""
+    if valid is None:
+        return image
+    mask = valid.reshape(valid.shape + (1,) * (image.ndim - 2))
+    return np.where(mask, image, image.dtype.type(0))
 
 
 def read_up(path: Path) -> NDArray[np.float64] | None:
@@ -314,10 +277,49 @@ def read_up(path: Path) -> NDArray[np.float64] | None:
     Raises:
         DataError: A tag is not an angle.
     """
-    tags = read_properties(path, _NAMESPACE)
-    pitch = _number(path, "PosePitchDegrees", tags.get("PosePitchDegrees", "0"), 90)
-    roll = _number(path, "PoseRollDegrees", tags.get("PoseRollDegrees", "0"), 180)
+    tags = _read_properties(path)
+    pitch, roll = (_number(tags.get(f"Pose{name}Degrees", "0")) for name in ("Pitch", "Roll"))
+    if not (abs(pitch) <= 90 and abs(roll) <= 180):
+        raise DataError(
+            path,
+            found=f"GPano:PosePitchDegrees and PoseRollDegrees of {pitch} and {roll}",
+            expected="numbers from −90 to 90 and from −180 to 180",
+            remedy="Remove the tags, for example with exiftool -XMP-GPano:all= <file>.",
+        )
     return None if pitch == roll == 0 else up_from_pose(pitch, roll)
+
+
+def _read_properties(path: Path) -> dict[str, str]:
+    """Read the simple GPano properties from the XMP data of an image, by local name.
+
+    A property may have any prefix, and may be an attribute or an element (XMP specification, part
+    1). Properties of structures are ignored: they may describe another image.
+
+    Raises:
+        DataError: The file cannot be read, or XMP data with this namespace are not XML.
+    """
+    packet = read_xmp(path).strip(b"\0 \n")
+    # A document type, which XMP does not have, could define entities that grow.
+    if _NAMESPACE.encode() not in packet or b"<!DOCTYPE" in packet:
+        return {}
+    try:
+        nodes = [node for rdf in ElementTree.fromstring(packet).iter(_RDF) for node in rdf]
+    except (SyntaxError, ValueError) as error:
+        raise DataError(
+            path,
+            found=f"XMP data that cannot be read ({error})",
+            expected="XML",
+            remedy="Write the tags again, or remove them: exiftool -XMP:all= <file>.",
+        ) from error
+    values: dict[str, str] = {}
+    for node in nodes:
+        values |= node.attrib | {child.tag: child.text or "" for child in node}
+    start = f"{{{_NAMESPACE}}}"
+    return {
+        name.removeprefix(start): value.strip()
+        for name, value in values.items()
+        if name.startswith(start)
+    }
 
 
 @lru_cache(maxsize=4)
@@ -331,41 +333,9 @@ def _width_deg(west: float, east: float) -> float:
     return east - west if east > west else east - west + 360
 
 
-def _number(path: Path, name: str, text: str, most: float) -> float:
-    number = float(text) if _REAL.fullmatch(text) else math.nan
-    if not abs(number) <= most:
-        raise DataError(
-            path,
-            found=f"GPano:{name} {text!r}",
-            expected=f"a number from −{most:g} to {most:g}",
-            remedy=f"Remove the tag, for example with exiftool -XMP-GPano:{name}= <file>.",
-        )
-    return number
-
-
-def _area(
-    subject: object, size: tuple[int, int], across: tuple[float, float], down: tuple[float, float]
-) -> PanoramaArea:
-    """Return the area of an image.
-
-    Args:
-        subject: Subject of the error message.
-        size: Rows and columns of the image.
-        across: Left edge and width of the image, as fractions of the whole width.
-        down: Upper edge and height, as fractions of the whole height.
-    """
-    full_height = max(1, round(size[1] / across[1] / 2))
-    if 2 * full_height > _MOST_COLUMNS:
-        raise DataError(
-            subject,
-            found=f"a part of a panorama of {2 * full_height} columns",
-            expected=f"at most {_MOST_COLUMNS}",
-            remedy="Shrink the image, or use it as a photo.",
-        )
-    full_width = 2 * full_height
-    left, width = round(across[0] * full_width) % full_width, min(size[1], full_width)
-    exact = down[1] * full_height
-    height = size[0] if abs(exact - size[0]) < 1 else max(1, round(exact))
-    height = min(height, full_height)
-    top = min(round(down[0] * full_height), full_height - height)
-    return PanoramaArea((full_height, full_width), (top, top + height), (left, left + width), size)
+def _number(text: str) -> float:
+    """Return the number in a tag, NaN for other text."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan

@@ -113,15 +113,6 @@ def composed(name: str) -> str:
     return unicodedata.normalize("NFC", name)
 
 
-def spelled(name: str) -> str:
-    """Quote a name, with code points for letters beyond ASCII.
-
-    >>> spelled("k" + chr(0xFC) + "che")
-    "'k<U+00FC>che'"
-    """
-    return "'" + "".join(c if c.isascii() else f"<U+{ord(c):04X}>" for c in name) + "'"
-
-
 class NamedFiles:
     """Files of a folder and its subfolders by `composed` names.
 
@@ -134,29 +125,16 @@ class NamedFiles:
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self._found: dict[str, list[Path]] = {}
-        for path in walk_files(folder):
-            name = composed(path.relative_to(folder).as_posix())
-            self._found.setdefault(name, []).append(path)
+        names = ((path.relative_to(folder).as_posix(), path) for path in walk_files(folder))
+        self._found = {composed(name): path for name, path in names}
 
     def path(self, name: str) -> Path:
-        """Return the path of a file that has a name, or would have it if it is missing.
+        """Return the path of a file, which may be missing; see `composed`.
 
         Args:
-            name: Path of the file relative to the folder.
-
-        Raises:
-            DataError: Several files have this name after `composed`.
+            name: Name of the file relative to the folder.
         """
-        paths = self._found.get(composed(name), [self.folder / name])
-        if len(paths) > 1:
-            raise DataError(
-                paths[0],
-                found=f"{spelled(paths[0].name)} and {spelled(paths[1].name)}, which look the same",
-                expected="one file of each name, however its letters are encoded",
-                remedy="Rename or remove one of them.",
-            )
-        return paths[0]
+        return self._found.get(composed(name), self.folder / name)
 
 
 def find_depth(files: NamedFiles, name: str, remedy: str) -> Path:

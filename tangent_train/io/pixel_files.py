@@ -1,16 +1,17 @@
 """Reading and writing images: colors, depth, labels, arrays.
 
-Pillow decodes images of 8 bits and 16-bit gray PNG files, tifffile TIFF files of more than 8 bits,
-OpenCV 16-bit colors in PNG and LZW; OpenCV writes.
+Pillow decodes images of 8 bits, tifffile TIFF files of more than 8 bits, OpenCV PNG and LZW of more
+than 8 bits, OpenEXR its own format; OpenCV writes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -20,48 +21,61 @@ from numpy.typing import DTypeLike, NDArray
 from PIL import ExifTags, Image
 from PIL.ExifTags import Base as Tag
 
-from tangent_train.errors import DataError, SettingError, first_line, width_height
+from tangent_train.errors import DataError, SettingError, width_height
 from tangent_train.files import atomic_path, reserve, write_bytes
-from tangent_train.io.exr import read_exr, read_exr_size, write_exr
-from tangent_train.io.image_files import IMAGE_FORMATS
-from tangent_train.io.png import MOST_PIXELS, check_pixels, read_png_header
+from tangent_train.io.exr import open_exr, write_exr
+from tangent_train.io.image_files import IMAGE_FORMATS, IMAGE_SUFFIXES
 
 LOSSY_SUFFIXES = (".jpg", ".jpeg", ".webp")
 """Formats that change pixels slightly: not for labels and depth."""
 
+_TIFF_SUFFIXES = (".tif", ".tiff")
 _WRITABLE = {
     ".png": ("uint8", "uint16"),
     **dict.fromkeys(LOSSY_SUFFIXES, ("uint8",)),
-    **dict.fromkeys((".tif", ".tiff"), ("uint8", "uint16", "float32")),
+    **dict.fromkeys(_TIFF_SUFFIXES, ("uint8", "uint16", "float32")),
 }
 """Pixel types by suffix; ``.npy`` holds all types."""
 
-PIXEL_SUFFIXES = (*_WRITABLE, ".npy")
-"""Suffixes that `write_pixels` takes, in lower case."""
-
-READABLE_SUFFIXES = (*PIXEL_SUFFIXES, ".exr")
-"""Suffixes that `read_pixels` takes."""
+READABLE_SUFFIXES = (*_WRITABLE, ".npy", ".exr")
+"""Suffixes that `read_pixels` takes, in lower case."""
 
 _SINGLE_CHANNEL = ("L", "I", "F", "I;16", "I;16L", "I;16B", "I;16N")
 _FIRST_TRANSPOSED = 5  # EXIF orientation from which rows are stored as columns
-_BYTE_BITS = 8
 _UNSIGNED = 1  # SampleFormat of TIFF
 _MAX_DEPTH_M = 1e4  # larger depth is missing: some files have 1e10 there
 _MISSING_UNITS = 65535
 _FILM_DIAGONAL_MM = math.hypot(36, 24)
+_MOST_PIXELS = 32768 * 16384  # a file of a few kilobytes can claim more than memory holds
 
-Image.MAX_IMAGE_PIXELS = MOST_PIXELS
+Image.MAX_IMAGE_PIXELS = _MOST_PIXELS
+
+
+class _StoredImage(NamedTuple):
+    """An open image file.
+
+    Attributes:
+        size: Rows and columns as stored.
+        decode: Returns the stored pixels, given True for indices instead of colors.
+        orientation: EXIF orientation of these pixels, 1 to 8.
+    """
+
+    size: tuple[int, int]
+    decode: Callable[[bool], NDArray[Any]]
+    orientation: int = 1
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[Image.Image]:
+def _opened(path: Path) -> Iterator[_StoredImage]:
     """Open an image of an allowed size without decoding; errors in the block name the file."""
     try:
         # Not by its name: Pillow would map raw TIFF files into memory and rotate them wrongly.
-        with path.open("rb") as file, Image.open(file, formats=IMAGE_FORMATS) as image:
-            check_pixels(path, image.height, image.width)
-            yield image
-    except (DataError, MemoryError):
+        with path.open("rb") as file:
+            stored = _open_stored(path, file)
+            if not 0 < math.prod(stored.size) <= _MOST_PIXELS:
+                raise ValueError(f"{width_height(stored.size)}; 1 to {_MOST_PIXELS} pixels")  # noqa: TRY301
+            yield stored
+    except SettingError:  # a missing package
         raise
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
@@ -69,47 +83,35 @@ def _opened(path: Path) -> Iterator[Image.Image]:
         raise DataError(
             path,
             found=f"no image that can be decoded ({reason})",
-            expected=f"a whole image of a known format ({', '.join(IMAGE_FORMATS)})",
-            remedy="Copy or export the file again, for example as JPEG or PNG.",
+            expected=f"a whole image ({', '.join(IMAGE_FORMATS)}), .npy array or OpenEXR image",
+            remedy="Copy or export the file again, for example as JPEG or PNG, or depth as a "
+            "16-bit PNG or a float TIFF.",
         ) from error
 
 
-def read_xmp(path: Path) -> bytes:
-    """Read the XMP packet of an image file, empty without one.
-
-    Args:
-        path: See `read_pixels`; arrays and OpenEXR images have no packet.
-
-    Raises:
-        DataError: It cannot be read, or is not an image.
-    """
-    if path.suffix.lower() in (".npy", ".exr"):
-        return b""
-    with _opened(path) as image:
-        if image.format == "PNG":
-            image.load()  # programs write the packet behind the pixels too
-        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return packet.encode() if isinstance(packet, str) else bytes(packet)
-
-
-def read_image_size(path: Path) -> tuple[int, int]:
-    """Read the rows and columns that `read_pixels` would return from the header of a file.
-
-    Raises:
-        DataError: It cannot be read, or is not an image.
-    """
+def _open_stored(path: Path, file: IO[bytes]) -> _StoredImage:
     suffix = path.suffix.lower()
-    if suffix == ".exr":
-        return read_exr_size(path)
     if suffix == ".npy":
-        height, width = read_array(path).shape[:2]
-        return height, width
-    if page := _deep_tiff(path):
-        rows, columns = page.imagelength, page.imagewidth
-        check_pixels(path, rows, columns)
-        return (columns, rows) if _tiff_orientation(page) >= _FIRST_TRANSPOSED else (rows, columns)
-    with _opened(path) as image:
-        return _upright_size(image)
+        with np.errstate(over="ignore"):  # by the sizes in a broken header
+            array = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = array[..., 0] if array.ndim == 3 and array.shape[-1] == 1 else array
+        height, width, *_ = array.shape
+        return _StoredImage((height, width), lambda _: array)
+    if suffix == ".exr":
+        return _StoredImage(*open_exr(path))
+    page = _deep_page(file) if suffix in _TIFF_SUFFIXES else None
+    if page is not None:
+        found = page.tags.valueof(Tag.Orientation)
+        orientation = found if found in range(1, 9) else 1
+        decode = partial(_decode_deep_tiff, file, page)
+        return _StoredImage((page.imagelength, page.imagewidth), decode, orientation)
+    file.seek(0)
+    image = Image.open(file, formats=IMAGE_FORMATS)
+    decode = partial(_decode, image)
+    layout = str(image.tile[0][3]) if image.format == "PNG" else ""
+    if layout.endswith("16B"):  # Pillow would cut colors to 8 bits
+        decode = partial(_decode_deep_png, file, image, layout.startswith("LA"))
+    return _StoredImage((image.height, image.width), decode, _orientation(image))
 
 
 def _orientation(image: Image.Image) -> int:
@@ -124,54 +126,7 @@ def _orientation(image: Image.Image) -> int:
     return found if found in range(1, 9) else 1
 
 
-def _upright_size(image: Image.Image) -> tuple[int, int]:
-    quarter = _orientation(image) >= _FIRST_TRANSPOSED
-    return (image.width, image.height) if quarter else (image.height, image.width)
-
-
-def _displayed(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
-    """Rotate pixels by their EXIF orientation (CIPA DC-008, tag 274)."""
-    pixels = pixels.swapaxes(0, 1) if orientation >= _FIRST_TRANSPOSED else pixels
-    pixels = pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
-    pixels = pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
-    return np.ascontiguousarray(pixels)
-
-
-def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
-    """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
-
-    Args:
-        path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (one channel of it) or
-            ``.npy``.
-        indices: True to read indices, not colors, from images with a palette or of 1 bit.
-
-    Returns:
-        ``(H, W)`` for one channel, else ``(H, W, C)``, colors in RGB order. Arrays are
-        memory-mapped and read-only.
-
-    Raises:
-        DataError: The file cannot be read or is broken, or its array is not an image.
-    """
-    suffix = path.suffix.lower()
-    if suffix == ".npy":
-        return read_array(path)
-    if suffix == ".exr":
-        return read_exr(path)
-    if page := _deep_tiff(path):
-        return _displayed(_decode_tiff(path, page), _tiff_orientation(page))
-    with _opened(path) as image:
-        orientation = _orientation(image)
-        header = read_png_header(path) if image.format == "PNG" else None
-        if header and header.bits > _BYTE_BITS:  # Pillow would cut colors to 8 bits
-            image.load()  # refuses truncated files
-            pixels = _decode_deep(path)
-            pixels = pixels[..., 0] if pixels.ndim > 2 and "gray" in header.color else pixels
-        else:
-            pixels = _decode(image, indices=indices)
-        return _displayed(pixels, orientation)
-
-
-def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
+def _decode(image: Image.Image, indices: bool) -> NDArray[Any]:
     image.load()
     if image.mode in _SINGLE_CHANNEL or (image.mode in ("1", "P") and indices):
         stored = np.array(image, np.uint8 if image.mode == "1" else None)
@@ -184,68 +139,113 @@ def _decode(image: Image.Image, *, indices: bool) -> NDArray[Any]:
     return np.array(image if image.mode == "RGB" else image.convert("RGB"))
 
 
-def _decode_deep(path: Path) -> NDArray[Any]:
+def _decode_by_opencv(file: IO[bytes]) -> NDArray[Any]:
     # From memory: `cv2.imread` cannot open paths beyond the system's code page.
-    pixels: Any = cv2.imdecode(np.fromfile(path, np.uint8), cv2.IMREAD_UNCHANGED)
-    if pixels is None or pixels.dtype == np.uint8:
-        raise ValueError("pixels that OpenCV does not decode")
+    file.seek(0)
+    content = np.frombuffer(file.read(), np.uint8)
+    pixels: Any = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     return pixels if pixels.ndim == 2 else pixels[..., 2::-1]
 
 
-def _deep_tiff(path: Path) -> Any:
+def _decode_deep_png(
+    file: IO[bytes], image: Image.Image, is_gray_alpha: bool, indices: bool
+) -> NDArray[Any]:
+    del indices
+    image.load()  # refuses truncated files
+    pixels = _decode_by_opencv(file)
+    return pixels[..., 0] if is_gray_alpha else pixels
+
+
+def _deep_page(file: IO[bytes]) -> Any:
     """Return the page that tifffile decodes, the first of full size; None to use Pillow."""
-    if path.suffix.lower() not in (".tif", ".tiff"):
-        return None
     try:
-        with tifffile.TiffFile(path) as file:
-            pages: Any = file.pages
-            page = next((one for one in pages if not one.is_reduced), pages[0])
+        pages: Any = tifffile.TiffFile(file).pages
+        page = next((one for one in pages if not one.is_reduced), pages[0])
     except Exception:  # the parser raises many kinds of errors; Pillow names them
         return None
-    is_unsigned = page.sampleformat == _UNSIGNED
-    is_shallow = is_unsigned and np.max(page.bitspersample) <= _BYTE_BITS
+    is_shallow = page.sampleformat == _UNSIGNED and np.max(page.bitspersample) <= 8
     is_shallow &= page.fillorder == tifffile.FILLORDER.MSB2LSB
     return None if is_shallow and page.index == 0 else page
 
 
-def _tiff_orientation(page: Any) -> int:
-    found = page.tags.valueof(Tag.Orientation)
-    return found if found in range(1, 9) else 1
-
-
-def _decode_tiff(path: Path, page: Any) -> NDArray[Any]:
+def _decode_deep_tiff(file: IO[bytes], page: Any, indices: bool) -> NDArray[Any]:
     """Decode the gray or RGB pixels of a page, without alpha."""
+    del indices
     channels = page.samplesperpixel
     colors = tifffile.PHOTOMETRIC.MINISBLACK if channels == 1 else tifffile.PHOTOMETRIC.RGB
     is_plain = channels in (1, 3, 4) and page.photometric == colors
     is_plain &= tifffile.EXTRASAMPLE.ASSOCALPHA not in page.extrasamples
     is_planar = channels > 1 and page.planarconfig == tifffile.PLANARCONFIG.SEPARATE
-    try:
-        check_pixels(path, page.imagelength, page.imagewidth)
-        if page.compression != tifffile.COMPRESSION.LZW:
-            with tifffile.TiffFile(path) as file:
-                pixels = file.asarray(key=page.index)
-        elif is_planar or page.index:
-            raise ValueError("LZW")  # noqa: TRY301
-        else:  # tifffile needs another package for LZW
-            pixels = _decode_deep(path)
-    except DataError:
-        raise
-    except Exception as error:  # codecs raise many kinds of errors
-        is_plain, reason = False, first_line(error)
-    else:
-        reason = f"{page.bitspersample} bits, {channels} channels, {page.photometric!r}"
-    if not is_plain:
-        raise DataError(
-            path,
-            found=f"a TIFF layout that cannot be decoded ({reason})",
-            expected="gray or RGB of 8 or 16 bits or depth of 32-bit float, without premultiplied "
-            "alpha",
-            remedy="Convert the image to PNG, or to TIFF of 8 or 16 bits; depth, to 32-bit float.",
-        )
+    is_lzw = page.compression == tifffile.COMPRESSION.LZW  # tifffile needs another package for it
+    if not is_plain or (is_lzw and (is_planar or page.index)):
+        raise ValueError(f"TIFF layout: {channels} channels, {page.photometric!r}")
+    pixels = _decode_by_opencv(file) if is_lzw else page.asarray()
     pixels = np.moveaxis(pixels, 0, -1) if is_planar else pixels
     pixels = pixels.astype(pixels.dtype.newbyteorder("="), copy=False)
     return pixels if channels == 1 else pixels[..., :3]
+
+
+def _displayed(pixels: NDArray[Any], orientation: int) -> NDArray[Any]:
+    """Rotate pixels by their EXIF orientation (CIPA DC-008, tag 274)."""
+    if orientation == 1:
+        return pixels
+    pixels = pixels.swapaxes(0, 1) if orientation >= _FIRST_TRANSPOSED else pixels
+    pixels = pixels[:, ::-1] if orientation in (2, 3, 6, 7) else pixels
+    pixels = pixels[::-1] if orientation in (3, 4, 7, 8) else pixels
+    return np.ascontiguousarray(pixels)
+
+
+def read_xmp(path: Path) -> bytes:
+    """Read the XMP packet of an image file; empty without one, and for other files.
+
+    Raises:
+        DataError: It cannot be read, or is not an image.
+    """
+    if path.suffix.lower() not in IMAGE_SUFFIXES:
+        return b""
+    with _opened(path), Image.open(path, formats=IMAGE_FORMATS) as image:
+        if image.format == "PNG":
+            image.load()  # programs write the packet behind the pixels too
+        packet = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return packet.encode() if isinstance(packet, str) else bytes(packet)
+
+
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Read the rows and columns that `read_pixels` would return from the header of a file.
+
+    Raises:
+        DataError: It cannot be read, or is not an image.
+    """
+    with _opened(path) as stored:
+        height, width = stored.size
+        return (width, height) if stored.orientation >= _FIRST_TRANSPOSED else (height, width)
+
+
+def read_pixels(path: Path, *, indices: bool) -> NDArray[Any]:
+    """Read an image or an array as stored; alpha is dropped, the EXIF orientation applied.
+
+    Args:
+        path: An image of `IMAGE_FORMATS` (its first picture), OpenEXR (see `open_exr`) or ``.npy``.
+        indices: True to read indices, not colors, from images with a palette or of 1 bit.
+
+    Returns:
+        ``(H, W)`` for one channel, else ``(H, W, C)``, colors in RGB order. Arrays are
+        memory-mapped and read-only.
+
+    Raises:
+        DataError: The file cannot be read or is broken, or its array is not an image.
+    """
+    with _opened(path) as stored:
+        return _displayed(stored.decode(indices), stored.orientation)
+
+
+def _check_pixels(
+    subject: object, pixels: NDArray[Any], expected: str, *, is_usable: bool
+) -> NDArray[Any]:
+    if not is_usable:
+        found = f"{pixels.dtype} of shape {pixels.shape}"
+        raise DataError(subject, found=found, expected=expected)
+    return pixels
 
 
 def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
@@ -266,13 +266,9 @@ def read_rgb(image: Path | Image.Image) -> NDArray[np.uint8]:
         pixels = _displayed(_decode(image.copy(), indices=False), _orientation(image))
     if pixels.dtype == np.uint16:
         pixels = (pixels >> 8).astype(np.uint8)
-    if pixels.dtype != np.uint8 or pixels.shape[2:] not in ((), (3,)):
-        raise DataError(
-            image if isinstance(image, Path) else "image",
-            found=f"{pixels.dtype} of shape {pixels.shape}",
-            expected="colors of 8 or 16 bits",
-            remedy="Export the image as JPEG or PNG.",
-        )
+    subject = image if isinstance(image, Path) else "image"
+    is_usable = pixels.dtype == np.uint8 and pixels.shape[2:] in ((), (3,))
+    _check_pixels(subject, pixels, "colors of 8 or 16 bits, as JPEG or PNG", is_usable=is_usable)
     return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=-1)
 
 
@@ -290,18 +286,11 @@ def read_depth_m(path: Path, units_per_m: float) -> NDArray[np.float32]:
 
     Raises:
         DataError: The file cannot be read, is broken, or holds no depth.
-        SettingError: The units are not positive.
     """
-    if not 0 < units_per_m < math.inf:
-        raise SettingError("depth units per meter", found=units_per_m, expected="more than 0")
     stored = read_pixels(path, indices=True)
-    if stored.ndim != 2 or stored.dtype in (np.uint8, np.bool_):
-        raise DataError(
-            path,
-            found=f"{stored.dtype} of shape {stored.shape}",
-            expected="depth: 16-bit gray PNG or TIFF, 32-bit float TIFF, .npy or .exr",
-        )
-    depth = stored.astype(np.float32)
+    is_usable = stored.ndim == 2 and stored.dtype not in (np.uint8, np.bool_)
+    expected = "depth: 16-bit gray PNG or TIFF, 32-bit float TIFF, .npy or .exr"
+    depth = _check_pixels(path, stored, expected, is_usable=is_usable).astype(np.float32)
     if stored.dtype.kind != "f":
         depth /= np.float32(units_per_m)
     missing = ~((depth > 0) & (depth <= _MAX_DEPTH_M))
@@ -334,32 +323,6 @@ def write_depth_m(path: Path, depth_m: NDArray[np.floating], units_per_m: float)
     write_pixels(path, np.where(is_written, units, 0).astype(np.uint16))
 
 
-def read_array(path: Path) -> NDArray[Any]:
-    """Memory-map the pixels of a ``.npy`` file, read-only.
-
-    Returns:
-        ``(H, W)`` or ``(H, W, C)`` numbers; a last dimension of one channel is dropped.
-
-    Raises:
-        DataError: It cannot be read, or is not an array of pixels.
-    """
-    try:
-        with np.errstate(over="ignore"):  # by the sizes in a broken header
-            array = np.load(path, mmap_mode="r", allow_pickle=False)
-        usable = array.ndim in (2, 3) and 0 not in array.shape and array.dtype.kind in "buif"
-    # Broken headers raise anything, also tokenize.TokenError; archives have no dimensions.
-    except Exception as error:
-        raise DataError(path, found=error, expected="one array, saved with numpy.save") from error
-    if not usable:
-        raise DataError(
-            path,
-            found=f"{array.dtype} of shape {array.shape}",
-            expected="numbers of shape (H, W) or (H, W, C)",
-        )
-    pixels: NDArray[Any] = array
-    return pixels[..., 0] if pixels.ndim == 3 and pixels.shape[-1] == 1 else pixels
-
-
 def photo_fov_deg(path: Path) -> float | None:
     """Read the horizontal field of view of a photo in degrees from its EXIF data.
 
@@ -372,13 +335,13 @@ def photo_fov_deg(path: Path) -> float | None:
     Raises:
         DataError: The file cannot be read, or is not an image.
     """
-    with _opened(path) as image:
-        height, width = _upright_size(image)
-        try:
+    height, width = read_image_size(path)
+    try:
+        with Image.open(path, formats=IMAGE_FORMATS) as image:
             exif = image.getexif().get_ifd(ExifTags.IFD.Exif)
-            film_mm = float(exif.get(Tag.FocalLengthIn35mmFilm, 0))
-        except Exception:  # broken EXIF data
-            return None
+        film_mm = float(exif.get(Tag.FocalLengthIn35mmFilm, 0))
+    except Exception:  # broken EXIF data
+        return None
     if not 0 < film_mm < math.inf:  # 0 stands for unknown
         return None
     focal_pixels = film_mm / _FILM_DIAGONAL_MM * math.hypot(height, width)

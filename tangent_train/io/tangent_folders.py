@@ -1,45 +1,40 @@
-"""Folders of tangent images, rendered from panoramas."""
+"""Folders of tangent images: writing them, and rendering results of other programs on them back."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from tangent_train.geometry import PinholeGrid, equirect_shape
-from tangent_train.io import camera_files
-from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, whole_area
-from tangent_train.io.pixel_files import read_pixels, write_pixels
-from tangent_train.io.videos import VIDEO_SUFFIXES
-from tangent_train.rendering import Interpolation, equirect_to_tangent
+from tangent_train.errors import DataError, SettingError, width_height
+from tangent_train.geometry import PinholeGrid, equirect_shape, ray_lengths
+from tangent_train.io import pixel_files
+from tangent_train.io.camera_files import CameraFile
+from tangent_train.io.gpano import PanoramaArea, read_area
+from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent, tangent_to_equirect
 from tangent_train.threads import in_threads
 
 _RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 
+ResultKind = Literal["color", "labels", "depth", "features"]
+"""Meaning of pixels: colors and features are interpolated, labels and depth are not."""
 
-def panorama_area(
-    path: Path, size: tuple[int, int], angles: Sequence[float] | None = None
-) -> PanoramaArea:
-    """Return the part of the sphere that a file shows.
+_TYPES = {"color": "uif", "labels": "bui", "depth": "uif", "features": "uif"}
+_CHANNELS = {"color": ((), (3,)), "labels": ((),), "depth": ((),)}
 
-    Args:
-        path: Image, array or video; arrays and videos have no GPano tags.
-        size: Rows and columns of the image or of a frame of the video.
-        angles: Part of the sphere, see `area_of_angles`; None to read it from GPano tags.
+_GROUP_BYTES = 2**28
+"""Largest size in bytes of the images of channels that are rendered together."""
 
-    Raises:
-        DataError: The file is neither a whole panorama nor tagged as a part.
-        SettingError: The angles do not fit.
-    """
-    if angles is not None:
-        return area_of_angles(size, angles)
-    is_tagged = path.suffix.lower() not in (".npy", ".exr", *VIDEO_SUFFIXES)
-    return read_area(path, size) if is_tagged else whole_area(path, size)
+_NO_DEPTH = 65535
+"""Value for missing depth in many 16-bit files, besides 0."""
 
 
 def read_placed(
@@ -53,7 +48,7 @@ def read_placed(
     Args:
         path: An image, an array or a video.
         interpolation: With ``nearest``, images with a palette give its indices.
-        angles: See `panorama_area`.
+        angles: See `read_area`.
         frame: Function that returns the frame of a video.
 
     Returns:
@@ -61,16 +56,26 @@ def read_placed(
 
     Raises:
         DataError: The file cannot be used.
-        SettingError: The angles do not fit.
+        SettingError: The angles are invalid.
     """
-    image = read_pixels(path, indices=interpolation == "nearest") if frame is None else frame()
-    area = panorama_area(path, (image.shape[0], image.shape[1]), angles)
+    is_nearest = interpolation == "nearest"
+    image = frame() if frame else pixel_files.read_pixels(path, indices=is_nearest)
+    area = read_area(path, (image.shape[0], image.shape[1]), angles)
     return area.place(image), area
 
 
 def face_name(grid: PinholeGrid, face: int) -> str:
     """Return the name of a tangent image, e.g. ``face_007``; names sort like the images."""
     return f"face_{face:0{max(3, len(str(grid.num_images - 1)))}}"
+
+
+def flat_name(name: str) -> str:
+    """Return the name of a panorama without folders, for COLMAP.
+
+    >>> flat_name("x/1")
+    'x__1'
+    """
+    return name.replace("/", "__")
 
 
 def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
@@ -94,19 +99,19 @@ def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
     return np.stack(small, axis=-1).reshape(height, width, *image.shape[2:])
 
 
-def write_tangent_folder(
-    folder: Path,
+def write_views(
     image: NDArray[Any],
-    cameras: camera_files.CameraFile,
+    grid: PinholeGrid,
+    files: Mapping[Path, int],
     interpolation: Interpolation,
     progress: Callable[[float], object],
 ) -> None:
-    """Render tangent images to a folder; files of the same names are replaced.
+    """Render tangent images to files in threads; existing files are replaced.
 
     Args:
-        folder: Output folder.
         image: ``(H, W)`` or ``(H, W, C)`` panorama.
-        cameras: Content of ``cameras.json``.
+        grid: Geometry of the images.
+        files: Index of the image of each file.
         interpolation: See `equirect_to_tangent`.
         progress: Called with the share of the images written since its last call.
 
@@ -114,24 +119,174 @@ def write_tangent_folder(
         SettingError: The panorama cannot be rendered, or the files cannot hold its pixels.
     """
 
-    def render(file: str, face: int) -> None:
-        (pixels,) = equirect_to_tangent(image, cameras.grid, [face], interpolation)
-        write_pixels(folder / file, pixels)
+    def write(item: tuple[Path, int]) -> None:
+        (pixels,) = equirect_to_tangent(image, grid, [item[1]], interpolation)
+        pixel_files.write_pixels(item[0], pixels)
 
-    write_each(render, dict(zip(cameras.files, cameras.faces, strict=True)), progress)
-    camera_files.write_cameras(folder / camera_files.CAMERAS_FILE, cameras)
+    with closing(in_threads(write, files.items())) as written:
+        for _ in written:
+            progress(1 / len(files))
 
 
-def write_each(
-    write: Callable[[str, int], None], faces: Mapping[str, int], progress: Callable[[float], object]
-) -> None:
-    """Write the images of some faces in threads.
+def result_files(folder: Path, cameras: CameraFile) -> list[Path]:
+    """List the result files for all images of a grid, which have the names of the images.
 
     Args:
-        write: Function of the name of an image and its face.
-        faces: Faces by name.
-        progress: Called with the share of the images written since its last call.
+        folder: Folder of the results.
+        cameras: Cameras of the images.
+
+    Returns:
+        One file for each image of the grid, in the order of the grid.
+
+    Raises:
+        DataError: A file is missing, or two files have the same name.
     """
-    with closing(in_threads(lambda face: write(*face), faces.items())) as written:
-        for _ in written:
-            progress(1 / len(faces))
+    there: dict[str, list[Path]] = {}
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() in pixel_files.READABLE_SUFFIXES:
+            there.setdefault(file.stem, []).append(file)
+    names = dict(zip(cameras.faces, cameras.files, strict=True))
+    stems = [Path(names.get(f, f"file of image {f}")).stem for f in cameras.grid.face_indices()]
+    wrong = [stem for stem in stems if len(there.get(stem, [])) != 1]
+    if wrong:
+        files = " and ".join(file.name for file in there.get(wrong[0], []))
+        raise DataError(
+            folder,
+            found=files or f"no {wrong[0]}",
+            expected=f"one file for each of the {len(stems)} images of the sphere, named as in the "
+            "cameras",
+            remedy="Render the panorama without faces=…, put results into a separate folder, and "
+            "give cameras=<folder of the images>.",
+        )
+    return [there[stem][0] for stem in stems]
+
+
+@dataclass(frozen=True)
+class TangentResults:
+    """Results for all images of one panorama.
+
+    Attributes:
+        arrays: ``(h, w)`` or ``(h, w, C)`` for every image of the grid, all of one shape and dtype.
+        grid: Grid of the images, with the size of the results.
+        kind: Meaning of the pixels.
+    """
+
+    arrays: Sequence[NDArray[Any]]
+    grid: PinholeGrid
+    kind: ResultKind
+
+    @classmethod
+    def read(
+        cls, files: Sequence[Path], grid: PinholeGrid, kind: ResultKind | Literal["auto"]
+    ) -> TangentResults:
+        """Read and check result files.
+
+        Args:
+            files: One file for each image, in the order of the grid, see `result_files`.
+            grid: Grid of the images.
+            kind: ``auto`` decides by the first file: ``.npy`` of floats are features; three
+                channels are colors, one channel of integers labels; images of one channel with 16
+                bits or floats are depth.
+
+        Raises:
+            DataError: A file cannot be read, differs from the others, cannot be of this kind, or
+                has another ratio of sides than the images.
+        """
+        arrays = list(in_threads(partial(pixel_files.read_pixels, indices=kind != "color"), files))
+        first = arrays[0]
+        decided = _kind_of(files[0], first) if kind == "auto" else kind
+        channels = _CHANNELS.get(decided, (first.shape[2:],))
+        is_usable = first.dtype.kind in _TYPES[decided] and first.shape[2:] in channels
+        is_usable &= first.shape[0] * grid.size[1] == first.shape[1] * grid.size[0]
+        for file, array in zip(files, arrays, strict=True):
+            if not is_usable or (array.shape, array.dtype) != (first.shape, first.dtype):
+                raise DataError(
+                    file,
+                    found=f"{array.dtype} of shape {array.shape}",
+                    expected=f"{decided} of one type and shape in all files, in the ratio of "
+                    f"{width_height(grid.size)}; labels and depth have one channel, colors one or "
+                    "three",
+                    remedy=f"Choose kind={', '.join(get_args(ResultKind))}.",
+                )
+        size = first.shape[0], first.shape[1]
+        return cls(arrays, grid if size == grid.size else grid.resized(size), decided)
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of a file format that keeps the pixels unchanged."""
+        if self.kind == "features":
+            return ".npy"
+        return ".tif" if self.arrays[0].dtype.kind == "f" else ".png"
+
+    def write(self, path: Path, shape: tuple[int, int], blend: Blend, *, z_depth: bool) -> None:
+        """Render the results back to a panorama, and write it.
+
+        Results of another size than the images cover the same field of view, edge to edge.
+
+        Args:
+            path: File of the panorama. Arrays (``.npy``) keep the dtype; images hold 32-bit floats,
+                or labels in the smallest integers that suffice.
+            shape: ``(H, W)`` of the panorama.
+            blend: Blending of overlapping images, for colors and features.
+            z_depth: True to convert z-depth of the images to distance from the center. In integers
+                that cannot hold a distance, it is missing: 0.
+
+        Raises:
+            SettingError: The format cannot hold the pixels, or `z_depth` is set without depth.
+        """
+        suffix, channels = path.suffix.lower(), self.arrays[0].shape[2:]
+        is_lossy = suffix in pixel_files.LOSSY_SUFFIXES and self.kind != "color"
+        if is_lossy or (z_depth and self.kind != "depth"):
+            setting = "output" if is_lossy else "z_depth"
+            expected = "depth with z_depth=true, and png, tif or npy for all but colors"
+            raise SettingError(setting, found=f"{self.kind} to {path.name}", expected=expected)
+        dtype = self._image_dtype() if suffix != ".npy" else self.arrays[0].dtype
+        pixel_files.check_writable(suffix, dtype, channels[0] if channels else 1)
+        arrays = [_distances(array, self.grid) for array in self.arrays] if z_depth else self.arrays
+        whole = (*shape, *channels)
+        if suffix == ".npy":
+            with pixel_files.array_file(path, whole, dtype) as out:
+                self._render(arrays, blend, out)
+        else:
+            panorama = np.empty(whole, arrays[0].dtype)
+            self._render(arrays, blend, panorama)
+            pixel_files.write_pixels(path, panorama.astype(dtype, copy=False))
+
+    def _image_dtype(self) -> np.dtype[Any]:
+        dtype = self.arrays[0].dtype
+        if self.kind == "labels":
+            values = [int(value) for array in self.arrays for value in (array.min(), array.max())]
+            return np.result_type(*map(np.min_scalar_type, (min(values), max(values))))
+        return np.dtype(np.float32) if dtype.kind == "f" else dtype
+
+    def _render(self, arrays: Sequence[NDArray[Any]], blend: Blend, out: NDArray[Any]) -> None:
+        grid = self.grid
+        shape = (out.shape[0], out.shape[1])
+        if self.kind in ("labels", "depth"):
+            out[:] = tangent_to_equirect(np.stack(arrays), grid, shape, interpolation="nearest")
+            return
+        channels = out.shape[2:]
+        step = max(1, _GROUP_BYTES // (4 * grid.num_images * math.prod(grid.size)))
+        for start in range(0, channels[0], step) if channels else (0,):
+            part = (..., slice(start, start + step)) if channels else ...
+            group = np.stack([array[part] for array in arrays])
+            out[part] = tangent_to_equirect(group, grid, shape, blend)
+
+
+def _kind_of(file: Path, array: NDArray[Any]) -> ResultKind:
+    is_array, kind = file.suffix.lower() == ".npy", array.dtype.kind
+    if is_array and kind == "f":
+        return "features"
+    if array.ndim == 3:
+        return "color"
+    return "depth" if kind == "f" or (array.dtype == np.uint16 and not is_array) else "labels"
+
+
+def _distances(depth: NDArray[Any], grid: PinholeGrid) -> NDArray[Any]:
+    """Convert z-depth ``(h, w)`` of an image to distances."""
+    distances = depth * ray_lengths(grid.camera_matrix, depth.shape)
+    if depth.dtype.kind != "f":
+        missing = (depth == _NO_DEPTH) & (depth.dtype == np.uint16)
+        distances = np.where(missing, depth, np.rint(distances))
+        distances[distances > np.iinfo(depth.dtype).max] = 0
+    return distances.astype(depth.dtype)

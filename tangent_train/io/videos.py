@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, of_extra
 from tangent_train.files import atomic_path
-from tangent_train.io.png import check_pixels
 from tangent_train.threads import in_threads
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".webm", ".avi")
@@ -28,9 +27,7 @@ _MISSING_S = 0.5
 """Part of the declared duration that a whole video may lack: frames are not always as long."""
 
 _SHOWN_VP8 = 0x10
-_STRAIGHT = 0.02  # tolerance of a matrix: about a degree
 _UPRIGHT_SIGNS = np.eye(2, dtype=np.int64)
-_UPRIGHT = "Export the video upright."
 _AHEAD = 2
 _ENCODER = "libx264"
 _QUALITY = {"crf": "18", "preset": "veryfast"}
@@ -46,7 +43,7 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
         DataError: The video cannot be read, or has no frames.
         SettingError: PyAV is missing.
     """
-    first, packets, hidden, end_s, times = None, 0, 0, 0.0, []
+    first, times, packets, end_s = None, [], 0, 0.0
     with _opened(path) as (container, stream):
         for packet in container.demux():
             if packet.pts is not None:
@@ -54,22 +51,18 @@ def read_video_size(path: Path) -> tuple[int, int, int]:
                 end_s = max(end_s, float(end))
             if packet.stream == stream:
                 packets += packet.size > 0
-                hidden += packet.size > 0 and not _is_shown(packet)
                 times += [packet.pts] if packet.size and _is_shown(packet) else []
                 first = first or next(iter(packet.decode()), None)
         indexed = sum(entry.size > 0 for entry in stream.index_entries)
         # MP4 files have an index of all frames, the others a duration.
         is_cut = (container.duration or 0) / _MICROSECONDS - end_s > _MISSING_S
         is_cut &= "mov" not in container.format.name
-        declared = max(indexed, packets + is_cut) - hidden
     if first is None:
         raise DataError(path, found="no frame that can be decoded", expected="a whole video")
-    check_pixels(path, first.height, first.width)
-    rows, columns = _upright(first, _orientation(path, first)).shape[:2]
     # Cutting without encoding leaves frames at the start that refer to missing ones.
-    start = first.pts
-    early = sum(None not in (time, start) and time < start for time in times)
-    return declared - early, rows, columns
+    early = sum(None not in (time, first.pts) and time < first.pts for time in times)
+    declared = max(indexed, packets + is_cut) - (packets - len(times)) - early
+    return declared, *_upright(first, _orientation(first)).shape[:2]
 
 
 def read_frames(
@@ -97,17 +90,24 @@ def _frames(path: Path, expected: int, every: int) -> Generator[tuple[Any, NDArr
     """Yield frames with their orientation, see `_orientation`."""
 
     def decoded() -> Generator[tuple[Any, NDArray[np.int64]]]:
-        number, signs = -1, _UPRIGHT_SIGNS
+        number, signs = 0, _UPRIGHT_SIGNS
         with _opened(path) as (container, stream):
-            for number, frame in enumerate(container.decode(stream)):
-                if frame.is_corrupt:
-                    raise _damaged(path, f"frame {number}, and frames before that refer to it")
+            for frame in container.decode(stream):
+                if frame.is_corrupt:  # and frames before that refer to it
+                    break
                 # Within an H.264 stream, only the first frame may have the matrix.
-                signs = _orientation(path, frame) if number == 0 else signs
+                signs = _orientation(frame) if number == 0 else signs
                 if number % every == 0:
                     yield frame, signs
-        if number + 1 != expected:
-            raise _damaged(path, f"{number + 1} of {expected} frames")
+                number += 1
+        if number != expected:
+            raise DataError(
+                path,
+                found=f"a truncated or damaged video ({number} of {expected} frames)",
+                expected="a whole one",
+                remedy="Copy or export it again. To use what is left of it, repair it, for example "
+                "with ffmpeg -i <video> -c copy <repaired>.",
+            )
 
     source = decoded()
     with closing(in_threads(lambda _: next(source, None), count(), 1, _AHEAD)) as frames:
@@ -125,10 +125,9 @@ def _opened(path: Path) -> Iterator[tuple[Any, Any]]:
             _file_url(path), container_options=options, metadata_errors="replace"
         ) as container:
             stream: Any = container.streams.best("video")
-            if stream is None or stream.disposition & stream.disposition.attached_pic:
-                raise DataError(path, found="no video stream", expected="a video")
-            if stream.codec_context is None:
-                raise DataError(path, found="a codec that FFmpeg lacks", expected="another one")
+            if stream is None or stream.codec_context is None:
+                expected = "a video stream of a codec that FFmpeg has"
+                raise DataError(path, found="no video stream", expected=expected)
             stream.thread_type = "AUTO"
             yield container, stream
     except av.FFmpegError as error:
@@ -151,37 +150,18 @@ def _is_shown(packet: Any) -> bool:
     return not (packet.is_discard or hidden)
 
 
-def _damaged(path: Path, detail: str) -> DataError:
-    return DataError(
-        path,
-        found=f"a truncated or damaged video ({detail})",
-        expected="a whole one",
-        remedy="Copy or export it again. To use what is left of it, repair it, for example with "
-        "ffmpeg -i <video> -c copy <repaired>.",
-    )
-
-
-def _orientation(path: Path, frame: Any) -> NDArray[np.int64]:
+def _orientation(frame: Any) -> NDArray[np.int64]:
     """Return the signs ``(2, 2)`` of the transposed display matrix of a frame, or the identity.
 
-    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M.
-
-    Raises:
-        DataError: The matrix is not a rotation by quarter turns, with or without mirroring.
+    The matrix M of ISO 14496-12 maps a stored pixel [x y 1] to the displayed pixel [x y 1] M. Other
+    rotations than by quarter turns are rounded to these.
     """
     data = frame.side_data.get("DISPLAYMATRIX")
     if data is None:
         return _UPRIGHT_SIGNS
     # Its rows give the column and the row of a displayed pixel.
     matrix = np.frombuffer(bytes(data), np.int32).reshape(3, 3)[:2, :2].T.astype(float)
-    unit = matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)
-    signs = np.rint(unit).astype(np.int64)
-    if (signs @ signs.T != np.eye(2)).any() or abs(unit - signs).max() > _STRAIGHT:
-        shown = np.array2string(matrix / 2**16, precision=4).replace("\n", "")
-        expected = "a rotation by 90°, 180° or 270°, mirrored or not"
-        found = f"a display matrix {shown}"
-        raise DataError(path, found=found, expected=expected, remedy=_UPRIGHT)
-    return signs
+    return np.rint(matrix / np.maximum(abs(matrix).max(axis=1, keepdims=True), 1)).astype(np.int64)
 
 
 def _upright(frame: Any, signs: NDArray[np.int64]) -> NDArray[np.uint8]:

@@ -108,4 +108,4 @@ def test_the_views_of_an_area_are_counted(tmp_path: Path, capsys: Capture) -> No
     with pytest.raises(SystemExit):
         _checked(tmp_path, capsys, "data.area=[-180,180,-60,60]")
     out, err = capsys.readouterr()
-    assert out.count("expected 64 × 21 (width × height), for square pixels in data.area=") == 3
+    assert out.count("expected 64 × 21.3 (width × height): square pixels in area=") == 3

@@ -153,7 +153,7 @@ def test_videos_that_cannot_be_used(
         ("broken", "cannot be decoded"),
         ("cut", "cannot be decoded"),
         ("gray", "cannot be decoded"),
-        ("narrow", "expected a whole panorama"),
+        ("narrow", "a whole panorama, twice"),
         ("sound", "no video stream"),
     ):
         assert re.search(rf"{name}\.\w+: ", printed)

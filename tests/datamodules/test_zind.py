@@ -150,7 +150,7 @@ def test_panoramas_inside_one_room_are_paired(tmp_path: Path) -> None:
     assert pair.left.name.endswith("pano_3")
     assert pair.right.file.name.endswith("pano_5.jpg")
     assert pair.left.rgb.shape == (64, 128, 3)
-    with pytest.raises(SettingError, match=r"erp_height: found 65; expected at most the 64 rows"):
+    with pytest.raises(SettingError, match=r"erp_height: found 65; expected at most 64"):
         ZindPairs(tmp_path, erp_height=65).read(1)
 
 

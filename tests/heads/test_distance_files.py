@@ -13,7 +13,7 @@ from tangent_train.geometry import camera_matrix_from_fov, equirect_directions
 from tangent_train.heads import DistanceHead, PredictedImage
 from tangent_train.heads.distance import points_of, spread_pixels
 from tangent_train.inference.images import InputImage
-from tangent_train.io.gpano import area_of_angles, whole_area
+from tangent_train.io.gpano import read_area
 from tangent_train.io.palette import distance_colors
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
 
@@ -22,7 +22,7 @@ RNG = np.random.default_rng(0)
 
 def _panorama(depth: NDArray[np.float32]) -> PredictedImage:
     rgb = RNG.integers(0, 256, (*depth.shape, 3), np.uint8)
-    return PredictedImage(InputImage(rgb, area=whole_area(Path("a"), depth.shape)), depth)
+    return PredictedImage(InputImage(rgb, area=read_area(Path("image"), depth.shape)), depth)
 
 
 def test_points_are_evenly_spread_over_the_sphere() -> None:
@@ -42,7 +42,7 @@ def test_points_are_rays_times_depth_without_unknown_pixels() -> None:
     rgb = RNG.integers(0, 256, (64, 128, 3), np.uint8)
     depth = RNG.uniform(0.5, 9, (16, 32)).astype(np.float32)
     depth[RNG.random(depth.shape) < 0.3] = np.nan
-    area = area_of_angles(depth.shape, [135, -135, 0, 45])
+    area = read_area(Path("image"), depth.shape, [135, -135, 0, 45])
     part = PredictedImage(InputImage(rgb, area=area), depth)
     rows, columns = pixels = spread_pixels(part, 10**6)
     assert np.isfinite(depth).sum() == len(rows) == len({*zip(rows, columns, strict=True)})

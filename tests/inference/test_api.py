@@ -212,10 +212,10 @@ _RGB = np.zeros((16, 32, 3), np.uint8)
 @pytest.mark.parametrize(
     ("image", "settings", "message"),
     [
-        (_RGB[:, :30], {}, "expected a whole panorama, twice as wide as high.*area=.*fov="),
+        (_RGB[:, :30], {}, "a whole panorama, twice as wide as high.*area=.*fov="),
         (torch.zeros(16, 32, 3, dtype=torch.uint8), {}, r"Tensor \(16, 32, 3\).*\(3, H, W\)"),
         ("room.jpg", {}, "room.jpg: found .*No such file"),
-        (_RGB, {"area": [0, 90, 0, 90]}, "area: found .*square"),
+        (_RGB, {"area": [0, 90, 0, 90]}, "square pixels in area="),
         (_RGB, {"upright": "yes"}, "upright: found 'yes'; expected 'pose' or 'auto'"),
         (_RGB, {"upright": "pose"}, "upright: found pose; expected the path of a file"),
         (_RGB, {"mask": 30}, "mask: found 30; expected a latitude"),

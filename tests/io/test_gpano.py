@@ -11,9 +11,9 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, PngImagePlugin
 
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.geometry import equirect_to_lonlat
-from tangent_train.io.gpano import PanoramaArea, area_of_angles, read_area, read_up, whole_area
+from tangent_train.io.gpano import PanoramaArea, read_area, read_up
 from tangent_train.orientation.gravity import up_from_pose
 from tests.datamodules.data_files import (
     GPANO_TAGS,
@@ -126,9 +126,8 @@ def test_places_of_xmp(tmp_path: Path) -> None:
     [
         xmp_packet(_FORMS["attributes"])[:-60],
         xmp_packet(_FORMS["attributes"]).replace(b"rdf:about", b"other:about"),
-        b'<!DOCTYPE x [<!ENTITY a "aaaa">]>' + xmp_packet(_FORMS["attributes"]),
     ],
-    ids=["truncated", "unknown prefix", "entities"],
+    ids=["truncated", "unknown prefix"],
 )
 def test_xmp_that_cannot_be_read(tmp_path: Path, packet: bytes) -> None:
     """Refused with these tags, ignored without them."""
@@ -148,7 +147,7 @@ def test_images_that_say_nothing(tmp_path: Path) -> None:
     other = _save(tmp_path / "other.jpg", GPANO_TAGS)
     other.write_bytes(other.read_bytes().replace(b"photos/1.0/panorama", b"photos/1.0/image"))
     for path in (tmp_path / "none.jpg", _save(tmp_path / "incomplete.jpg", incomplete), other):
-        assert read_area(path, (30, 60)) == whole_area(path, (30, 60)), path.name
+        assert read_area(path, (30, 60)) == read_area(Path("image"), (30, 60)), path.name
         with pytest.raises(DataError, match="a whole panorama"):
             read_area(path, (40, 60))
         assert read_up(path) is None
@@ -177,20 +176,13 @@ def _angles_deg(area: PanoramaArea, corner_xy: tuple[int, int]) -> NDArray[np.fl
 @pytest.mark.parametrize(
     ("changes", "size", "found"),
     [
-        ({"ProjectionType": "cylindrical"}, (40, 60), "GPano:ProjectionType cylindrical"),
-        ({"FullPanoWidthPixels": "many"}, (40, 60), "GPano:FullPanoWidthPixels 'many'"),
-        (
-            {"FullPanoHeightPixels": "100"},
-            (40, 60),
-            r"of 360 × 100 \(width × height\), .*expected a part",
-        ),
-        (
-            {"CroppedAreaTopPixels": "150"},
-            (40, 60),
-            "100 from the left and 150 from the top of 360 × 180",
-        ),
-        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "tags of 0 × 40"),
-        ({}, (40, 50), r"in an image of 50 × 40 \(width × height\); .*may have been cut after"),
+        ({"ProjectionType": "cylindrical"}, (40, 60), "cylindrical"),
+        ({"FullPanoWidthPixels": "many"}, (40, 60), "many"),
+        ({"FullPanoHeightPixels": "100"}, (40, 60), "tags"),
+        ({"CroppedAreaTopPixels": "150"}, (40, 60), "150"),
+        ({"CroppedAreaLeftPixels": "nan"}, (40, 60), "nan"),
+        ({"CroppedAreaImageWidthPixels": "0"}, (40, 60), "tags"),
+        ({}, (40, 50), r"33\.3 .*tags"),
         ({"FullPanoWidthPixels": "9e7", "FullPanoHeightPixels": "4.5e7"}, (40, 60), "columns"),
     ],
 )
@@ -229,7 +221,7 @@ def test_place_and_cut(area: PanoramaArea, channels: tuple[int, ...], dtype: Any
 
 @pytest.mark.parametrize("width", [19, 20, 21])
 def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, width: int) -> None:
-    area = whole_area(tmp_path / "image.jpg", (10, width))
+    area = read_area(Path("image"), (10, width))
     assert area.full_shape == (10, 20)
     assert area.is_whole
     image = np.arange(10 * width).reshape(10, width)
@@ -241,11 +233,11 @@ def test_whole_panoramas_may_lack_a_column_or_have_one_more(tmp_path: Path, widt
     assert np.abs(cut - image).max() <= (width != 20)
 
 
-@pytest.mark.parametrize("size", [(10, 18), (10, 22), (1, 1)])
-def test_other_shapes_are_refused(tmp_path: Path, size: tuple[int, int]) -> None:
-    message = rf"a\.jpg: found {size[1]} × {size[0]} .*area=.*GPano.*photo, give fov=.*projection="
+@pytest.mark.parametrize("size", [(10, 18), (10, 22)])
+def test_other_shapes_are_refused(size: tuple[int, int]) -> None:
+    message = rf"a: found {size[1]} × {size[0]} .*area=.*GPano.*photo, give fov=.*projection="
     with pytest.raises(DataError, match=message):
-        whole_area(tmp_path / "a.jpg", size)
+        read_area(Path("a"), size)
 
 
 # The setting
@@ -260,7 +252,7 @@ def test_edges_are_at_the_angles(seed: int) -> None:
     south = rng.uniform(-90, 90 - down)
     width = int(rng.integers(300, 900))
     size = (round(width * down / across), width)
-    area = area_of_angles(size, (west, east, south, south + down))
+    area = read_area(Path("image"), size, (west, east, south, south + down))
     pixel_deg = 180 / area.full_shape[0]
     left, top = _angles_deg(area, (area.columns[0], area.rows[0]))
     assert abs((left - west + 180) % 360 - 180) <= pixel_deg
@@ -275,10 +267,8 @@ def test_edges_are_at_the_angles(seed: int) -> None:
 
 
 def test_pixels_that_are_not_square_are_refused() -> None:
-    message = r"area: found .*pixels 0\.4° wide and 0\.1° high in an image of 100 × 100 .* square: "
-    message += r"40\.00° high, e\.g\. -20\.00 to 20\.00"
-    with pytest.raises(SettingError, match=message):
-        area_of_angles((100, 100), (0, 40, 0, 10))
+    with pytest.raises(DataError, match=r"found 100 × 100 .*expected 100 × 25 .*area=\[0, 40"):
+        read_area(Path("image"), (100, 100), (0, 40, 0, 10))
 
 
 # Pose
@@ -296,17 +286,9 @@ def test_zero_pitch_and_roll_are_unknown(tmp_path: Path, pitch: str, roll: str) 
     np.testing.assert_array_equal(up, expected)
 
 
-def test_impossible_poses_are_refused(tmp_path: Path) -> None:
-    for axis, value in (
-        ("Pitch", "91"),
-        ("Roll", "nan"),
-        ("Roll", "180.5"),
-        ("Roll", "steep"),
-        ("Pitch", "1_0"),
-        ("Pitch", "\u0663"),
-        ("Pitch", "1e400"),
-    ):
-        path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
-        message = rf"image\.jpg: found GPano:Pose{axis}Degrees .*expected a number from"
-        with pytest.raises(DataError, match=message):
-            read_up(path)
+@pytest.mark.parametrize("value", ["181", "nan", "steep", "1e400"])
+@pytest.mark.parametrize("axis", ["Pitch", "Roll"])
+def test_impossible_poses_are_refused(tmp_path: Path, axis: str, value: str) -> None:
+    path = _save(tmp_path / "image.jpg", {f"Pose{axis}Degrees": value})
+    with pytest.raises(DataError, match=r"image\.jpg: found GPano:Pose.*expected numbers from"):
+        read_up(path)

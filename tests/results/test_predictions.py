@@ -13,7 +13,7 @@ from datamodules.folder.labeled import class_masks
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads import ClassesHead, PredictedImage
 from tangent_train.inference.images import InputImage
-from tangent_train.io.gpano import area_of_angles, whole_area
+from tangent_train.io.gpano import read_area
 from tangent_train.io.image_files import short_names
 from tangent_train.io.pixel_files import write_pixels
 from tangent_train.results.predictions import PredictionFolder
@@ -53,7 +53,7 @@ def test_classes_of_one_name_are_read_back_as_one(tmp_path: Path) -> None:
     classes = read_label_map(tmp_path / "classes.json")
     assert classes.names == ("door", "wall", "ü", "Wall")
     assert classes.decode(labels)[0].tolist() == [0, 1, 2, 1, 3, 0, 4, 3]
-    area = whole_area(Path("a"), (4, 8))
+    area = read_area(Path("image"), (4, 8))
     for ignored, masked in ((["door", "Wall"], [1, 3, 6]), (["u\u0308"], [4, 7])):
         counts = class_masks(tmp_path, ignored).read("a", area)
         assert np.flatnonzero(counts[0] == 0).tolist() == masked
@@ -64,7 +64,7 @@ def test_a_cap_of_a_crop_has_its_solid_angle() -> None:
     labels[:30] = 1  # 60° to 90°: 2π (1 − sin 60°) of 4π
     labels[60:] = 0  # below 30°: half of it
     cap = (1 - math.sin(math.pi / 3)) / 2
-    area = area_of_angles((90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
+    area = read_area(Path("image"), (90, 180), [-90, 90, 0, 90])  # a quarter of the sphere
     image = InputImage(np.zeros((180, 360, 3), np.uint8), area=area)
     shares = ClassesHead(NAMES).summarize(PredictedImage(image, labels), np.array(True))
     assert shares == pytest.approx({NAMES[0]: 0.5, "up": 2 * cap, "down": 0.5 - 2 * cap})

@@ -65,12 +65,12 @@ def test_the_largest_panoramas_are_allowed(tmp_path: Path) -> None:
     assert read_image_size(_png(tmp_path / "a.png", 32768, 16384)) == (16384, 32768)
 
 
-def test_long_xmp_with_a_document_type_is_refused_before_entities_are_expanded(
+def test_long_xmp_with_a_document_type_is_ignored(
     tmp_path: Path,
 ) -> None:
     name = b"http://ns.google.com/photos/1.0/panorama/"
     laughs = b'<!DOCTYPE x [<!ENTITY a "ha"><!ENTITY b "&a;&a;">]>'
     inside = b'<x xmlns:GPano="%s"><GPano:FullPanoWidthPixels>%s' % (name, b"&b;\n" * 2_000_000)
     Image.new("RGB", (2, 1)).save(tmp_path / "a.webp", xmp=laughs + inside)
-    with pytest.raises(DataError, match=r"a\.webp: found XMP data .* \(a document type\)"):
-        read_area(tmp_path / "a.webp", (1, 2))
+    with pytest.raises(DataError, match=r"a\.webp: found 2 × 4"):
+        read_area(tmp_path / "a.webp", (4, 2))

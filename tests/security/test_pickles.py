@@ -20,7 +20,7 @@ from tangent_train.errors import DataError
 from tangent_train.heads import ClassesHead
 from tangent_train.io.image_files import short_names
 from tangent_train.io.inputs import Job
-from tangent_train.io.pixel_files import read_array, write_pixels
+from tangent_train.io.pixel_files import read_image_size, write_pixels
 from tangent_train.results.predictions import PredictionFolder
 from tests.cli.tiny_runs import run_command
 from tests.inference.trained import write_checkpoint
@@ -72,7 +72,7 @@ def test_no_reader_unpickles(make: Any, created: Path, tmp_path: Path) -> None:
     readers: tuple[Any, ...] = (
         load_network,
         read_tensors,
-        read_array,
+        read_image_size,
     )
     for name in NAMES:
         path = tmp_path / name

@@ -147,7 +147,7 @@ def test_the_estimate_of_up_does_not_see_the_fill(
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({}, DataError, r"\.png: found 256 × 50 .*twice as wide as high\. If all .* data\.area="),
+        ({}, DataError, r"\.png: found 256 × 50 .*twice as wide as high.* All .* data\.area="),
         ({"area": (-180, 180, -45, 45)}, DataError, r"found 256 × 50 .*expected 256 × 64 .*square"),
         ({"area": AREA, "level": 7}, SettingError, r"erp_height: found 256; expected at most 128"),
     ],
