@@ -9,10 +9,11 @@ from typing import Any
 import lightning
 from hydra.core.hydra_config import HydraConfig
 from hydra.utils import get_class
+from lightning.pytorch.utilities import rank_zero_only
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings, typed_names
+from tangent_train.config.settings import EvaluateSettings, refuse_typed, typed_names
 from tangent_train.errors import SettingError
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
@@ -34,10 +35,11 @@ def evaluate(settings: EvaluateSettings) -> None:
     if "data" in hydra.runtime.choices and not {"data", "experiment"}.intersection(typed):
         expected = "the data set of the evaluation, data=… or experiment=…"
         raise SettingError("data", found="nothing", expected=expected)
-    for name in _OF_TRAINING.intersection(typed):
-        expected = "no such setting: an evaluation does not read it"
-        raise SettingError(name, found="a value", expected=expected)
+    refuse_typed(_OF_TRAINING, "no such setting: an evaluation does not read it")
     folder = Path(hydra.runtime.output_dir)
+    if (folder / "config.yaml").exists() and rank_zero_only.rank == 0:
+        found = f"{folder}, the folder of another run"
+        raise SettingError("hydra.run.dir", found=found, expected="a new folder")
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
@@ -61,7 +63,7 @@ def evaluate(settings: EvaluateSettings) -> None:
     head = build_head(settings, data, loaded.depth_kind)
     task = build_task(settings, data, loaded.network, head)
     run = Run(folder, settings, data, task, loaded, notes)
-    run.write_settings()
+    rank_zero_only(run.write_settings)()
     run.test(run.trainer(), settings.checkpoint)
 
 

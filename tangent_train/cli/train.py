@@ -22,7 +22,7 @@ from tangent_train.callbacks.checkpoints import BestCheckpoint, LastCheckpoint
 from tangent_train.cli.pretrained import load_pretrained, with_pretrained_network
 from tangent_train.cli.processes import OBJECTIVE_FILE
 from tangent_train.cli.run import Run, build
-from tangent_train.config.settings import TrainSettings
+from tangent_train.config.settings import TrainSettings, refuse_typed
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import atomic_path, write_text
@@ -34,6 +34,12 @@ _EXPECTED_WARNINGS = (
     "The number of training batches",  # a small data set has few batches
     "Found .* in eval mode at the start of training",  # network.frozen_statistics=true
 )
+
+_FIXED = {
+    *("ema", "init_from", "level", "network", "optimizer", "representation", "scheduler", "seed"),
+    "task",
+}
+"""Groups and settings that a resumed run takes from its folder and its checkpoint."""
 
 
 def train(settings: TrainSettings) -> float | None:
@@ -50,13 +56,15 @@ def train(settings: TrainSettings) -> float | None:
     logging.getLogger("lightning.pytorch.profilers").setLevel(logging.INFO)
     resumed = settings.resume and settings.resume / "checkpoints" / "last.ckpt"
     file = None
+    if resumed is not None:
+        refuse_typed(_FIXED, "that of the run, when resuming: start a new run instead")
     if resumed is None and settings.init_from is not None:
         settings, file = with_pretrained_network(settings.init_from, settings)
     run = Run(folder, settings, *build(settings, file, settings.trust))
     if resumed is None:
         _create_folder(folder)
         load_pretrained(run, settings.init_from)
-    rank_zero_only(run.write_settings)()
+        rank_zero_only(run.write_settings)()
     checkpoints = folder / "checkpoints"
     last = LastCheckpoint(checkpoints, settings.checkpoint_every_n_steps)
     best = BestCheckpoint(checkpoints, run.task.monitor, run.task.head.mode_of(run.task.monitor))
@@ -65,6 +73,8 @@ def train(settings: TrainSettings) -> float | None:
         average = EMAWeightAveraging(trainer.strategy.root_device, decay=settings.ema)
         trainer.callbacks.insert(0, average)  # type: ignore[attr-defined]
     _fit(run, trainer, resumed)
+    if resumed is not None:  # with changes, which did not keep the run from being resumed
+        rank_zero_only(run.write_settings)()
     # Written before the test, whose errors must not cost a sweep the score.
     score = _best_validation_score(trainer, best, folder)
     tested = _tested_checkpoint(trainer, best, last.path)

@@ -7,6 +7,7 @@ YAML files; their types are those of the class that they build.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -537,3 +538,14 @@ def typed_names() -> list[str]:
     """Return the names of the settings on the command line, such as ``network.widths``."""
     overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
     return [text.lstrip("+~").partition("=")[0] for text in overrides]
+
+
+def refuse_typed(names: Collection[str], expected: str) -> None:
+    """Refuse groups and settings on the command line that the command does not read.
+
+    Raises:
+        SettingError: One of the names, or a setting of such a group, is typed.
+    """
+    for typed in typed_names():
+        if re.split(r"[.@]", typed)[0] in names:
+            raise SettingError(typed, found="a value", expected=expected)

@@ -52,6 +52,8 @@ def test_a_run_is_evaluated_as_after_its_training(
 ) -> None:
     run("evaluate", _best(run_folder), *ROOMS, rooms, "hydra.run.dir=again")
     assert results(tmp_path / "again") == results(run_folder)
+    with pytest.raises(SystemExit, match=r"hydra\.run\.dir: found .*again, the folder of another"):
+        run("evaluate", _best(run_folder), *ROOMS, rooms, "hydra.run.dir=again")
     confusions = [results(run_folder)["confusion"]]
     for number, changes in enumerate(
         (
@@ -164,7 +166,7 @@ def test_an_exported_network_has_the_figures_of_its_run(
         ({"unmapped": "unmapped=often"}, "unmapped: found often; expected 'unknown' or 'never'"),
         ({"task": "task=depth"}, "checkpoint: found a network that predicts pixel_classes"),
         ({"data": "data=synthshapes"}, "data.inputs: found"),
-        ({"optimizer": "optimizer.lr=1"}, "optimizer: found a value; .*does not read it"),
+        ({"optimizer": "optimizer.lr=1"}, "optimizer.lr: found a value; .*does not read it"),
         ({"checkpoint": "checkpoint=none.onnx"}, r"checkpoint: found none\.onnx"),
     ],
 )

@@ -117,6 +117,11 @@ def test_without_validation_the_last_epoch_is_tested(rooms: str, tmp_path: Path,
     assert results(tmp_path / "run")["images"] == 2
     with pytest.raises(SystemExit, match=r"hydra\.run\.dir: found .*run, the folder of another"):
         run("train", *SETTINGS, rooms, *typed, "hydra.run.dir=run")
+    config = (tmp_path / "run" / "config.yaml").read_text()
+    assert "max_epochs: 2" in config
+    with pytest.raises(SystemExit, match=r"network\.widths: found a value; .*start a new run"):
+        run("train", "resume=run", "network.widths=[8]")
+    assert (tmp_path / "run" / "config.yaml").read_text() == config
 
 
 @pytest.mark.parametrize("limit", ["debug=fast", "+trainer.limit_test_batches=1"])
