@@ -52,10 +52,10 @@ def _table(level: int, dtype: np.dtype[Any], rounds: int) -> Table:
 
     step = 5 if level >= _LARGE else 1
     faces, render = range(0, grid.num_images, step), _pyequilib(panorama, grid)
-    theirs = np.stack(list(map(render, faces)))  # not interpolated across the seam and the poles
-    side = theirs.shape[1]
+    equilib = np.stack(list(map(render, faces)))  # not interpolated across the seam and the poles
+    side = equilib.shape[1]
     ours = equirect_to_tangent(panorama, grid, faces)[:, :side, :side].astype(np.float64)
-    is_same = np.abs(ours - theirs).max(axis=-1) <= 4
+    is_same = np.abs(ours - equilib).max(axis=-1) <= 4
     expect_agreement(LIBRARY, float(is_same.mean()), 0.97)
     four = [3, 20, 41, 77]
     alternatives = [

@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.unet import check_size
 from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
@@ -75,12 +74,7 @@ class HarmonicNetwork(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores of every pixel of the images.
-
-        Raises:
-            SettingError: The images are not whole equirectangular images of the level.
-        """
-        check_size(images, self, size=self.fixed_size)
+        """Return scores of every pixel of the images."""
         with torch.autocast(images.device.type, enabled=False):  # transforms need float32
             scores: Tensor = self.network(images.float())
         return scores

@@ -6,8 +6,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.unet import check_size
-
 _ENCODERS = (32, 64, 128, 256)
 _DECODERS = ((512, 256), (256, 128), (128, 64), (64, 32))
 """Bottleneck and output channels, coarsest first."""
@@ -74,12 +72,7 @@ class HexUNet(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch channels height width"]
     ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores of every pixel.
-
-        Raises:
-            SettingError: A side is not a multiple of the network's stride, 16.
-        """
-        check_size(images, self, multiple=self.size_multiple)
+        """Return scores of every pixel."""
         skips = []
         x = images
         for encoder in self.encoders:

@@ -141,7 +141,7 @@ class _TransformersNetwork(nn.Module):
         """
         if self._bgr:
             images = torch.cat([images[:, :3].flip(1), images[:, 3:]], dim=1)
-        check_size(images, self.network, multiple=self.size_multiple)
+        check_size(images.shape[-2:], self.network, self.size_multiple, None)
         return images
 
 

@@ -299,5 +299,5 @@ class IcoCNN(ResidualUNet):
         Raises:
             SettingError: The images are not signals on the vertices of the network's level.
         """
-        check_size(images, self, size=self.fixed_size)
+        check_size(images.shape[-2:], self, 1, self.fixed_size)
         return super().forward(images)

@@ -195,7 +195,7 @@ class MappedConv(nn.Module):
         Raises:
             SettingError: The signals are images, or have another number of positions.
         """
-        check_size(signals, self, size=self.fixed_size)
+        check_size(signals.shape[-2:], self, 1, self.fixed_size)
         weight = self.weight.transpose(1, 2).flatten(1)
         values = functional.linear(collect(signals, self.table), weight, self.bias)
         return values.transpose(1, 2).unsqueeze(2)

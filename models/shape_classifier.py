@@ -5,7 +5,7 @@ from __future__ import annotations
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from models.unet import Down, check_size
+from models.unet import Down
 
 _WIDTHS = (1, 4, 16, 64)
 """Channels after the first convolution and after each residual block, in units of `width`."""
@@ -52,12 +52,7 @@ class ShapeClassifier(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch views channels height width"]
     ) -> Float[Tensor, "batch classes"]:
-        """Return class scores of shapes, each seen in any number of views.
-
-        Raises:
-            SettingError: A side is not a multiple of the network's stride, 16.
-        """
-        check_size(images, self, multiple=self.size_multiple)
+        """Return class scores of shapes, each seen in any number of views."""
         features = self.features(images.flatten(0, 1)).unflatten(0, images.shape[:2])
         scores: Tensor = self.head(self.dropout(features.mean(dim=(1, 3, 4))))
         return scores

@@ -174,48 +174,32 @@ class UNet(ResidualUNet):
         )
         self.size_multiple = 2**fewer
 
-    def forward(
-        self, images: Float[Tensor, "batch channels height width"]
-    ) -> Float[Tensor, "batch classes height width"]:
-        """Return scores of every pixel.
-
-        Raises:
-            SettingError: A side is not a multiple of the network's stride (32 by default).
-        """
-        check_size(images, self, multiple=self.size_multiple)
-        return super().forward(images)
-
 
 def check_size(
-    images: Tensor,
-    network: nn.Module,
-    *,
-    multiple: int = 1,
-    size: tuple[int, int] | None = None,
+    size: Sequence[int], network: nn.Module, multiple: int, only: tuple[int, int] | None
 ) -> None:
     """Refuse images of a size that a network cannot take.
 
     Args:
-        images: ``(…, h, w)``.
+        size: Rows and columns of the images.
         network: Network, for the message.
         multiple: Number of which both sides have to be multiples: the network's stride.
-        size: Rows and columns that the images must have; None for any.
+        only: Rows and columns that the images must have; None for any.
 
     Raises:
         SettingError: The images have another size.
     """
-    found = images.shape[-2], images.shape[-1]
-    if found == size or (size is None and not any(side % multiple for side in found)):
+    if tuple(size) == only or (only is None and not any(side % multiple for side in size)):
         return
-    if size is None:
+    if only is None:
         expected = f"sides that are multiples of {multiple}"
         remedy = (
             f"Set representation.crop_multiple={multiple}, or choose another representation.dim, "
             "level or network. Signals on an icosphere need a network such as network=ugscnn."
         )
     else:
-        expected = width_height(size)
-        kind = "icosphere, with its elements" if size[0] == 1 else "erp"
+        expected = width_height(only)
+        kind = "icosphere, with its elements" if only[0] == 1 else "erp"
         remedy = f"Set representation={kind}, and network.level to the level of the images."
     subject = f"image size for the {type(network).__name__}"
-    raise SettingError(subject, found=width_height(found), expected=expected, remedy=remedy)
+    raise SettingError(subject, found=width_height(size), expected=expected, remedy=remedy)

@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.harmonic_network import pixel_row_weights, use_pixel_rows
-from models.unet import check_size
 from tangent_train.errors import of_extra
 from tangent_train.geometry import equirect_shape
 
@@ -101,10 +100,10 @@ class ZonalClassifier(nn.Module):
         anchors: int = 8,
     ) -> None:
         super().__init__()
-        self.shape = equirect_shape(level)
+        self.fixed_size = equirect_shape(level)
         self.branches = [list(branch) for branch in branches]
         self.layers = nn.ModuleList()
-        taken, shape = [len(branch) for branch in branches], self.shape
+        taken, shape = [len(branch) for branch in branches], self.fixed_size
         for number, width in enumerate(width for width in widths for _ in range(2)):
             rows = shape[0]
             if _is_halving(number):
@@ -120,12 +119,7 @@ class ZonalClassifier(nn.Module):
     def forward(
         self, images: Float[Tensor, "batch views channels height width"]
     ) -> Float[Tensor, "batch classes"]:
-        """Return class scores of shapes; several views of a shape are averaged.
-
-        Raises:
-            SettingError: The images are not whole equirectangular images of the level.
-        """
-        check_size(images, self, size=self.shape)
+        """Return class scores of shapes; several views of a shape are averaged."""
         flat = images.flatten(0, 1)
         features = [flat[:, branch] for branch in self.branches]
         layers: Any = self.layers

@@ -18,7 +18,6 @@ import torch
 from numpy.typing import NDArray
 
 from studies.output import Row, save
-from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.heads.alignment import (
     align_views,
     distance_of,
@@ -27,6 +26,7 @@ from tangent_train.heads.alignment import (
     sphere_points,
 )
 from tangent_train.io.pixel_files import read_depth_m
+from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import HorizontalRepresentation
 
 _RINGS = (

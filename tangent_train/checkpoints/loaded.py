@@ -21,13 +21,13 @@ from torch import Tensor, nn
 from datamodules.core.inputs import Input, Normalization, channel_names
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.checkpoints.outputs import OutputNetwork
 from tangent_train.config.build import filled
 from tangent_train.config.from_file import build_from_file, without_weights
 from tangent_train.errors import DataError, SettingError, first_line, wrong_field
 from tangent_train.files import load_plain
 from tangent_train.io.gpano import Fill
+from tangent_train.kinds import DepthKind, ScoreKind
 
 METADATA_KEY = "tangent_train"
 """Key of the description of a network: in a checkpoint, in the ``metadata_props`` of an ONNX file

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from models.distortion_aware import make_distortion_aware
-from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.errors import SettingError, width_height
+from tangent_train.kinds import ScoreKind
 
 _MAP = 3
 """Number of dimensions of labels or depth without an axis of channels."""

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 from rich import get_console
 from rich.text import Text
 
-from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.config.settings import ImportSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError, printable, width_height
 from tangent_train.files import check_new
+from tangent_train.kinds import DepthKind, ScoreKind
 
 if TYPE_CHECKING:
     from tangent_train.checkpoints.loaded import LoadedNetwork

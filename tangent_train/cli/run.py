@@ -20,6 +20,7 @@ from torch import nn
 from datamodules.core.image_module import ImageDataModule
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
+from models.unet import check_size
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
 from tangent_train.callbacks.pictures import Pictures
 from tangent_train.callbacks.progress import ProgressBar
@@ -151,7 +152,7 @@ class Run:
     def _report(
         self, checkpoint: Path, groups: Mapping[str, list[int]], callbacks: Sequence[Callback]
     ) -> None:
-        """Write the results, with the scores of each group of images (`LabeledData.groups`)."""
+        """Write the results, with the scores of each group of images (`DataModule.groups`)."""
         head, data, task = self.task.head, self.data, self.task
         # A relative path stays right when the folder is moved.
         is_inside = checkpoint.is_relative_to(self.folder)
@@ -213,6 +214,7 @@ def build(settings: RunSettings, file: Path | None = None, trust: Sequence[str] 
         network = build_from_config(section, "network")
     else:
         network = build_from_file(section, "network", file, trust)
+    check_size(data.representation.image_size, network, *declared_sizes(network))
     return data, build_task(settings, data, network, head)
 
 

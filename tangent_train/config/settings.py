@@ -29,9 +29,9 @@ from pydantic import (
 )
 from pydantic.fields import FieldInfo
 
-from tangent_train.checkpoints.kinds import Align, DepthKind, ScoreKind
 from tangent_train.errors import DataError, SettingError, wrong_setting
 from tangent_train.files import config_folder
+from tangent_train.kinds import Align, DepthKind, ScoreKind
 
 
 def _as_list(value: Any) -> Any:

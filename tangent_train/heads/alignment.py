@@ -34,9 +34,9 @@ from scipy.sparse.linalg import spsolve
 from torch import Tensor
 from torch.nn import functional
 
-from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import icosphere, lonlat_to_equirect, ray_lengths, xyz_to_lonlat
+from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import Views

@@ -174,7 +174,7 @@ class Head(nn.Module, ABC):
 
     @property
     def facts(self) -> dict[str, str]:
-        """Facts that the scores depend on besides those of the data, see `LabeledData.facts`."""
+        """Facts that the scores depend on besides those of the data, see `DataModule.facts`."""
         return {}
 
     def mode_of(self, monitor: str) -> str:

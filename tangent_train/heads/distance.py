@@ -17,7 +17,6 @@ from torch import Tensor
 
 from datamodules.core.depth import STEPS_PER_M
 from datamodules.core.label_map import DISTANCE
-from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.errors import SettingError, of_extra
 from tangent_train.files import write_bytes
 from tangent_train.geometry import equirect_to_lonlat, lonlat_to_xyz, to_right_handed
@@ -26,6 +25,7 @@ from tangent_train.heads import pictures
 from tangent_train.heads.base import RGB, Head, PredictedImage, Scores
 from tangent_train.heads.classes import exact
 from tangent_train.io.pixel_files import most_depth_m, read_depth_m, write_depth_m
+from tangent_train.kinds import Align, DepthKind
 from tangent_train.metrics import depth as metrics
 from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering import Blend

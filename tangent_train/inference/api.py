@@ -35,7 +35,6 @@ from datamodules.core.label_map import (
     plain_name,
     read_label_map,
 )
-from tangent_train.checkpoints.kinds import Align, DepthKind
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.errors import SettingError, check_choice, width_height
 from tangent_train.geometry import PinholeGrid
@@ -53,6 +52,7 @@ from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
 from tangent_train.io.gpano import Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
+from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.forward import Pixels, blend_of, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic

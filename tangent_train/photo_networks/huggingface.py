@@ -12,11 +12,11 @@ from torch import Tensor
 
 from datamodules.core.inputs import Normalization
 from models.huggingface import DEPTH, SEGMENTATION, architecture, network_types
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import DataError, SettingError, first_line
 from tangent_train.files import read_json
 from tangent_train.imports import hide_output, offline
+from tangent_train.kinds import DepthKind
 from tangent_train.photo_networks.network import (
     USUAL_SIZE,
     PhotoNetwork,

@@ -13,7 +13,6 @@ from torch import Tensor
 from datamodules.core.inputs import normalize_channels
 from datamodules.core.label_map import DISTANCE
 from models.onnx_network import OnnxNetwork
-from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.loaded import (
     METADATA_KEY,
     LoadedNetwork,
@@ -34,6 +33,7 @@ from tangent_train.inference.views import (
     photo_network_settings,
 )
 from tangent_train.io.image_files import composed
+from tangent_train.kinds import ScoreKind
 from tangent_train.photo_networks.network import PhotoNetwork
 
 _PHOTO_LEVELS = (5, 13)

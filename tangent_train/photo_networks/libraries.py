@@ -16,13 +16,13 @@ from torchvision.models import WeightsEnum
 from datamodules.core.inputs import Normalization
 from models.onnx_network import OnnxNetwork
 from models.pretrained import fetch_tensors, load_tensors, tensors_for
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import completed_settings
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
 from tangent_train.errors import SettingError, check_choice, first_line
 from tangent_train.files import read_json
 from tangent_train.imports import offline
+from tangent_train.kinds import DepthKind
 from tangent_train.photo_networks import huggingface
 from tangent_train.photo_networks.network import (
     USUAL_SIZE,

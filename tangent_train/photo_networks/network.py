@@ -11,9 +11,9 @@ from torch import Tensor, nn
 
 from datamodules.core.inputs import Normalization
 from models.pretrained import read_tensors
-from tangent_train.checkpoints.kinds import DepthKind, ScoreKind
 from tangent_train.errors import DataError, first_line
 from tangent_train.files import read_json
+from tangent_train.kinds import DepthKind, ScoreKind
 
 USUAL_SIZE = (512, 512)
 """Rows and columns of the photos if they are unknown."""

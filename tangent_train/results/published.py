@@ -3,7 +3,7 @@
 ``published.csv`` contains published scores with their sources, one score per line, and those of
 single classes of Stanford2D3DS: in percent, or in the unit of the score, see `ScoreColumn`.
 ``protocols.yaml`` contains the facts that make scores
-comparable (`LabeledData.facts`, `Task.facts`), for each ``protocol`` of the scores. A score
+comparable (`DataModule.facts`, `Head.facts`), for each ``protocol`` of the scores. A score
 stands beside a result if all facts are the same; else the facts that differ are named.
 
 Of the paper (Eder, Shvets, Lim and Frahm, CVPR 2020, arXiv:1912.09390), the file contains the

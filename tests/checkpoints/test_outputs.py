@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tangent_train.checkpoints.kinds import ScoreKind
 from tangent_train.checkpoints.outputs import OutputNetwork, as_logits
+from tangent_train.kinds import ScoreKind
 
 
 class LabelMaps(nn.Module):

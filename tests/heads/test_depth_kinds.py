@@ -8,7 +8,6 @@ from typing import Any, get_args
 import pytest
 import torch
 
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.geometry import camera_matrix_from_fov, ray_lengths
 from tangent_train.heads.alignment import (
     along_rays,
@@ -17,6 +16,7 @@ from tangent_train.heads.alignment import (
     from_distance,
     is_disparity,
 )
+from tangent_train.kinds import DepthKind
 
 
 @pytest.mark.parametrize("kind", get_args(DepthKind))

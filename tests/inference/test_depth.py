@@ -14,7 +14,6 @@ from torch import Tensor, nn
 
 import tangent_train as tt
 from datamodules.core.inputs import Normalization
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.errors import SettingError
@@ -32,6 +31,7 @@ from tangent_train.inference.api import Network, apply
 from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector, view_settings
+from tangent_train.kinds import DepthKind
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.inference.trained import CUBE, ERP, ICOSPHERE, TANGENT, trained_network
 

@@ -12,10 +12,10 @@ from torch import nn
 
 from datamodules.core.inputs import RGB_NORMALIZATION, RGBD_NORMALIZATION
 from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import METADATA_KEY, LoadedNetwork
 from tangent_train.config.build import build_from_config
 from tangent_train.geometry import equirect_directions
+from tangent_train.kinds import DepthKind
 
 CLASS_NAMES = ("unknown", "dark", "green", "bright")
 

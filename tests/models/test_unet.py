@@ -9,7 +9,8 @@ import torch
 from torch import nn
 
 from models import HexUNet, IcoCNN, UNet, ZonalClassifier
-from models.unet import Down
+from models.unet import Down, check_size
+from tangent_train.checkpoints.loaded import declared_sizes
 from tangent_train.errors import SettingError
 
 
@@ -54,17 +55,17 @@ def test_scores_have_the_size_of_the_images_and_every_parameter_learns(network: 
 
 
 @pytest.mark.parametrize(
-    ("network", "shape", "message"),
+    ("network", "size", "message"),
     [
-        (UNet(3, 4), (3, 48, 64), r"64 × 48 \(.*\); expected sides that are multiples of 32"),
-        (HexUNet(3, 4), (3, 24, 32), "HexUNet: found 32 × 24 .* multiples of 16"),
-        (UNet(3, 4), (3, 1, 2562), "2562 × 1 .*network=ugscnn"),
-        (IcoCNN(3, 4, 1, (4, 4)), (3, 32, 64), "found 64 × 32 .* 42 × 1 .*=icosphere"),
-        (ZonalClassifier(2, 4, 3), (1, 2, 32, 64), "found 64 × 32 .* 32 × 16 .*representation=erp"),
+        (UNet(3, 4), (48, 64), r"64 × 48 \(.*\); expected sides that are multiples of 32"),
+        (HexUNet(3, 4), (24, 32), "HexUNet: found 32 × 24 .* multiples of 16"),
+        (UNet(3, 4), (1, 2562), "2562 × 1 .*network=ugscnn"),
+        (IcoCNN(3, 4, 1, (4, 4)), (32, 64), "found 64 × 32 .* 42 × 1 .*=icosphere"),
+        (ZonalClassifier(2, 4, 3), (32, 64), "found 64 × 32 .* 32 × 16 .*representation=erp"),
     ],
 )
 def test_images_that_do_not_fit_are_refused(
-    network: nn.Module, shape: tuple[int, ...], message: str
+    network: nn.Module, size: tuple[int, int], message: str
 ) -> None:
     with pytest.raises(SettingError, match=message):
-        network(torch.zeros(1, *shape))
+        check_size(size, network, *declared_sizes(network))

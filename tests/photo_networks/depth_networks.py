@@ -10,8 +10,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import LoadedNetwork
+from tangent_train.kinds import DepthKind
 from tangent_train.photo_networks import PhotoNetwork
 from tests.photo_networks.huggingface_networks import Made, transformers
 

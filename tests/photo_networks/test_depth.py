@@ -12,10 +12,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.checkpoints.loaded import read_description
 from tangent_train.errors import DataError, SettingError
 from tangent_train.heads.alignment import depth_of_output
+from tangent_train.kinds import DepthKind
 from tangent_train.photo_networks import huggingface, import_network
 from tangent_train.photo_networks.huggingface import declared_kind
 from tests.photo_networks import depth_networks as depth

@@ -12,10 +12,10 @@ from torch import Tensor, nn
 from torch.utils.data import default_collate
 
 from datamodules.core.dataset import Sample
-from tangent_train.checkpoints.kinds import DepthKind
 from tangent_train.errors import SettingError
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads.alignment import from_distance, is_metric
+from tangent_train.kinds import DepthKind
 from tangent_train.metrics.depth import depth_scores
 from tangent_train.rendering import PerspectiveRepresentation, TangentRepresentation
 from tangent_train.results.evaluation import evaluation_result, result_tables
