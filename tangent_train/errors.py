@@ -151,6 +151,12 @@ def at_least(name: str, value: object, least: int) -> int:
     return int(value)
 
 
+def check_choice(name: str, value: str, allowed: tuple[str, ...]) -> None:
+    """Raise SettingError unless a value is one of those allowed."""
+    if value not in allowed:
+        raise SettingError(name, found=repr(value), expected=" or ".join(map(repr, allowed)))
+
+
 @contextmanager
 def of_extra(extra: str, subject: object, remedy: str = "") -> Iterator[None]:
     """Explain a missing package in a block that imports packages of an extra of tangent-train.

@@ -36,7 +36,7 @@ from datamodules.core.label_map import (
     read_label_map,
 )
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
-from tangent_train.errors import SettingError, width_height
+from tangent_train.errors import SettingError, check_choice, width_height
 from tangent_train.geometry import PinholeGrid
 from tangent_train.heads import head_of
 from tangent_train.heads.alignment import AlignedMosaic
@@ -54,8 +54,7 @@ from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.checks import blend_of, check_choice, check_panorama
-from tangent_train.rendering.forward import Pixels
+from tangent_train.rendering.forward import Pixels, blend_of, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
 

@@ -28,7 +28,7 @@ from tangent_train.inference.views import ViewSelector
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import CubemapRepresentation
 from tangent_train.rendering.resampling import resize
-from tangent_train.rendering.sampling import sphere_rays
+from tangent_train.rendering.tables import sphere_rays
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

@@ -19,10 +19,9 @@ from tangent_train.checkpoints.loaded import (
     load_network,
     write_onnx_description,
 )
-from tangent_train.errors import SettingError, first_line, of_extra
+from tangent_train.errors import SettingError, check_choice, first_line, of_extra
 from tangent_train.files import atomic_path
 from tangent_train.imports import hide_output
-from tangent_train.rendering.checks import check_choice
 
 SUFFIXES = (".onnx", ".safetensors")
 

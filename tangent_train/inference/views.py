@@ -14,14 +14,13 @@ from omegaconf import OmegaConf
 
 from datamodules.core.depth import distance_from_z_depth, resize_depth
 from tangent_train.config.build import build_from_config
-from tangent_train.errors import SettingError, counted, width_height
+from tangent_train.errors import SettingError, check_choice, counted, width_height
 from tangent_train.files import config_folder
 from tangent_train.geometry import TangentGrid
 from tangent_train.inference.images import InputImage
 from tangent_train.io.gpano import PanoramaArea
 from tangent_train.orientation.gravity import upright_rotation
 from tangent_train.rendering import PerspectiveRepresentation
-from tangent_train.rendering.checks import check_choice
 from tangent_train.rendering.representations.pinhole import PinholeRepresentation, level_list
 from tangent_train.rendering.representations.views import PinholeViews
 from tangent_train.rendering.resampling import resize

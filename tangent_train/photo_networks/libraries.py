@@ -19,7 +19,7 @@ from models.pretrained import fetch_tensors, load_tensors, tensors_for
 from tangent_train.checkpoints.loaded import completed_settings
 from tangent_train.config.build import build_from_config
 from tangent_train.config.from_file import build_from_file
-from tangent_train.errors import SettingError, first_line
+from tangent_train.errors import SettingError, check_choice, first_line
 from tangent_train.files import read_json
 from tangent_train.imports import offline
 from tangent_train.kinds import DepthKind
@@ -31,7 +31,6 @@ from tangent_train.photo_networks.network import (
     saved_folder,
     tensors_in,
 )
-from tangent_train.rendering.checks import check_choice
 
 _AUXILIARY = "aux_classifier.", "classification_head."
 """Prefixes of the tensors of heads that are not used."""

@@ -4,15 +4,19 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
-from tangent_train.rendering.backward import tangent_to_equirect, tangent_to_labels
-from tangent_train.rendering.checks import Blend
-from tangent_train.rendering.forward import Interpolation, equirect_to_tangent, rotate_equirect
+from tangent_train.rendering.forward import (
+    Blend,
+    Interpolation,
+    equirect_to_tangent,
+    rotate_equirect,
+)
+from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
-from tangent_train.rendering.representations.horizontal import HorizontalRepresentation
 from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
 from tangent_train.rendering.representations.perspective import PerspectiveRepresentation
 from tangent_train.rendering.representations.pinhole import (
     CubemapRepresentation,
+    HorizontalRepresentation,
     TangentRepresentation,
 )
 from tangent_train.rendering.representations.views import Representation

@@ -1,36 +1,51 @@
-"""Render panoramas to tangent images, and to rotated panoramas."""
+"""Render panoramas to tangent images, and to rotated panoramas.
+
+Arrays are sampled by `sample_map`, tensors by `sample_tensor`.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, Literal, TypeVar
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
+from torch.nn.functional import grid_sample
 
+from tangent_train.errors import SettingError, check_choice
 from tangent_train.geometry import PinholeGrid, checked_rotation
 from tangent_train.geometry.grids import Faces
-from tangent_train.rendering.checks import check_panorama
-from tangent_train.rendering.sampling import (
+from tangent_train.rendering.tables import (
     EquirectMap,
+    Positions,
+    forward_map,
+    forward_positions,
     map_dtype,
-    nearest_equirect_index,
     positions_of_rays,
-    sample_map,
-    sample_tensor,
     sphere_rays,
 )
-from tangent_train.rendering.tables import Positions, forward_map, forward_positions
 
 Interpolation = Literal["bilinear", "nearest"]
+Blend = Literal["nearest", "feather"]
+"""``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
+images that cover a pixel, with weights that fall to 0 at the borders of the images."""
 
 Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
 """A tensor or an array; results are of the same kind."""
 
 _TOGETHER = 2**16
 """Number of pixels sampled in one call: small images are grouped, to save calls."""
+_REMAP_LIMIT = 32767
+"""cv2.remap requires sides below SHRT_MAX."""
+_REMAP_BILINEAR = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float32))
+_SAME_SIZE = {1: np.uint8, 2: np.uint16, 4: np.float32, 8: np.float64}
+"""Nearest sampling copies bytes: a dtype of the same size stands for every other."""
+_COPIED = 36
+"""Largest part of a panorama that is copied, in bytes per position: copying more takes longer."""
 
 
 def equirect_to_tangent(
@@ -128,3 +143,229 @@ def _rotation_map(
     """Return source positions of all pixels; cached for the depth and labels of a panorama."""
     inverse = np.frombuffer(rotation).reshape(1, 3, 3).transpose(0, 2, 1)
     return EquirectMap.of(*positions_of_rays(inverse, sphere_rays(shape), shape, dtype), shape)
+
+
+def sample_map(
+    table: EquirectMap,
+    image: NDArray[np.generic],
+    interpolation: str,
+    out: NDArray[np.generic],
+) -> None:
+    """Sample a panorama; longitude wraps, and rows reflect at the poles.
+
+    `cv2.remap` samples uint8, uint16 and float32 bilinearly, and the nearest pixel of all dtypes.
+    OpenCV 4 may round positions to 1/32 pixel, which is invisible in 8-bit images; OpenCV 5 does
+    not. Other dtypes are sampled without rounding.
+
+    Args:
+        table: Positions ``(h, w)``.
+        image: ``(H, W[, C])``, contiguous.
+        interpolation: ``bilinear`` or ``nearest``.
+        out: ``(h, w[, C])`` contiguous, same dtype, written.
+    """
+    is_nearest = interpolation == "nearest"
+    if is_nearest:
+        plain = _SAME_SIZE[image.dtype.itemsize]
+        image, out = image.view(plain), out.view(plain)
+    top, bottom, left, right = table.part.tolist()
+    part = image[top:bottom, left:right]
+    if right > image.shape[1]:
+        part = np.concatenate([part, image[top:bottom, : right - image.shape[1]]], axis=1)
+    is_small = max(*part.shape[:2], *table.u.shape) < _REMAP_LIMIT
+    if is_small and (is_nearest or image.dtype in _REMAP_BILINEAR):
+        _remap(table, part, is_nearest, out)
+    elif is_nearest:
+        row = np.rint(table.v).astype(np.intp).clip(0, len(part) - 1)
+        out[:] = part[row, np.rint(table.u).astype(np.intp) % part.shape[1]]
+    else:
+        out[:] = _interpolated(part, table.u, table.v)
+    if not is_nearest and len(table.polar):
+        _write_polar(table, image, out)
+
+
+def _remap(
+    table: EquirectMap, part: NDArray[np.generic], is_nearest: bool, out: NDArray[np.generic]
+) -> None:
+    """Sample a part of a panorama with `cv2.remap`."""
+    # Copying the part row by row takes less time than waiting for memory at every position.
+    is_copied = part.dtype.itemsize < 4 and part.nbytes <= _COPIED * table.u.size
+    u, v = (line.astype(np.float32, copy=False) for line in table[:2])
+    if is_nearest and len(table.polar):
+        v = v.clip(0, len(part) - 1)
+    flag = cv2.INTER_NEAREST if is_nearest else cv2.INTER_LINEAR
+    channels = 1 if part.ndim == 2 else part.shape[2]
+    is_padded = is_copied and channels % 3 == 0 and not is_nearest
+    if part.ndim == 2 or (channels in (3, 4) and not is_padded):
+        part = np.ascontiguousarray(part) if is_copied else part
+        cv2.remap(part, u, v, flag, dst=out, borderMode=cv2.BORDER_WRAP)
+        return
+    # cv2 is fastest with 4 channels. It refuses more than 4, or rounds their positions.
+    several = 3 if channels % 3 == 0 else 1
+    for first in range(0, channels, several):
+        group = part[..., first : first + several]
+        if is_padded:
+            group = cv2.cvtColor(group, cv2.COLOR_RGB2RGBA)
+        sampled = cv2.remap(group, u, v, flag, borderMode=cv2.BORDER_WRAP)
+        if is_padded:
+            sampled = cv2.cvtColor(sampled, cv2.COLOR_RGBA2RGB)
+        out[..., first : first + several] = sampled.reshape(*out.shape[:2], several)
+
+
+def _write_polar(table: EquirectMap, image: NDArray[np.generic], out: NDArray[np.generic]) -> None:
+    """Sample positions next to the poles, where cv2 would continue at the other pole."""
+    u, v = (line.reshape(-1)[table.polar].astype(np.float64) for line in table[:2])
+    v += table.part[0]
+    v = np.where(v < 0, v, v - (len(image) - 2))
+    values = _interpolated(image[[0, -1]], u + table.part[2], v)
+    out.reshape(table.u.size, -1)[table.polar] = values.reshape(len(u), -1)
+
+
+def _interpolated(image: NDArray[Any], u: NDArray[Any], v: NDArray[Any]) -> NDArray[np.float64]:
+    """Return float64 values ``(…[, C])`` of a whole or partial panorama ``(H, W[, C])``."""
+    shape = image.shape[:2]
+    planes = np.moveaxis(image.reshape(*shape, -1), -1, 0).astype(np.float64)
+    columns, rows = (torch.from_numpy(line.reshape(-1)).double() for line in (u, v))
+    values = sample_tensor(torch.from_numpy(planes), columns, rows).numpy().T
+    values = np.rint(values) if image.dtype.kind in "ui" else values
+    return values.reshape(*u.shape, *image.shape[2:])
+
+
+def sample_tensor(image: Tensor, u: Tensor, v: Tensor) -> Tensor:
+    """Interpolate a panorama bilinearly, differentiably on any device.
+
+    Longitude wraps. A row beyond a pole is the reflected row, shifted by half a revolution.
+
+    Args:
+        image: ``(C, H, W)`` floating-point values.
+        u: ``(P,)`` columns in [−1, 2 W].
+        v: ``(P,)`` rows in [−½, H − ½].
+
+    Returns:
+        ``(C, P)`` values of the dtype of the image.
+    """
+    height, width = image.shape[-2:]
+    planes = image if image.dtype == torch.float64 else image.float()
+    beyond = [_half_revolution(planes[:, [row]]) for row in (0, -1)]
+    tall = torch.cat([beyond[0], planes, beyond[1]], dim=1)
+    padded = torch.cat([tall[..., -1:], tall, tall[..., :1]], dim=2)
+    x = (2 * torch.where(u < width, u, u - width) + 3) / (width + 2) - 1
+    positions = torch.stack([x, (2 * v + 3) / (height + 2) - 1], dim=-1)[None, None]
+    with torch.autocast(image.device.type, enabled=False):
+        values = grid_sample(
+            padded[None], positions.to(planes.dtype), padding_mode="border", align_corners=False
+        )
+    return values[0, :, 0].to(image.dtype)
+
+
+def _half_revolution(row: Tensor) -> Tensor:
+    """Return a row ``(C, 1, W)`` rotated by 180°; means of two columns if W is odd."""
+    width = row.shape[-1]
+    return (row.roll(width // 2, -1) + row.roll((width + 1) // 2, -1)) / 2
+
+
+def nearest_equirect_index(u: Tensor, v: Tensor, shape: tuple[int, int]) -> Tensor:
+    """Return the nearest pixel at positions in an ERP; half-way between two, the even one.
+
+    Args:
+        u: ``(P,)`` columns, any real number.
+        v: ``(P,)`` rows in [−½, H − ½].
+        shape: ``(H, W)``.
+
+    Returns:
+        ``(P,)`` int64 flat indices.
+    """
+    height, width = shape
+    row = v.round().long().clamp(0, height - 1)
+    return row * width + u.round().long() % width
+
+
+def check_interpolation(interpolation: str, blend: str = "nearest") -> None:
+    """Raise SettingError unless the interpolation exists and can be combined with the blend."""
+    check_choice("interpolation", interpolation, ("bilinear", "nearest"))
+    if interpolation == "nearest" and blend != "nearest":
+        raise SettingError(
+            "interpolation",
+            found=f"'nearest' with blend {blend!r}",
+            expected="blend='nearest'",
+            remedy="Copied pixels cannot be averaged.",
+        )
+
+
+def blend_of(blend: Blend, *, is_overlapping: bool) -> Blend:
+    """Return the blend, or ``nearest`` for images that do not overlap.
+
+    Images without overlap meet at their edges, where feather weights are 0: the faces of a cube map
+    without a margin, and the panorama itself.
+
+    Args:
+        blend: Requested blend.
+        is_overlapping: True if every pixel is inside an image, not only on its outer edge.
+
+    Raises:
+        SettingError: There is no such blend.
+    """
+    check_choice("blend", blend, ("nearest", "feather"))
+    return blend if is_overlapping else "nearest"
+
+
+def check_shape(shape: Sequence[int]) -> tuple[int, int]:
+    """Return ``(H, W)`` as two integers; raise SettingError unless both are positive."""
+    whole = [isinstance(side, int | np.integer) and side > 0 for side in shape]
+    if len(whole) != 2 or not all(whole):
+        raise SettingError("shape", found=tuple(shape), expected="(height, width), both 1 or more")
+    return int(shape[0]), int(shape[1])
+
+
+def check_panorama(image: Tensor | NDArray[np.generic], interpolation: str) -> None:
+    """Raise SettingError unless a panorama, array or tensor, can be sampled."""
+    check_interpolation(interpolation)
+    array = isinstance(image, np.ndarray)
+    fits = image.ndim in (2, 3) and 0 not in image.shape if array else image.ndim >= 3
+    if not fits or 0 in image.shape[-2:]:
+        expected = "(H, W) or (H, W, C)" if array else "(..., C, H, W)"
+        raise SettingError("panorama", found=f"shape {tuple(image.shape)}", expected=expected)
+    _check_numbers("panorama", image, interpolation)
+
+
+def check_images(
+    name: str,
+    images: Tensor | NDArray[np.generic],
+    grid: PinholeGrid,
+    interpolation: str = "bilinear",
+) -> None:
+    """Raise SettingError unless there is an image of the right size for each face of a grid.
+
+    Args:
+        name: Name of the images in the message.
+        images: Tensor ``(..., N, C, h, w)`` or array ``(N, h, w[, C])``.
+        grid: Geometry of the images.
+        interpolation: Interpolation that will be used to sample them.
+    """
+    shape, sides = tuple(images.shape), (grid.num_images, *grid.size)
+    if isinstance(images, np.ndarray):
+        fits, expected = len(shape) in (3, 4) and shape[:3] == sides, "({}, {}, {}[, channels])"
+    else:
+        fits = len(shape) >= 4 and (shape[-4], *shape[-2:]) == sides
+        expected = "(..., {}, channels, {}, {})"
+    if not fits:
+        raise SettingError(
+            name,
+            found=f"shape {shape}",
+            expected=f"{expected.format(*sides)} for this grid",
+            remedy="All images of the grid are needed, in its order.",
+        )
+    _check_numbers(name, images, interpolation)
+
+
+def _check_numbers(name: str, values: Tensor | NDArray[np.generic], interpolation: str) -> None:
+    if isinstance(values, Tensor):
+        usable = interpolation == "nearest" or torch.is_floating_point(values)
+    else:
+        usable = values.dtype.kind in ("uif" if interpolation == "bilinear" else "buif")
+    if not usable:
+        raise SettingError(
+            name,
+            found=f"dtype {values.dtype}",
+            expected=f"numbers that {interpolation} interpolation can use",
+            remedy="Convert them to floats, or use interpolation='nearest' for labels and masks.",
+        )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from tangent_train.errors import SettingError
 from tangent_train.files import reserve
 from tangent_train.rendering import kernels
-from tangent_train.rendering.compiled import over_rows
+from tangent_train.rendering.kernels import over_rows
 
 if TYPE_CHECKING:
     from torch import Tensor

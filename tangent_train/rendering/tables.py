@@ -1,4 +1,9 @@
-"""Tables of positions per grid and panorama size, in a cache of limited size."""
+"""Tables of positions per grid and panorama size, in a cache of limited size.
+
+The ray of pixel (i, j) of a panorama or image is
+``(rows[i, 0] columns[0, j], rows[i, 0] columns[1, j], rows[i, 1])``, with the factors of
+`sphere_rays` or `plane_rays`.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +12,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from os import register_at_fork
 from threading import Lock
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -15,21 +20,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import PinholeGrid
+from tangent_train.geometry import PinholeGrid, equirect_latitudes, equirect_longitudes
 from tangent_train.rendering import kernels
-from tangent_train.rendering.compiled import njit_exact, over_rows
-from tangent_train.rendering.sampling import (
-    Array,
-    EquirectMap,
-    map_dtype,
-    plane_rays,
-    positions_of_rays,
-    sphere_rays,
-)
+from tangent_train.rendering.kernels import Array, njit_exact, over_rows
 
 Value = TypeVar("Value", bound=tuple[Any, ...])
 Positions = tuple[Tensor, Tensor]
 """Columns and rows ``(P,)`` in a panorama."""
+Rays = tuple[Array, Array]
+"""``(2, W)`` factors of the columns and ``(H, 2)`` factors of the rows, float64."""
 
 
 class TableCache:
@@ -363,3 +362,124 @@ def _write_spans(
                 first = math.floor(((middle + least) / (2 * math.pi) + 0.5) * width - 0.5)
                 last = math.ceil(((middle + most) / (2 * math.pi) + 0.5) * width - 0.5)
                 spans[m, i, 0], spans[m, i, 1] = first % width, min(last - first + 1, width)
+
+
+def sphere_rays(shape: tuple[int, int]) -> Rays:
+    """Return the rays of a panorama, unit directions: cos λ, sin λ and cos φ, sin φ."""
+    lat, lon = equirect_latitudes(shape[0]), equirect_longitudes(shape[1])
+    return np.stack([np.cos(lon), np.sin(lon)]), np.stack([np.cos(lat), np.sin(lat)], -1)
+
+
+def plane_rays(shape: tuple[int, int]) -> Rays:
+    """Return the rays ``(j, 1, i)`` of an image: homogeneous pixels in another order."""
+    height, width = shape
+    columns = np.stack([np.arange(width, dtype=np.float64), np.ones(width)])
+    return columns, np.stack([np.ones(height), np.arange(height, dtype=np.float64)], -1)
+
+
+def map_dtype(exact: bool, interpolation: str) -> np.dtype[np.floating]:
+    """Return the dtype of positions: float64 if `exact` and bilinear, else float32.
+
+    Nearest sampling uses the same positions for all dtypes.
+    """
+    return np.dtype(np.float64 if exact and interpolation == "bilinear" else np.float32)
+
+
+class EquirectMap(NamedTuple):
+    """Positions in an ERP, relative to the part of it that contains them.
+
+    Attributes:
+        u: ``(h, w)`` columns in the part, float32 or float64.
+        v: ``(h, w)`` rows in the part, same dtype.
+        polar: Flat indices of positions between a pole and the row next to it.
+        part: First row, row after the last, first column and column after the last, int64. Columns
+            W and higher are beyond the seam.
+    """
+
+    u: NDArray[np.floating]
+    v: NDArray[np.floating]
+    polar: NDArray[np.intp]
+    part: NDArray[np.int64]
+
+    @classmethod
+    def of(
+        cls, u: NDArray[np.floating], v: NDArray[np.floating], shape: tuple[int, int]
+    ) -> EquirectMap:
+        """Find the part that contains some positions.
+
+        Args:
+            u: ``(h, w)`` columns in [−½, W − ½], float32 or float64.
+            v: ``(h, w)`` rows in [−½, H − ½], same dtype.
+            shape: ``(H, W)`` of the ERP.
+        """
+        height, width = shape
+        polar = np.flatnonzero((v < 0) | (v > height - 1))
+        # Columns of the left half are rounded as if beyond the seam, so that all parts agree.
+        beyond, left_half = u + u.dtype.type(width), u < width / 2
+        u = np.where(left_half, beyond - u.dtype.type(width), u)
+        # An even offset keeps the choice between two equally near pixels, which is the even one.
+        top, left = (int(line.min()) // 2 * 2 for line in (v, u))
+        bottom, right = min(height, int(v.max()) + 2), int(u.max()) + 2
+        if u.min() < 0 or right - left > width / 2:
+            joined = np.where(left_half, beyond, u)
+            left, right = int(joined.min()) // 2 * 2, int(joined.max()) + 2
+            if right - left > width / 2:
+                left, right = 0, width
+            else:
+                u = joined
+        part = np.array((top, bottom, left, right))
+        return cls(u - u.dtype.type(left), v - u.dtype.type(top), polar, part)
+
+
+def positions_of_rays(
+    matrices: NDArray[np.float64],
+    rays: Rays,
+    shape: tuple[int, int],
+    dtype: np.dtype[np.floating],
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+    """Return the positions in an ERP of the rays of n canvases, stacked vertically.
+
+    Args:
+        matrices: ``(n, 3, 3)`` from the rays of each canvas to directions of any length.
+        rays: Rays of a canvas of ``(h, w)`` pixels.
+        shape: ``(H, W)`` of the ERP.
+        dtype: float32 or float64; the computation is float64 in both cases.
+
+    Returns:
+        Columns in [−½, W − ½] and rows in [−½, H − ½], ``(n h, w)``.
+    """
+    columns, rows = rays
+    u, v = np.empty((2, len(matrices) * len(rows), columns.shape[1]), dtype)
+    over_rows(_write_positions, *u.shape, np.ascontiguousarray(matrices), *rays, *shape, u, v)
+    return u, v
+
+
+@njit_exact
+def _write_positions(
+    start: int, stop: int, matrices: Array, columns: Array, rows: Array,
+    height: int, width: int, u: Array, v: Array,
+) -> None:  # fmt: skip
+    """Write ERP positions of the rays of stacked canvases, rows ``start:stop``.
+
+    Args:
+        start: First row.
+        stop: One past the last row.
+        matrices: ``(n, 3, 3)`` from each canvas's rays to directions of any length.
+        columns: ``(2, w)`` factors of the rays.
+        rows: ``(h, 2)`` factors of the rays.
+        height: Rows H of the ERP.
+        width: Columns W of the ERP.
+        u: ``(n h, w)`` columns in the ERP, written.
+        v: ``(n h, w)`` rows in the ERP, written.
+    """
+    for row in range(start, stop):
+        m = matrices[row // len(rows)]
+        i = row % len(rows)
+        c = rows[i, 1]
+        for j in range(columns.shape[1]):
+            a, b = rows[i, 0] * columns[0, j], rows[i, 0] * columns[1, j]
+            x = m[0, 0] * a + m[0, 1] * b + m[0, 2] * c
+            y = m[1, 0] * a + m[1, 1] * b + m[1, 2] * c
+            z = m[2, 0] * a + m[2, 1] * b + m[2, 2] * c
+            u[row, j] = (math.atan2(y, x) / (2 * math.pi) + 0.5) * width - 0.5
+            v[row, j] = (0.5 - math.atan2(z, math.sqrt(x * x + y * y)) / math.pi) * height - 0.5

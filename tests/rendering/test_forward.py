@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation, xyz_to_lonlat
-from tangent_train.rendering import equirect_to_tangent, sampling
+from tangent_train.rendering import equirect_to_tangent, forward, tables
 
 Array = NDArray[Any]
 TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
@@ -25,8 +25,8 @@ def _random(shape: tuple[int, ...], dtype: Any = np.float64) -> Array:
 def _sampled(image: Array, u: Any, v: Any, interpolation: Any = "bilinear") -> Array:
     u, v = (np.atleast_2d(np.asarray(line, np.float32)) for line in (u, v))
     out = np.empty((*u.shape, *image.shape[2:]), image.dtype)
-    table = sampling.EquirectMap.of(u, v, (image.shape[0], image.shape[1]))
-    sampling.sample_map(table, image, interpolation, out)
+    table = tables.EquirectMap.of(u, v, (image.shape[0], image.shape[1]))
+    forward.sample_map(table, image, interpolation, out)
     return out
 
 
@@ -86,7 +86,7 @@ def test_panoramas_too_large_for_opencv_are_rendered(
 ) -> None:
     image, grid = _random((32, 64, 3), dtype), TangentGrid(0, 4)
     expected = equirect_to_tangent(image, grid, interpolation=interpolation)
-    monkeypatch.setattr(sampling, "_REMAP_LIMIT", 8)
+    monkeypatch.setattr(forward, "_REMAP_LIMIT", 8)
     monkeypatch.setattr("cv2.remap", None)
     found = equirect_to_tangent(image, grid, interpolation=interpolation)
     np.testing.assert_allclose(found, expected, atol=1 if dtype == np.uint8 else 1e-5)

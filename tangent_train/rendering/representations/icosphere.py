@@ -16,6 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tangent_train.errors import check_choice
 from tangent_train.geometry import (
     equirect_directions,
     equirect_shape,
@@ -35,15 +36,17 @@ from tangent_train.geometry.icosphere import (
     nearest_vertices,
     sampling_points,
 )
-from tangent_train.rendering.checks import Blend, check_choice, check_panorama
-from tangent_train.rendering.forward import Interpolation, Pixels
+from tangent_train.rendering.forward import (
+    Blend,
+    Interpolation,
+    Pixels,
+    check_panorama,
+    sample_tensor,
+)
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity, vertical_rotations
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
 from tangent_train.rendering.resampling import resize
-from tangent_train.rendering.sampling import (
-    sample_tensor,
-)
 from tangent_train.rendering.tables import Value, cached
 
 ScoreInterpolation = Literal["barycentric", "nearest"]

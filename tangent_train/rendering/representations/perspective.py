@@ -24,7 +24,7 @@ from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import NO_OWNERS, CanvasGeometry
 from tangent_train.rendering.representations.views import Views
 from tangent_train.rendering.resampling import crop
-from tangent_train.rendering.sampling import plane_rays
+from tangent_train.rendering.tables import plane_rays
 
 _PAPER_FOV_DEG = 45.0
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid, ray_lengths
-from tangent_train.rendering.checks import Blend
-from tangent_train.rendering.forward import Interpolation, Pixels, equirect_to_tangent
+from tangent_train.rendering.forward import Blend, Interpolation, Pixels, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
 from tangent_train.rendering.tables import canvas_geometry, owners
 
