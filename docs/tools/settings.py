@@ -22,8 +22,6 @@ from tangent_train.results.published import facts, protocols, published_lines
 
 CONFIGS = config_folder()
 REFERENCE = Path(__file__).parents[1] / "reference"
-COMMANDS = ("train", "evaluate", "predict", "import", "export", "render", "transfer", "keypoints",
-            "prepare", "check")  # fmt: skip
 GROUPS = ("data", "representation", "network", "task", "optimizer", "scheduler", "trainer",
           "logger", "callbacks", "recipe", "debug", "sweep", "launcher")  # fmt: skip
 _MARK = "<!-- generated -->\n"
@@ -31,7 +29,7 @@ _MARK = "<!-- generated -->\n"
 
 def pages() -> dict[Path, str]:
     """Return the generated pages by their paths."""
-    settings = ["## Commands\n", *map(_command, COMMANDS), "## Groups\n"]
+    settings = ["## Commands\n", *map(_command, SETTINGS), "## Groups\n"]
     for group in GROUPS:
         settings += [f"### {group}\n", *map(_option, sorted((CONFIGS / group).glob("*.yaml")))]
     experiments = map(_experiment, sorted((CONFIGS / "experiment").rglob("*.yaml")))

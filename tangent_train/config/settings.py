@@ -433,16 +433,16 @@ class TransferSettings(LabelMapSettings, RunSettings):
 
 
 SETTINGS: Mapping[str, type[Settings]] = {
-    "check": RunSettings,
-    "evaluate": EvaluateSettings,
-    "export": ExportSettings,
-    "import": ImportSettings,
-    "keypoints": KeypointSettings,
-    "predict": PredictSettings,
-    "prepare": PrepareSettings,
-    "render": RenderSettings,
     "train": TrainSettings,
+    "evaluate": EvaluateSettings,
+    "predict": PredictSettings,
+    "import": ImportSettings,
+    "export": ExportSettings,
+    "render": RenderSettings,
     "transfer": TransferSettings,
+    "keypoints": KeypointSettings,
+    "prepare": PrepareSettings,
+    "check": RunSettings,
 }
 """Settings by the name of the command."""
 

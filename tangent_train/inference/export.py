@@ -71,6 +71,9 @@ def export_network(
             scores or the depth differ by more than `TOLERANCE` of their range.
     """
     check_choice("output", path.suffix.lower(), SUFFIXES)
+    step = loaded.size_multiple
+    if image_size is not None and any(side % step for side in image_size):
+        raise SettingError("image_size", found=image_size, expected=f"multiples of {step}")
     is_onnx = path.suffix.lower() == ".onnx"
     is_aware = make_ordinary(loaded.module) is not loaded.module
     is_aware |= bool(loaded.representation.get("distortion_aware"))

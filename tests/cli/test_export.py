@@ -41,8 +41,11 @@ def test_the_suffix_selects_the_format(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["output=x.pt"], r"output: found x\.pt; .* \.onnx or \.safetensors\.$"),
-        (["output=x.safetensors", "image_size=[9,9]"], "output: .* multiples of 2"),
+        (["output=x.pt"], r"output: found '\.pt'; expected '\.onnx' or '\.safetensors'\.$"),
+        (
+            ["output=x.safetensors", "image_size=[9,9]"],
+            r"image_size: found \(9, 9\); expected multiples of 2",
+        ),
     ],
 )
 def test_export_errors_are_one_line(
