@@ -14,10 +14,14 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from hypothesis import settings
 from numpy.typing import NDArray
 
 from datamodules.stanford2d3ds.files import CLASSES
 from tests.datamodules.data_files import write_png
+
+settings.register_profile("tests", deadline=None)  # speed is no test's business
+settings.load_profile("tests")
 
 SLOW = Path(__file__).parent / "slow"
 
@@ -44,9 +48,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Start the server of processes here: the folder of the first test that needs it may go."""
-    modules = ["datamodules.synthrooms.datamodule"]
-    if any(item.get_closest_marker("slow") for item in session.items):
-        modules += ["tangent_train.cli.train", "tangent_train.cli.transfer", "tensorboard"]
+    if not any(item.get_closest_marker("slow") for item in session.items):
+        return
+    modules = ["tangent_train.cli.train", "tangent_train.cli.transfer", "tensorboard"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("OMP_NUM_THREADS", "1")  # forked processes have no threads
         patch.setenv("NUMBA_NUM_THREADS", "1")

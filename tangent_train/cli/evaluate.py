@@ -37,9 +37,7 @@ def evaluate(settings: EvaluateSettings) -> None:
         raise SettingError("data", found="nothing", expected=expected)
     refuse_typed(_OF_TRAINING, "no such setting: an evaluation does not read it")
     folder = Path(hydra.runtime.output_dir)
-    if (folder / "config.yaml").exists() and rank_zero_only.rank == 0:
-        found = f"{folder}, the folder of another run"
-        raise SettingError("hydra.run.dir", found=found, expected="a new folder")
+    _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
     loaded = load_network(settings.checkpoint, settings.trust)
     remedy = "Choose the task of the network: task=segmentation, depth or classification."
@@ -65,6 +63,14 @@ def evaluate(settings: EvaluateSettings) -> None:
     run = Run(folder, settings, data, task, loaded, notes)
     rank_zero_only(run.write_settings)()
     run.test(run.trainer(), settings.checkpoint)
+
+
+@rank_zero_only
+def _refuse_folder_of_run(folder: Path) -> None:
+    """Refuse a folder with the settings of a run: they would be overwritten."""
+    if (folder / "config.yaml").exists():
+        found = f"{folder}, the folder of another run"
+        raise SettingError("hydra.run.dir", found=found, expected="a new folder")
 
 
 def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, Any]:
