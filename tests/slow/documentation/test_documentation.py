@@ -45,11 +45,17 @@ def template(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return build_world(tmp_path_factory.mktemp("documentation"))
 
 
+@pytest.fixture(scope="session")
+def validated(template: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy, into which the tests of settings write files that earlier commands would write."""
+    return shutil.copytree(template, tmp_path_factory.mktemp("validated") / "world")
+
+
 @pytest.mark.parametrize("block", OTHERS, ids=lambda block: block.location)
 def test_documented_settings_are_valid(
-    block: Block, template: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    block: Block, validated: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    world = shutil.copytree(template, tmp_path / "world")
+    world = validated
     monkeypatch.chdir(world)
     for name, content in block.files.items():
         Path(name).parent.mkdir(parents=True, exist_ok=True)
