@@ -46,13 +46,16 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
         kind: Class of the settings; None or `AutoConfig` to choose it by ``model_type``.
 
     Raises:
-        SettingError: transformers is missing.
+        SettingError: transformers lacks the class, or is missing.
     """
     with of_extra("huggingface", "network"):
         import transformers
 
     if kind in (None, transformers.AutoConfig):
-        kind = transformers.CONFIG_MAPPING[config["model_type"]]
+        name, expected = config.get("model_type"), "a kind of network that transformers has"
+        if name not in transformers.CONFIG_MAPPING:
+            raise SettingError("network.config.model_type", found=str(name), expected=expected)
+        kind = transformers.CONFIG_MAPPING[name]
     # Settings that all networks share are about labels, results, and how a file was written.
     of_all = signature(transformers.PreTrainedConfig).parameters.keys()
     declared = signature(kind).parameters.keys() - of_all
