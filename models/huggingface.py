@@ -52,9 +52,9 @@ def architecture(config: Mapping[str, Any], kind: Any = None) -> dict[str, Any]:
         import transformers
 
     if kind in (None, transformers.AutoConfig):
-        name, expected = config.get("model_type"), "a kind of network that transformers has"
+        name, expected = str(config.get("model_type")), "a kind of network that transformers has"
         if name not in transformers.CONFIG_MAPPING:
-            raise SettingError("network.config.model_type", found=str(name), expected=expected)
+            raise SettingError("network.config.model_type", found=name, expected=expected)
         kind = transformers.CONFIG_MAPPING[name]
     # Settings that all networks share are about labels, results, and how a file was written.
     of_all = signature(transformers.PreTrainedConfig).parameters.keys()
