@@ -16,7 +16,7 @@ from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
 from tangent_train.files import check_new
-from tangent_train.geometry import PinholeGrid, nearest_level, rotation_about
+from tangent_train.geometry import PinholeGrid, TangentGrid, nearest_level, rotation_about
 from tangent_train.inference.views import view_settings
 from tangent_train.io.camera_files import (
     CAMERAS_FILE,
@@ -143,7 +143,9 @@ def _write_figure(settings: RenderSettings, inputs: Inputs, path: Path) -> None:
     check_new(path, overwrite=settings.overwrite)
     job = next(iter(inputs.jobs(inputs.names)))
     image, _ = read_placed(job.path, settings.interpolation, settings.area, job.value)
-    grid: Any = _views(settings, image.shape[0])[0]
+    grid = _views(settings, image.shape[0])[0]
+    if not isinstance(grid, TangentGrid):
+        raise SettingError("figure", found=path, expected=f"null, for views={settings.views}")
     write_pixels(path, tangent_figure(image, grid))
     print_text(f"Written: {path}")
 
@@ -156,7 +158,9 @@ def _views(settings: RenderSettings, rows: int) -> tuple[PinholeGrid, tuple[int,
     section |= {name: value for name, value in given.items() if value is not None}
     # Labels are rendered back from the owner of each direction.
     section |= {"blend": "nearest"} if "blend" in section else {}
-    grid: PinholeGrid = build_from_config(section, "views").grid
+    grid: PinholeGrid | None = getattr(build_from_config(section, "views"), "grid", None)
+    if grid is None:
+        raise SettingError("views", found=settings.views, expected="tangent, horizontal or cubemap")
     if settings.rotation is not None:  # x forward, y to the right, z up
         yaw, pitch, roll = np.radians(settings.rotation)
         # A positive rotation about y looks down.

@@ -175,8 +175,11 @@ def test_level_views_come_back_in_place(tmp_path: Path, blend: str, refused: Ref
     np.save(tmp_path / "features" / "face_003.npy", np.zeros((20, 20, 3), np.float32))
     message = refused(output=tmp_path / "no.npy", **settings)
     assert "face_003.npy: found float32 of shape (20, 20, 3)" in message
-    changed = {"output": tmp_path / "no", "views": views, "base_level": 0}
-    assert "views: found" in refused(input=tmp_path / "room.png", **changed)
+    given = {"views": views, "figure": "a.png"}
+    assert "figure: found" in refused(input=tmp_path / "room.png", **given)
+    for changes in ({"views": "erp"}, {"views": views, "base_level": 0}):
+        message = refused(input=tmp_path / "room.png", output=tmp_path / "no", **changes)
+        assert "views: found" in message
 
 
 @pytest.mark.parametrize(
