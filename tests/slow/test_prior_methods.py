@@ -110,7 +110,7 @@ def test_the_zonal_classifier_trains_resumes_and_evaluates(tmp_path: Path) -> No
     evaluation = (*settings[:1], *settings[3:7], "hydra.run.dir=evaluated")
     run_in(tmp_path, "evaluate", f"checkpoint={last}", *evaluation)
     assert results(tmp_path / "evaluated")["confusion"] == results(tmp_path / "run")["confusion"]
-    with pytest.raises(SystemExit, match=r"found images of 16 × 16 .*representation=erp"):
+    with pytest.raises(SystemExit, match=r"found 16 × 16 .*representation=erp"):
         run_in(tmp_path, "train", *settings, "hydra.run.dir=refused")
 
 
