@@ -38,7 +38,6 @@ from tangent_train.io.tangent_folders import (
     flat_name,
     read_placed,
     result_files,
-    shrink_to_level,
     write_views,
 )
 from tangent_train.keypoints.colmap import panorama_poses
@@ -89,7 +88,6 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         image, area = read_placed(job.path, kind, settings.area, job.value)
         shape = image.shape[0], image.shape[1]
         view = (grid, faces, level) if settings.colmap else _views(settings, shape[0])
-        image = shrink_to_level(image, view[2]) if kind == "bilinear" else image
         if settings.colmap:
             end = f"{flat_name(job.name)}{suffix}"
             images = {output / "images" / (p + end): face for p, face in prefixes.items()}
