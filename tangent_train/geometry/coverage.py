@@ -161,7 +161,7 @@ def _needed(
     centers = np.concatenate([grid.centers_xyz for grid in grids])
     # Pixels between the centers of coarse cells are seen too: images are convex, and the margin is
     # more than half of the diagonal of a cell.
-    margin = -_ROUNDING if by_owners or is_exact else math.sin(0.75 * math.pi / len(cells))
+    margin = -_ROUNDING if is_exact else math.sin(0.75 * math.pi / len(cells))
     inner, seen = insets >= margin, insets >= -_ROUNDING
     nearness = (centers @ directions.T).astype(np.float32)
     owner = nearness.argmax(axis=0)
