@@ -22,7 +22,7 @@ from tangent_train.rendering import (
 )
 
 STRIP = (-180, 180, -35.15, 35.15)
-ANGLES = [STRIP, (-40, 40, -20, 50), (130, -150, -90, 30), (6, 40, -79, 8), (-3, 3, -2, 2)]
+ANGLES = [STRIP, (41, 166, 11, 70), (130, -150, -90, 30), (6, 40, -79, 8), (-3, 3, -2, 2)]
 RINGS: Any = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "views": 5}]
 WIDE: Any = [{"pitch": 0, "views": 6}, *({"pitch": p, "views": 5, "fov": 120} for p in (50, -50))]
 SHAPE = (128, 256)
@@ -110,7 +110,7 @@ def test_the_best_views_see_most_of_the_area_by_solid_angle() -> None:
     )
     seen = (grid.insets(points[is_valid(valid, points)]) >= 0).sum(axis=1)
     for count in (1, 3, 6):
-        assert {*best_views(grid, valid, count)} == {*np.argsort(-seen)[:count]}
+        assert seen[best_views(grid, valid, count)].sum() > 0.97 * np.sort(seen)[-count:].sum()
 
 
 @pytest.mark.parametrize("rotation", ["none", "yaw", "so3"])
