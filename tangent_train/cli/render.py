@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.labeled import class_masks
+from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
@@ -238,3 +239,7 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
 
 _NOT_CONTENT = {"figure", "output", "overwrite"}
 """Settings that do not change the files in an output folder."""
+
+
+if __name__ == "__main__":
+    main.render()
