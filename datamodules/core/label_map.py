@@ -225,6 +225,8 @@ def plain_name(name: str) -> str:
 
     >>> plain_name("Window-Pane, window")
     'window pane'
+    >>> plain_name("STRASSE") == plain_name("Straße")
+    True
     """
     first = composed(name).partition(",")[0].replace("-", " ").replace("_", " ")
     return " ".join(first.casefold().split())

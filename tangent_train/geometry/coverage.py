@@ -156,17 +156,17 @@ def _needed(
     grids: tuple[PinholeGrid, ...], mask: _Mask, by_owners: bool, is_exact: bool
 ) -> list[NDArray[np.int64]]:
     """See `needed_views`; cached, because all panoramas of a data set have the same mask."""
-    cells, directions, angles = _cells(mask)
+    cells, directions, _ = _cells(mask)
     insets = np.concatenate([grid.insets(directions) for grid in grids])
     centers = np.concatenate([grid.centers_xyz for grid in grids])
     # Pixels between the centers of coarse cells are seen too: images are convex, and the margin is
     # more than half of the diagonal of a cell.
-    margin = -_ROUNDING if by_owners or is_exact else math.sin(0.75 * math.pi / len(cells))
+    margin = -_ROUNDING if is_exact else math.sin(0.75 * math.pi / len(cells))
     inner, seen = insets >= margin, insets >= -_ROUNDING
     nearness = (centers @ directions.T).astype(np.float32)
     owner = nearness.argmax(axis=0)
     kept, central = np.ones(len(centers), np.bool_), is_valid(cells, centers)
-    for image in np.argsort(seen @ angles, kind="stable"):
+    for image in np.argsort(seen.sum(axis=1), kind="stable"):
         if central[image]:
             continue
         kept[image] = False

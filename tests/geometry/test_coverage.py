@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_directions, random_rotation
+from tangent_train.geometry.coverage import best_views, is_valid
 from tangent_train.geometry.sphere import area_mask
 from tangent_train.rendering import (
     CubemapRepresentation,
@@ -21,7 +22,7 @@ from tangent_train.rendering import (
 )
 
 STRIP = (-180, 180, -35.15, 35.15)
-ANGLES = [STRIP, (-40, 40, -20, 50), (130, -150, -90, 30), (-3, 3, -2, 2)]
+ANGLES = [STRIP, (41, 166, 11, 70), (130, -150, -90, 30), (6, 40, -79, 8), (-3, 3, -2, 2)]
 RINGS: Any = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "views": 5}]
 WIDE: Any = [{"pitch": 0, "views": 6}, *({"pitch": p, "views": 5, "fov": 120} for p in (50, -50))]
 SHAPE = (128, 256)
@@ -29,6 +30,7 @@ SHAPE = (128, 256)
 VIEWS: dict[str, Any] = {
     "tangent, b = 0": TangentRepresentation(0, 6),
     "tangent, b = 1": TangentRepresentation(1, 6),
+    "nearest": TangentRepresentation(1, 6, blend="nearest"),
     "cropped": TangentRepresentation(0, 6, crop_multiple=2, blend="nearest"),
     "horizontal": HorizontalRepresentation(6, RINGS, [100, 100]),
     "cube map": CubemapRepresentation(6),
@@ -73,17 +75,42 @@ def test_views_see_every_valid_pixel(
     valid, views = _valid(angles, seed), VIEWS[name]
     if seed is not None:
         views = views.with_rotation(random_rotation(np.random.default_rng(1)))
-    directions = equirect_directions(SHAPE)[valid]
     sets = views.view_sets(valid)
     assert sum(map(len, sets)) <= sum(map(len, views.view_sets())) - (seed is None)
-    shown = []
-    for of_set in sets:
-        grid: Any = of_set.grid
-        seen = grid.widened(1).insets(directions).T >= -1e-9
-        if views.blend == "nearest" or not grid.is_overlapping:
-            seen = np.take_along_axis(seen, grid.owners(directions)[:, None], axis=1)
-        shown.append(seen.any(axis=1))
+    shown = [_shown(views, of_set, valid) for of_set in sets]
     assert np.all(np.any(shown, axis=0) if name == "rings of two widths" else shown)
+
+
+def _shown(views: Any, of_set: Any, valid: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return ``(n,)`` True for the valid pixels that a set of views shows where they are needed."""
+    directions, grid = equirect_directions(valid.shape)[valid], of_set.grid
+    seen = grid.widened(1).insets(directions).T >= -1e-9
+    if views.blend == "nearest" or not grid.is_overlapping:
+        seen = np.take_along_axis(seen, grid.owners(directions)[:, None], axis=1)
+    shown: NDArray[np.bool_] = seen.any(axis=1)
+    return shown
+
+
+@pytest.mark.parametrize("blend", ["feather", "nearest"])
+def test_views_of_an_area_with_many_rows_see_every_pixel(blend: Any) -> None:
+    """Views are chosen by cells of 1°, the pixels of these views have 0.2°."""
+    valid = area_mask((135.6, -53.1, -41.8, 36.0), (720, 1440))
+    views = TangentRepresentation(0, 9, blend=blend)
+    assert _shown(views, views.view_sets(valid)[0], valid).all()
+
+
+def test_the_best_views_see_most_of_the_area_by_solid_angle() -> None:
+    """A meridian strip has as many pixels at the pole as at the equator."""
+    valid = area_mask((-30, 30, -10, 90), (60, 120))
+    grid = TangentRepresentation(1, 6).grid
+    turns, heights = np.random.default_rng(0).uniform(-1, 1, (2, 400_000))
+    flat = np.sqrt(1 - heights**2)
+    points = np.stack(
+        [flat * np.cos(np.pi * turns), flat * np.sin(np.pi * turns), heights], axis=-1
+    )
+    seen = (grid.insets(points[is_valid(valid, points)]) >= 0).sum(axis=1)
+    for count in (1, 3, 6):
+        assert seen[best_views(grid, valid, count)].sum() > 0.97 * np.sort(seen)[-count:].sum()
 
 
 @pytest.mark.parametrize("rotation", ["none", "yaw", "so3"])

@@ -76,14 +76,38 @@ def test_directions_are_nested(elements: IcosphereElements) -> None:
     assert np.abs(same - coarse).max() < 0.02
 
 
+def _solid_angles(corners: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return steradians of triangles with unit vectors ``(n, 3, 3)`` at their corners.
+
+    Van Oosterom and Strackee, IEEE Trans. Biomed. Eng. 1983, equation 8.
+    """
+    a, b, c = np.moveaxis(corners, 1, 0)
+    dots = 1 + (a * b).sum(1) + (b * c).sum(1) + (c * a).sum(1)
+    angles: NDArray[np.float64] = 2 * np.arctan2(np.abs(np.linalg.det(corners)), dots)
+    return angles
+
+
+def test_points_of_a_cell_have_the_weight_of_their_solid_angle() -> None:
+    """Of the triangles between a corner, the middle of an edge and the center of a face."""
+    corners = icosphere_directions(1)[icosphere(1).faces]
+    parts = np.empty((len(corners), 3, 2, 3, 3))
+    for corner, side in np.ndindex(3, 2):
+        middle = corners[:, [corner, (corner + 1 + side) % 3]].mean(axis=1)
+        parts[:, corner, side] = np.stack([corners[:, corner], middle, corners.mean(axis=1)], 1)
+    parts /= np.linalg.norm(parts, axis=-1, keepdims=True)
+    angles = _solid_angles(parts.reshape(-1, 3, 3))
+    assert angles.sum() == pytest.approx(4 * np.pi)
+    _, source, weight = sampling_points(1, "vertices")
+    expected = angles[source] * (weight > 0)
+    np.testing.assert_allclose(weight, expected / expected.sum(axis=0), atol=2e-4)
+
+
 @pytest.mark.parametrize("elements", ["vertices", "faces"])
 def test_means_over_cells_are_integrals(elements: IcosphereElements) -> None:
     points, source, weight = sampling_points(1, elements)
     np.testing.assert_allclose(weight.sum(axis=0), 1, rtol=1e-6)
     fine, corners = icosphere_directions(6, "faces"), icosphere_directions(6)[icosphere(6).faces]
-    a, b, c = np.moveaxis(corners, 1, 0)
-    dots = 1 + (a * b).sum(1) + (b * c).sum(1) + (c * a).sum(1)
-    solid_angles = 2 * np.arctan2(np.abs(np.linalg.det(corners)), dots)
+    solid_angles = _solid_angles(corners)
     found, shares = locate(1, fine)
     owner = found
     if elements == "vertices":

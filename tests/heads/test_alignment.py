@@ -148,6 +148,27 @@ def test_scales_and_shifts_of_views_are_recovered(kind: Kind, views: str) -> Non
     assert np.abs(errors).max() < 1e-2
 
 
+@pytest.mark.parametrize(("kind", "views", "seed"), [("metric_z", "levels", 4)])
+def test_views_with_a_wrong_start_are_no_outliers(kind: Kind, views: str, seed: int) -> None:
+    """Most views agree soon: if the unit of noise followed at once, the others would stay."""
+    truth = _truth(views)
+    samples = _corrupted(truth, kind, np.random.default_rng(seed))
+    errors = _errors(align_views([samples], kind), samples, truth.distance)
+    assert np.abs(errors).max() < EXACT
+
+
+def test_groups_of_views_keep_the_unit_of_their_median_view() -> None:
+    """Three views of 50 points in millimeters, and three of other points in meters."""
+    view, point = (part.ravel() for part in np.mgrid[:6, :50])
+    factor = np.array([1000.0, 1000.0, 3000.0, 1.0, 2.0, 2.0])
+    distance = np.random.default_rng(0).uniform(1, 4, 100)[point + 50 * (view > 2)]
+    ones, positions = np.ones(len(view)), np.zeros((len(view), 2))
+    given = point + 50 * (view > 2), distance * factor[view], ones, positions
+    found = align_views([ViewSamples(6, view, *given)], "metric_distance")
+    assert found.facts["groups"] == 2
+    np.testing.assert_allclose(factor * found.scale, np.repeat([1000.0, 2.0], 3), rtol=1e-6)
+
+
 def test_the_fit_minimizes_the_cauchy_loss() -> None:
     """Scales and shifts are those of a general optimizer, which evaluates the loss as defined."""
     rng = np.random.default_rng(1)

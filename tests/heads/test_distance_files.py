@@ -59,6 +59,16 @@ def test_points_are_rays_times_depth_without_unknown_pixels() -> None:
     np.testing.assert_allclose(points, [[3 * 127 / 128, -3 * 63 / 128, 3]])
 
 
+def test_solid_angles_of_a_photo_sum_to_that_of_its_pyramid() -> None:
+    camera, size = camera_matrix_from_fov(120.0, (300, 400)), (300, 400)
+    image = InputImage(np.zeros((*size, 3), np.uint8), camera_matrix=camera)
+    angles = PredictedImage(image, np.ones(size)).solid_angles
+    across = math.tan(math.radians(60))  # half of the picture's width at distance 1
+    down = across * 300 / 400
+    pyramid = 4 * math.asin(across * down / math.hypot(1, across) / math.hypot(1, down))
+    assert angles.sum() * (across / 200) ** 2 == pytest.approx(pyramid, rel=1e-4)
+
+
 def test_depth_files_are_read_back(tmp_path: Path) -> None:
     """At the limits of 16 bits: 65535 means missing, and 0 would."""
     meters = np.array([[np.nan, 1e-5, 0.0014, 1.0, 65.534, 65.5344, 65.5346, 1e4]], np.float32)

@@ -22,6 +22,7 @@ from tangent_train.geometry import (
     camera_matrix_from_fov,
     equirect_directions,
     equirect_solid_angles,
+    ray_lengths,
     rotation_about,
 )
 from tangent_train.geometry.sphere import area_mask
@@ -32,6 +33,7 @@ from tangent_train.inference.engine import Predictor
 from tangent_train.inference.images import InputImage
 from tangent_train.inference.views import ViewSelector, view_settings
 from tangent_train.kinds import DepthKind
+from tangent_train.rendering import PerspectiveRepresentation
 from tangent_train.rendering.representations.views import PinholeViews
 from tests.inference.trained import CUBE, ERP, ICOSPHERE, TANGENT, trained_network
 
@@ -77,6 +79,20 @@ def _combined(
         mosaic.add(depth, views)
     distances: NDArray[np.float32] = mosaic.distances().numpy()
     return distances
+
+
+def test_the_median_depth_of_a_photo_is_that_by_solid_angle() -> None:
+    """A disk at 1 m that fills 55 % of the solid angle, 19 % of the pixels; the wall is at 3 m."""
+    size = 192, 256
+    camera = camera_matrix_from_fov(140.0, size)
+    lengths = ray_lengths(camera, size)
+    angles = lengths**-3.0
+    edge = np.quantile(lengths, 0.55, weights=angles, method="inverted_cdf")
+    z_depth = torch.from_numpy(np.where(lengths < edge, 1.0, 3.0)).float()
+    photos = PerspectiveRepresentation(6, 45.0, (48, 64)).of_camera(camera, size)
+    outputs = [(views, views.render(z_depth[None], "nearest")) for views in photos.view_sets()]
+    found = _combined(outputs, size, "relative_depth", "nearest", "none", camera_matrix=camera)
+    assert np.median(found / lengths) == pytest.approx(3, rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -137,6 +137,18 @@ def test_alignments_equal_least_squares_of_numpy(alignment: Alignment, quantity:
     np.testing.assert_allclose(aligned.numpy(), expected, rtol=1e-9)
 
 
+def test_disparities_that_an_alignment_makes_negative_are_far_away() -> None:
+    """``clip`` makes them the largest distance; without it they are unknown."""
+    truth = torch.tensor([[1.0, 2.0, 4.0, 8.0, torch.nan]])
+    prediction = 1 / (1 / truth + 0.1)  # the shift of the fit is −0.1
+    prediction[0, 4] = 20.0
+    for clip, expected in ((True, 10.0), (False, torch.nan)):
+        protocol = DepthProtocol("affine", "disparity", max_distance=10.0, clip=clip)
+        aligned = protocol.aligned(prediction, truth)
+        torch.testing.assert_close(aligned[:, :4], truth[:, :4])
+        torch.testing.assert_close(aligned[0, 4], torch.tensor(expected), equal_nan=True)
+
+
 def test_scale_and_shift_of_each_image_are_those_of_least_squares() -> None:
     values, truth = (
         torch.from_numpy(np.stack(x)) for x in zip(*map(_image, range(4)), strict=True)

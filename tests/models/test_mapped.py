@@ -68,6 +68,13 @@ def _two_layers() -> nn.Sequential:
     return nn.Sequential(MappedConv(2, 3, table), MappedConv(3, 2, table))
 
 
+def test_weights_start_as_those_of_convolutions_of_torch() -> None:
+    torch.manual_seed(0)
+    ours, of_torch = MappedConv(6, 500, _some_table(taps=9)), nn.Conv1d(6, 500, 9)
+    for own, other in zip(ours.parameters(), of_torch.parameters(), strict=True):
+        torch.testing.assert_close(own.abs().max(), other.abs().max(), rtol=0.02, atol=0)
+
+
 def test_tables_are_shared_and_in_no_checkpoint() -> None:
     network = _two_layers()
     assert set(network.state_dict()) == {"0.weight", "0.bias", "1.weight", "1.bias"}

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from datamodules.core.depth import resize_depth
 from datamodules.core.image_module import Unknown, mask_black
-from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.resampling import crop, resize
 from tests.datamodules.data_files import nearest_valid
 
 
@@ -26,6 +27,24 @@ def test_colors_are_means_of_areas() -> None:
     rgb = np.random.default_rng(0).integers(0, 256, (32, 64, 3), np.uint8)
     means = rgb.reshape(8, 4, 16, 4, 3).mean(axis=(1, 3))
     np.testing.assert_allclose(resize(rgb, (8, 16), "bilinear"), means, atol=0.501)
+
+
+@pytest.mark.parametrize("shape", [(8, 16), (12, 24), (48, 96)])
+def test_resized_tensors_are_those_of_opencv(shape: tuple[int, int]) -> None:
+    rgb = np.random.default_rng(2).random((32, 64, 3), np.float32)
+    expected = resize(rgb, shape, "bilinear")
+    found = resize(torch.from_numpy(rgb).permute(2, 0, 1), shape, "bilinear")
+    np.testing.assert_allclose(found.permute(1, 2, 0), expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [(7, 9), (40, 60)])
+def test_crops_of_tensors_are_those_of_pillow(shape: tuple[int, int]) -> None:
+    """Smaller and larger than the part of the photo that they show."""
+    rgb = np.random.default_rng(1).integers(0, 256, (20, 30, 3), np.uint8)
+    box = np.array([3.0, 2.5, 18.2, 13.0])
+    expected = crop(rgb, box, shape, "bilinear")
+    found = crop(torch.from_numpy(rgb).permute(2, 0, 1).float(), box, shape, "bilinear")
+    np.testing.assert_allclose(found.permute(1, 2, 0), expected, atol=1.01)
 
 
 @pytest.mark.parametrize("shape", [(12, 24), (4, 8), (3, 6), (5, 10)])
