@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from tangent_train.imports import check_own_packages
 
 if TYPE_CHECKING:
+    __version__: str
     from tangent_train.geometry import RingGrid, TangentGrid
     from tangent_train.inference.api import apply, load
     from tangent_train.rendering import (
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
 __all__ = [
     "RingGrid",
     "TangentGrid",
+    "__version__",
     "apply",
     "equirect_to_tangent",
     "load",
@@ -40,6 +42,10 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("tangent-train")
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return getattr(import_module(f"tangent_train.{_HOMES.get(name, 'rendering')}"), name)

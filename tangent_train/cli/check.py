@@ -8,15 +8,16 @@ from contextlib import redirect_stdout
 import numpy as np
 
 from datamodules.core.label_map import label_doubts
+from tangent_train.cli import main
 from tangent_train.cli.run import open_data
-from tangent_train.config.settings import RunSettings
+from tangent_train.config.settings import CheckSettings
 from tangent_train.console import print_text
 from tangent_train.errors import counted
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.results.tables import Table, percent
 
 
-def check(settings: RunSettings) -> None:
+def check(settings: CheckSettings) -> None:
     """Read the whole data set of a run; exit with status 1 if there are problems.
 
     On a terminal, the problems are printed as a table. Elsewhere they are lines of file, finding
@@ -69,3 +70,7 @@ def check(settings: RunSettings) -> None:
     print_text(f"{summary}; {checked}.", error=bool(listed or warnings) and not terminal)
     if listed:
         sys.exit(1)
+
+
+if __name__ == "__main__":
+    main.check()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +11,12 @@ from hydra.utils import get_class
 from lightning.pytorch.utilities import rank_zero_only
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.cli.run import Run, build_data, build_head, build_task
-from tangent_train.config.settings import EvaluateSettings, refuse_typed, typed_names
+from tangent_train.config.settings import EvaluateSettings, is_within, refuse_typed, typed_names
 from tangent_train.errors import SettingError
 from tangent_train.inference.api import load_label_map, map_classes
 from tangent_train.inference.views import check_size, panorama_settings
-
-_OF_TRAINING = {
-    *("network", "optimizer", "scheduler", "callbacks", "ema", "checkpoint_every_n_steps"),
-    "validation_images",
-}
-"""Groups and settings that an evaluation does not read."""
 
 
 def evaluate(settings: EvaluateSettings) -> None:
@@ -31,11 +25,12 @@ def evaluate(settings: EvaluateSettings) -> None:
     Raises:
         SettingError: The network does not fit the data, or nothing reads a typed setting.
     """
-    hydra, typed = HydraConfig.get(), [re.split(r"[.@]", name)[0] for name in typed_names()]
-    if "data" in hydra.runtime.choices and not {"data", "experiment"}.intersection(typed):
+    hydra, typed = HydraConfig.get(), typed_names()
+    names = "data", "experiment"
+    if "data" in hydra.runtime.choices and not any(is_within(name, names) for name in typed):
         expected = "the data set of the evaluation, data=… or experiment=…"
         raise SettingError("data", found="nothing", expected=expected)
-    refuse_typed(_OF_TRAINING, "no such setting: an evaluation does not read it")
+    refuse_typed(settings.not_read, "no such setting: an evaluation does not read it")
     folder = Path(hydra.runtime.output_dir)
     _refuse_folder_of_run(folder)
     lightning.seed_everything(settings.seed, workers=True, verbose=False)
@@ -88,3 +83,7 @@ def _of_network(settings: EvaluateSettings, loaded: LoadedNetwork) -> dict[str, 
         data = {**data, "inputs": list(loaded.inputs), "normalization": normalization}
     network = loaded.settings
     return {"level": level, "representation": section, "data": data, "network": network}
+
+
+if __name__ == "__main__":
+    main.evaluate()

@@ -6,6 +6,7 @@ from rich import get_console
 from rich.text import Text
 
 from tangent_train.checkpoints.loaded import load_network
+from tangent_train.cli import main
 from tangent_train.config.settings import ExportSettings
 from tangent_train.console import print_text
 from tangent_train.errors import printable, width_height
@@ -40,3 +41,7 @@ def export(settings: ExportSettings) -> None:
     )
     if output.suffix.lower() == ".onnx" and sees_rays(loaded.network):
         print_text(f"{output.name} lacks the cross-image attention; .safetensors contains it.")
+
+
+if __name__ == "__main__":
+    main.export()

@@ -15,7 +15,7 @@ from importlib import import_module
 from io import StringIO
 from typing import Any
 
-from tangent_train.errors import DataError, SettingError, nearest, printable
+from tangent_train.errors import DataError, SettingError, printable
 
 
 @contextmanager
@@ -26,19 +26,31 @@ def _errors_as_messages(command: str) -> Iterator[None]:
 
     try:
         yield
-    except (DataError, SettingError, HydraException, OmegaConfBaseException, OSError) as error:
-        known = getattr(error.__cause__, "parent_node", None)  # of an override without a setting
-        remedy = nearest(str(getattr(error.__cause__, "key", "")), map(str, known or ()))
-        sys.exit(printable(f"tangent-{command}: {error}\n{remedy}".rstrip()))
+    except (HydraException, OmegaConfBaseException) as error:
+        from tangent_train.config.command_line import explained
+
+        message = explained(error, command) or " ".join(str(error).split())
+        sys.exit(printable(f"tangent-{command}: {message}"))
+    except MemoryError as error:
+        remedy = "Choose smaller images or fewer at once."
+        sys.exit(f"tangent-{command}: not enough memory. {error}. {remedy}")
+    except (DataError, SettingError, OSError) as error:
+        sys.exit(printable(f"tangent-{command}: {error}"))
+    except ValueError as error:
+        if "group override" not in str(error):  # Hydra's, of data=5
+            raise
+        sys.exit(f"tangent-{command}: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
 
 
 def _main(command: str) -> None:
     """Run a command with the settings that Hydra composes from the command line."""
+    _print_version(command)
     import hydra
 
     from tangent_train.cli.processes import in_sweep, run_job
+    from tangent_train.config.command_line import check_words
     from tangent_train.config.help import annotate
     from tangent_train.config.settings import config_name, validate
     from tangent_train.files import config_folder
@@ -53,6 +65,7 @@ def _main(command: str) -> None:
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):
+        check_words(command, sys.argv[1:])
         name = config_name(command, sys.argv[1:])
         run = hydra.main(version_base="1.3", config_path=str(config_folder()), config_name=name)
         if {"--help", "-h"}.isdisjoint(sys.argv):
@@ -63,12 +76,34 @@ def _main(command: str) -> None:
         sys.stdout.write(annotate(printed.getvalue(), command))
 
 
+def _print_version(command: str) -> None:
+    """Print the version and exit if the command line asks for it."""
+    if "--version" in sys.argv[1:]:
+        import tangent_train
+
+        sys.stdout.write(f"tangent-{command} {tangent_train.__version__}\n")
+        sys.exit()
+
+
 def report() -> None:
     """Run ``tangent-report <run folders>``: write tables and a chart over runs."""
+    _print_version("report")
     from tangent_train.cli.report import report as write_report
 
     with _errors_as_messages("report"):
         write_report(sys.argv[1:])
+
+
+def overview() -> None:
+    """Print the commands of the package, for ``python -m tangent_train``."""
+    _print_version("train")
+    from tangent_train.config.help import description
+    from tangent_train.files import config_folder
+
+    files = [path for path in sorted(config_folder().glob("*.yaml")) if path.stem != "run"]
+    lines = [description(path)[0] for path in files]
+    lines.append("tangent-report compares finished runs, also with published scores.\n")
+    sys.stdout.write("\n".join([*lines, "--help explains the settings of a command.\n"]))
 
 
 train = partial(_main, "train")
@@ -81,3 +116,6 @@ render = partial(_main, "render")
 export = partial(_main, "export")
 import_network = partial(_main, "import")
 keypoints = partial(_main, "keypoints")
+
+if __name__ == "__main__":
+    overview()

@@ -14,6 +14,7 @@ import numpy as np
 
 from datamodules.core.label_map import PIXEL_CLASSES
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
+from tangent_train.cli import main
 from tangent_train.config.settings import PredictSettings, check_read
 from tangent_train.console import print_text
 from tangent_train.errors import DataError, SettingError, counted
@@ -224,3 +225,7 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
     return names | ({"depth", "depth_scale"} if "depth" in loaded.inputs else set())
+
+
+if __name__ == "__main__":
+    main.predict()

@@ -12,6 +12,7 @@ from pathlib import Path
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 
+from tangent_train.config.settings import typed_settings
 from tangent_train.errors import DataError, SettingError
 
 OBJECTIVE_FILE = "validation.json"
@@ -38,7 +39,7 @@ def run_job(command: str) -> float | None:
     """
     hydra = HydraConfig.get()
     folder = Path(hydra.runtime.output_dir)
-    arguments = list(hydra.overrides.task)
+    arguments = typed_settings()
     if (folder / "checkpoints" / "last.ckpt").exists():  # SLURM has started the job again
         arguments = [f"resume={quoted(folder)}"]
     sources = [s.path for s in hydra.runtime.config_sources if s.provider == "command-line"]

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from datamodules.folder.labeled import class_masks
+from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
 from tangent_train.console import print_text
@@ -38,7 +39,6 @@ from tangent_train.io.tangent_folders import (
     flat_name,
     read_placed,
     result_files,
-    shrink_to_level,
     write_views,
 )
 from tangent_train.keypoints.colmap import panorama_poses
@@ -89,7 +89,6 @@ def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
         image, area = read_placed(job.path, kind, settings.area, job.value)
         shape = image.shape[0], image.shape[1]
         view = (grid, faces, level) if settings.colmap else _views(settings, shape[0])
-        image = shrink_to_level(image, view[2]) if kind == "bilinear" else image
         if settings.colmap:
             end = f"{flat_name(job.name)}{suffix}"
             images = {output / "images" / (p + end): face for p, face in prefixes.items()}
@@ -240,3 +239,7 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
 
 _NOT_CONTENT = {"figure", "output", "overwrite"}
 """Settings that do not change the files in an output folder."""
+
+
+if __name__ == "__main__":
+    main.render()

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from tangent_train.cli import main
 from tangent_train.console import print_text
 
 
@@ -41,3 +42,7 @@ def report(arguments: Sequence[str]) -> None:
     for note in runs.notes:
         print_text(f"- {note}")
     print_text(f"Files: {options.output}/report.*")
+
+
+if __name__ == "__main__":
+    main.report()

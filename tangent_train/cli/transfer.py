@@ -34,9 +34,10 @@ from omegaconf import OmegaConf
 
 from tangent_train.checkpoints.loaded import LoadedNetwork, load_network
 from tangent_train.checkpoints.outputs import network_for_views
+from tangent_train.cli import main
 from tangent_train.cli.processes import command_line, quoted, run_process
 from tangent_train.cli.run import build_data
-from tangent_train.config.settings import SETTINGS, typed_names, validate
+from tangent_train.config.settings import SETTINGS, typed_names, typed_settings, validate
 from tangent_train.console import print_text
 from tangent_train.errors import SettingError
 from tangent_train.files import write_text
@@ -83,8 +84,7 @@ def transfer(_: object) -> None:
         SettingError: A setting is invalid, or the transfer was begun with other settings.
     """
     # Composed again, because the stages need the settings with their references.
-    typed: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
-    config: Any = compose("transfer", [*_search_path(), *typed])
+    config: Any = compose("transfer", [*_search_path(), *typed_settings()])
     folder, loaded = Path(HydraConfig.get().runtime.output_dir), None
     if config.checkpoint is not None:
         loaded = load_network(Path(config.checkpoint), config.trust)
@@ -302,3 +302,7 @@ def _report(config: Any, folder: Path, stages: Sequence[Stage]) -> None:
     for note in report.notes:
         print_text(f"- {note}")
     print_text(f"Tables and a chart: {folder / name}.md, .csv, .png")
+
+
+if __name__ == "__main__":
+    main.transfer()

@@ -8,9 +8,9 @@ YAML files; their types are those of the class that they build.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
 
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -57,6 +57,9 @@ class Settings(BaseModel):
     """Base of all settings."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+    not_read: ClassVar[Sequence[str]] = ()
+    """Groups and settings that the command does not read, although experiments may set them. They
+    are not suggested."""
 
 
 class NetworkSettings(Settings):
@@ -361,13 +364,38 @@ class TrainSettings(RunSettings):
 class EvaluateSettings(LabelMapSettings, NetworkSettings, RunSettings):
     """Settings of tangent-evaluate."""
 
+    not_read: ClassVar[Sequence[str]] = (
+        *("network", "optimizer", "scheduler", "callbacks", "recipe", "ema"),
+        *("checkpoint_every_n_steps", "validation_images", "data.color_jitter"),
+        *("representation.faces_per_panorama", "representation.random_rotation"),
+        *("representation.mirror", "task.auxiliary_weight", "task.backbone_lr_factor"),
+        *("task.frozen", "task.view_batch_size", "task.head.class_weights"),
+        *("task.head.label_smoothing", "task.head.loss", "task.head.scale_invariance"),
+        *("trainer.accumulate_grad_batches", "trainer.check_val_every_n_epoch"),
+        *("trainer.gradient_clip_algorithm", "trainer.gradient_clip_val"),
+        *("trainer.limit_train_batches", "trainer.limit_val_batches", "trainer.log_every_n_steps"),
+        *("trainer.max_epochs", "trainer.max_steps", "trainer.max_time", "trainer.min_epochs"),
+        *("trainer.min_steps", "trainer.num_sanity_val_steps", "trainer.overfit_batches"),
+        *("trainer.reload_dataloaders_every_n_epochs", "trainer.sync_batchnorm"),
+        "trainer.val_check_interval",
+    )
+
     representation: Section | None = None  # type: ignore[assignment]
     """views of a panorama that the network is given; null = those of the checkpoint"""
     level: int | None = None  # type: ignore[assignment]
     """level s, the angular resolution; null = that of the checkpoint"""
 
 
-class PrepareSettings(RunSettings):
+class CheckSettings(RunSettings):
+    """Settings of tangent-check."""
+
+    not_read: ClassVar[Sequence[str]] = (
+        *("network", "optimizer", "scheduler", "trainer", "logger", "callbacks", "task.head"),
+        *("recipe", "ema", "checkpoint_every_n_steps", "validation_images", "panels"),
+    )
+
+
+class PrepareSettings(CheckSettings):
     """Settings of tangent-prepare."""
 
     shard: str | int | None = None
@@ -442,7 +470,7 @@ SETTINGS: Mapping[str, type[Settings]] = {
     "transfer": TransferSettings,
     "keypoints": KeypointSettings,
     "prepare": PrepareSettings,
-    "check": RunSettings,
+    "check": CheckSettings,
 }
 """Settings by the name of the command."""
 
@@ -467,7 +495,8 @@ def config_name(command: str, arguments: Sequence[str]) -> str:
     store = ConfigStore.instance().store
     store("settings", _defaults(SETTINGS[command]))
     typed = [text for text in arguments if text.startswith("resume=") and command == "train"]
-    run = OverridesParser.create().parse_override(typed[-1]).value() if typed else None
+    value = OverridesParser.create().parse_override(typed[-1]).value() if typed else None
+    run = OmegaConf.create({"resume": value}).resume  # with interpolations
     if run is None:
         return command
     file = Path(str(run), "config.yaml")
@@ -531,13 +560,32 @@ def validate(command: str, config: Any) -> Any:
         return kind.model_validate({name: v for name, v in values.items() if v != "???"})
     except ValidationError as error:
         known = {name: comment_of(field) for name, field in kind.model_fields.items()}
-        raise wrong_setting(error, known) from error
+        inner = [one for one in dotted_names(values) if not is_within(one, kind.not_read)]
+        raise wrong_setting(error, dict.fromkeys(inner, "a value") | known) from error
+
+
+def typed_settings() -> list[str]:
+    """Return the settings on the command line as they were typed, with their interpolations."""
+    typed: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
+    return list(typed)
 
 
 def typed_names() -> list[str]:
     """Return the names of the settings on the command line, such as ``network.widths``."""
-    overrides: Any = OmegaConf.to_container(HydraConfig.get().overrides.task, resolve=False)
-    return [text.lstrip("+~").partition("=")[0] for text in overrides]
+    return [text.lstrip("+~").partition("=")[0] for text in typed_settings()]
+
+
+def is_within(name: str, names: Collection[str]) -> bool:
+    """Return True for one of the names, and for a setting of such a group."""
+    return any(re.match(rf"{re.escape(one)}([.@]|$)", name) for one in names)
+
+
+def dotted_names(section: Any, prefix: str = "") -> Iterator[str]:
+    """Yield the full names of settings and sections, such as ``data`` and ``data.root``."""
+    if isinstance(section, Mapping):
+        for name, value in section.items():
+            yield f"{prefix}{name}"
+            yield from dotted_names(value, f"{prefix}{name}.")
 
 
 def refuse_typed(names: Collection[str], expected: str) -> None:
@@ -547,5 +595,5 @@ def refuse_typed(names: Collection[str], expected: str) -> None:
         SettingError: One of the names, or a setting of such a group, is typed.
     """
     for typed in typed_names():
-        if re.split(r"[.@]", typed)[0] in names:
+        if is_within(typed, names):
             raise SettingError(typed, found="a value", expected=expected)

@@ -54,9 +54,10 @@ from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
 from tangent_train.kinds import Align, DepthKind
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
-from tangent_train.rendering.forward import Pixels, blend_of, check_panorama
+from tangent_train.rendering.forward import blend_of, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic
 from tangent_train.rendering.representations.views import PinholeViews
+from tangent_train.rendering.resampling import Pixels, reduce_to_pitch
 
 Unmapped = Literal["unknown", "never"]
 """Treatment of source classes that are not in a map: label 0 where they win, or they never win."""
@@ -369,6 +370,7 @@ def apply(
     step = images_per_call or views_per_forward(grid.size)
     rows, columns = panorama.shape[-2:] if isinstance(panorama, Tensor) else panorama.shape[:2]
     shape, views = (rows, columns), PinholeViews(grid)
+    panorama = reduce_to_pitch(panorama, grid.pitch)
     kept: list[NDArray[Any]] = []
     mosaic: Any = None
     for faces in np.split(np.arange(grid.num_images), range(step, grid.num_images, step)):

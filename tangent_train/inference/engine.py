@@ -8,8 +8,10 @@ and `UpLikelihood` use the engine.
 
 from __future__ import annotations
 
+import copy
 import inspect
 import math
+from dataclasses import replace
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -171,7 +173,14 @@ class RenderedViews:
 
     def of(self, views: Views) -> ViewImages:
         """Return a function that renders some of the views."""
-        return lambda part: self(views[part])
+        reduced = copy.copy(self)
+        if self._arrays:
+            reduced._image = replace(self._image, rgb=views.reduced(self._image.rgb))
+        reduced._planes = tuple(
+            (views.reduced(plane) if how == "bilinear" else plane, how)
+            for plane, how in self._planes
+        )
+        return lambda part: reduced(views[part])
 
 
 class Predictor:

@@ -10,19 +10,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from tangent_train.errors import DataError, SettingError, width_height
-from tangent_train.geometry import PinholeGrid, equirect_shape, ray_lengths
+from tangent_train.geometry import PinholeGrid, ray_lengths
 from tangent_train.io import pixel_files
 from tangent_train.io.camera_files import CameraFile
 from tangent_train.io.gpano import PanoramaArea, read_area
 from tangent_train.rendering import Blend, Interpolation, equirect_to_tangent, tangent_to_equirect
+from tangent_train.rendering.resampling import reduce_to_pitch
 from tangent_train.threads import in_threads
-
-_RESIZABLE = (np.uint8, np.uint16, np.float32, np.float64)
 
 ResultKind = Literal["color", "labels", "depth", "features"]
 """Meaning of pixels: colors and features are interpolated, labels and depth are not."""
@@ -78,27 +76,6 @@ def flat_name(name: str) -> str:
     return name.replace("/", "__")
 
 
-def shrink_to_level(image: NDArray[Any], level: int) -> NDArray[Any]:
-    """Downsample a panorama that has more rows than a level, by area averaging.
-
-    Args:
-        image: ``(H, W)`` or ``(H, W, C)``; other dtypes than uint8, uint16, float32 and float64
-            are not averaged.
-        level: Level s.
-
-    Returns:
-        The image itself, or a copy of the level's size.
-    """
-    height, width = equirect_shape(level)
-    if image.shape[0] <= height or image.dtype not in _RESIZABLE:
-        return image
-    small = [  # OpenCV takes four channels at most
-        cv2.resize(np.ascontiguousarray(channel), (width, height), interpolation=cv2.INTER_AREA)
-        for channel in np.moveaxis(np.atleast_3d(image), -1, 0)
-    ]
-    return np.stack(small, axis=-1).reshape(height, width, *image.shape[2:])
-
-
 def write_views(
     image: NDArray[Any],
     grid: PinholeGrid,
@@ -118,6 +95,8 @@ def write_views(
     Raises:
         SettingError: The panorama cannot be rendered, or the files cannot hold its pixels.
     """
+    if interpolation == "bilinear":
+        image = reduce_to_pitch(image, grid.pitch)
 
     def write(item: tuple[Path, int]) -> None:
         (pixels,) = equirect_to_tangent(image, grid, [item[1]], interpolation)

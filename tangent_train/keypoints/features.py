@@ -26,6 +26,7 @@ from tangent_train.geometry import (
     xyz_to_lonlat,
 )
 from tangent_train.rendering import equirect_to_tangent
+from tangent_train.rendering.resampling import reduce_to_pitch
 
 Floats = NDArray[np.float64]
 """Directions, rotations and other float64 arrays."""
@@ -129,7 +130,7 @@ def detect_on_tangent_images(
     Returns:
         Keypoints in the order of the faces they were detected in.
     """
-    gray = _gray(image)
+    gray = reduce_to_pitch(_gray(image), grid.pitch)
     wide = grid.widened(margin)
 
     def search(face: int) -> SphericalKeypoints:

@@ -4,12 +4,7 @@ NumPy panoramas are sampled by OpenCV, tensors by differentiable sparse sums on 
 by compiled kernels. All of them follow the convention in `tangent_train.geometry`.
 """
 
-from tangent_train.rendering.forward import (
-    Blend,
-    Interpolation,
-    equirect_to_tangent,
-    rotate_equirect,
-)
+from tangent_train.rendering.forward import Blend, equirect_to_tangent, rotate_equirect
 from tangent_train.rendering.mosaic import tangent_to_equirect, tangent_to_labels
 from tangent_train.rendering.representations.equirect import EquirectRepresentation
 from tangent_train.rendering.representations.icosphere import IcosphereRepresentation
@@ -20,6 +15,7 @@ from tangent_train.rendering.representations.pinhole import (
     TangentRepresentation,
 )
 from tangent_train.rendering.representations.views import Representation
+from tangent_train.rendering.resampling import Interpolation
 from tangent_train.rendering.tables import set_table_cache_limit
 
 __all__ = [

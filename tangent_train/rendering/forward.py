@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from torch.nn.functional import grid_sample
 from tangent_train.errors import SettingError, check_choice
 from tangent_train.geometry import PinholeGrid, checked_rotation
 from tangent_train.geometry.grids import Faces
+from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
 from tangent_train.rendering.tables import (
     EquirectMap,
     Positions,
@@ -29,13 +30,9 @@ from tangent_train.rendering.tables import (
     sphere_rays,
 )
 
-Interpolation = Literal["bilinear", "nearest"]
 Blend = Literal["nearest", "feather"]
 """``nearest``: each pixel is taken from the image that owns it. ``feather``: the average of all
 images that cover a pixel, with weights that fall to 0 at the borders of the images."""
-
-Pixels = TypeVar("Pixels", Tensor, NDArray[Any])
-"""A tensor or an array; results are of the same kind."""
 
 _TOGETHER = 2**16
 """Number of pixels sampled in one call: small images are grouped, to save calls."""
@@ -57,7 +54,9 @@ def equirect_to_tangent(
     """Render tangent images from a panorama (paper, section 3.2).
 
     Longitude wraps and rows reflect at the poles, for every interpolation. A panorama of another
-    aspect ratio than 2:1 is treated as a stretched image of the whole sphere.
+    aspect ratio than 2:1 is treated as a stretched image of the whole sphere. With ``bilinear``, a
+    panorama that is much finer than the images is first reduced by `reduce_to_pitch`; in a loop
+    over images, do this before.
 
     Args:
         image: A tensor ``(..., C, H, W)`` on any device, differentiable; or an array
@@ -74,6 +73,8 @@ def equirect_to_tangent(
         SettingError: The panorama, a face or the interpolation cannot be used.
     """
     check_panorama(image, interpolation)
+    if interpolation == "bilinear":
+        image = reduce_to_pitch(image, grid.pitch)
     indices, (rows, columns) = grid.face_indices(faces), grid.size
     # For random subsets of images, tables are cached per image: subsets rarely repeat.
     is_together = faces is None or grid.rotation is not None

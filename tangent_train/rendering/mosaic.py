@@ -17,8 +17,6 @@ from torch import Tensor
 
 from tangent_train.rendering.forward import (
     Blend,
-    Interpolation,
-    Pixels,
     blend_of,
     check_images,
     check_interpolation,
@@ -26,6 +24,7 @@ from tangent_train.rendering.forward import (
 )
 from tangent_train.rendering.numba_sums import NO_SUMS, NumbaSums
 from tangent_train.rendering.representations.views import PinholeViews
+from tangent_train.rendering.resampling import Interpolation, Pixels
 from tangent_train.rendering.tables import nearest_pixels
 from tangent_train.rendering.torch_sums import TorchSums, fits_on
 

@@ -140,7 +140,7 @@ def test_an_incomplete_test_leaves_no_results(
         (["representation.faces_per_panorama=99"], "representation.faces_per_panorama: found 99"),
         (["task=classification"], "task: found a task for image_class"),
         (["+optimizer.x=1"], "optimizer: found .*argument 'x'"),
-        (["+data.rooot=x"], "Did you mean root?"),
+        (["+data.rooot=x"], "Did you mean data.root?"),
         (["network._target_=models.Absent"], "Absent"),
         (["task.backbone_lr_factor=0.5"], r"lr_factor: found 0\.5; .*without init_from="),
     ],

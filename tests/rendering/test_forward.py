@@ -10,8 +10,17 @@ import torch
 from numpy.typing import NDArray
 
 from tangent_train.errors import SettingError
-from tangent_train.geometry import TangentGrid, equirect_shape, random_rotation, xyz_to_lonlat
+from tangent_train.geometry import (
+    CubeGrid,
+    PinholeGrid,
+    RingGrid,
+    TangentGrid,
+    equirect_shape,
+    random_rotation,
+    xyz_to_lonlat,
+)
 from tangent_train.rendering import equirect_to_tangent, forward, tables
+from tangent_train.rendering.resampling import reduce_to_pitch, resize
 
 Array = NDArray[Any]
 TURNED = TangentGrid(0, 5, rotation=random_rotation(np.random.default_rng(1)))
@@ -138,3 +147,64 @@ def test_unusable_arguments_are_refused(
 ) -> None:
     with pytest.raises(SettingError, match=message):
         equirect_to_tangent(image, TangentGrid(0, 4), **arguments)
+
+
+def _area_means(image: Array, grid: PinholeGrid, parts: int) -> Array:
+    """Means of the nearest pixels at parts × parts positions in each pixel, in float64."""
+    height, width = image.shape[:2]
+    sides = [(np.arange(parts * n) + 0.5) / parts - n / 2 for n in grid.size]
+    y, x = np.meshgrid(*(side * grid.pitch for side in sides), indexing="ij")
+    rays = np.einsum("nwc,ijc->nijw", grid.world_from_camera, np.stack([x, y, np.ones_like(x)], -1))
+    longitude = np.arctan2(rays[..., 1], rays[..., 0])
+    latitude = np.arctan2(rays[..., 2], np.hypot(rays[..., 0], rays[..., 1]))
+    column = ((longitude / (2 * np.pi) + 0.5) * width).astype(int) % width
+    row = ((0.5 - latitude / np.pi) * height).astype(int).clip(0, height - 1)
+    cells = image[row, column].reshape(-1, grid.size[0], parts, grid.size[1], parts)
+    return np.asarray(cells.mean(axis=(2, 4)))
+
+
+COARSE = [
+    RingGrid([{"pitch": 0, "views": 6}, {"pitch": 90, "views": 1}, {"pitch": -90, "views": 1}],
+             (100, 100), (24, 24)),
+    CubeGrid(16),
+    TangentGrid(0, 4),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32, np.float64, np.int32])
+@pytest.mark.parametrize("grid", COARSE)
+def test_views_coarser_than_the_panorama_are_area_means(grid: PinholeGrid, dtype: Any) -> None:
+    """White noise keeps the deviation of area means; stripes of one pixel become gray."""
+    height = 256
+    noise = np.random.default_rng(0).integers(0, 2, (height, 2 * height)) * 255.0
+    stripes = np.tile([0.0, 255.0], (height, height))
+    panorama = np.stack([noise, stripes], axis=-1).astype(dtype)
+    images = equirect_to_tangent(panorama, grid)
+    assert images.dtype == dtype
+    means = _area_means(noise, grid, 2 * round(grid.pitch * height / np.pi) + 1)
+    error = images[..., 0].astype(float) - means
+    assert images[..., 0].std() < 1.1 * means.std()
+    assert np.sqrt((error**2).mean()) < means.std()  # without reduction 3 to 5 times as much
+    assert np.abs(images[..., 1].astype(float) - 127.5).max() < 20
+    tensor = torch.from_numpy(panorama.astype(np.float64)).movedim(-1, 0).requires_grad_()
+    rendered = equirect_to_tangent(tensor, grid)
+    assert np.abs(rendered.movedim(1, -1).detach().numpy() - images).max() <= 1.5
+    (gradient,) = torch.autograd.grad(rendered.sum(), tensor)
+    assert gradient.sum() == pytest.approx(rendered.numel())
+    labels = equirect_to_tangent(panorama, grid, interpolation="nearest")
+    assert set(np.unique(labels)) == {0, 255}
+
+
+@pytest.mark.parametrize("grid", [TangentGrid(0, 5), TangentGrid(2, 5), CubeGrid(32)])
+def test_views_of_the_level_use_the_panorama_itself(grid: PinholeGrid) -> None:
+    panorama = _random(equirect_shape(5))
+    assert reduce_to_pitch(panorama, grid.pitch) is panorama
+
+
+@pytest.mark.parametrize("channels", [(), (3,), (5,)])
+def test_only_sides_that_become_smaller_are_averaged(channels: tuple[int, ...]) -> None:
+    stripes = np.broadcast_to(np.arange(64) % 2 * 200.0, (8, 64)).astype(np.uint8)
+    image = np.broadcast_to(stripes.reshape(8, 64, *(1 for _ in channels)), (8, 64, *channels))
+    assert (resize(image, (16, 8), "bilinear") == 100).all()
+    tensor = torch.from_numpy(stripes.astype(np.float32))[None].requires_grad_()
+    assert torch.allclose(resize(tensor, (16, 8), "bilinear"), torch.tensor(100.0))

@@ -13,11 +13,11 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError, at_least, check_choice
 from tangent_train.geometry import equirect_shape, random_rotation
-from tangent_train.rendering.forward import Blend, Interpolation, Pixels, rotate_equirect
+from tangent_train.rendering.forward import Blend, rotate_equirect
 from tangent_train.rendering.representations.perspective import PhotoCrops
 from tangent_train.rendering.representations.pinhole import unless_identity
 from tangent_train.rendering.representations.views import RotationAugmentation, Views
-from tangent_train.rendering.resampling import resize
+from tangent_train.rendering.resampling import Interpolation, Pixels, resize
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,10 +20,9 @@ from torch import Tensor
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import lengths_of_rays, shift_range
-from tangent_train.rendering.forward import Interpolation, Pixels
 from tangent_train.rendering.kernels import NO_OWNERS, CanvasGeometry
 from tangent_train.rendering.representations.views import Views
-from tangent_train.rendering.resampling import crop
+from tangent_train.rendering.resampling import Interpolation, Pixels, crop
 from tangent_train.rendering.tables import plane_rays
 
 _PAPER_FOV_DEG = 45.0

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tangent_train.geometry import PinholeGrid, ray_lengths
-from tangent_train.rendering.forward import Blend, Interpolation, Pixels, equirect_to_tangent
+from tangent_train.rendering.forward import Blend, equirect_to_tangent
 from tangent_train.rendering.kernels import CanvasGeometry
+from tangent_train.rendering.resampling import Interpolation, Pixels, reduce_to_pitch
 from tangent_train.rendering.tables import canvas_geometry, owners
 
 RotationAugmentation = Literal["none", "yaw", "so3"]
@@ -53,6 +54,10 @@ class Views:
     def __getitem__(self, part: slice) -> Self:
         """Return some of the views."""
         raise NotImplementedError
+
+    def reduced(self, image: Pixels) -> Pixels:
+        """Return an image at the resolution of the views, for many calls of `render`."""
+        return image
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """Render the views, with the dtype of the image.
@@ -173,6 +178,10 @@ class PinholeViews(Views):
     def is_overlapping(self) -> bool:  # type: ignore[override]
         """See `Views`."""
         return self.grid.is_overlapping
+
+    def reduced(self, image: Pixels) -> Pixels:
+        """See `Views`."""
+        return reduce_to_pitch(image, self.grid.pitch)
 
     def render(self, image: Pixels, interpolation: Interpolation) -> Pixels:
         """See `Views`."""

@@ -1,0 +1,125 @@
+"""Words of a command line: refuse those that are not settings, and explain errors of Hydra."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra._internal.utils import get_args_parser
+from hydra.errors import MissingConfigException, OverrideParseException
+from omegaconf import OmegaConf
+from omegaconf.errors import InterpolationResolutionError
+
+from tangent_train.config.settings import (
+    SETTINGS,
+    RunSettings,
+    config_name,
+    dotted_names,
+    is_within,
+)
+from tangent_train.errors import SettingError, first_line, nearest
+from tangent_train.files import config_folder
+
+_POSITIONAL = ("checkpoint", "input", "output")
+"""Settings that words without a name stand for in other programs, in this order."""
+
+
+def check_words(command: str, arguments: Sequence[str]) -> None:
+    """Refuse options that Hydra lacks, and words without ``=``.
+
+    Args:
+        command: Name of the command, e.g. predict.
+        arguments: Command line after the program's name.
+
+    Raises:
+        SettingError: There is such a word.
+    """
+    parser = get_args_parser()
+    parser.allow_abbrev = False
+    parsed, others = parser.parse_known_args([*arguments])
+    expected = "settings as name=value"
+    for option in (word for word in others if word.startswith("-")):
+        name = option.partition("=")[0].strip("-").replace("-", "_")
+        config_name(command, ())
+        with initialize_config_dir(str(config_folder()), version_base="1.3"):
+            remedy = nearest(name, _known(command, compose(command, return_hydra_config=True)))
+        raise SettingError(option, found="an option", expected=expected, remedy=remedy)
+    words = [word for word in [*parsed.overrides, *others] if not re.search("[=~]", word)]
+    if words:
+        typed = {word.partition("=")[0] for word in parsed.overrides}
+        fields = SETTINGS[command].model_fields
+        names = [name for name in _POSITIONAL if name in fields and name not in typed]
+        remedy = f"tangent-{command} --help lists them."
+        if len(words) <= len(names):
+            remedy = f"Did you mean {' '.join(map(typed_setting, names, words))}?"
+        raise SettingError(words[0], found="a word without =", expected=expected, remedy=remedy)
+
+
+def typed_setting(name: str, value: str) -> str:
+    """Return a setting as it is typed in a shell.
+
+    >>> print(typed_setting("input", "holiday/1.jpg"), typed_setting("input", "holiday (1).jpg"))
+    input=holiday/1.jpg 'input="holiday (1).jpg"'
+    """
+    if re.fullmatch(r"[\w./:+-]+", value, re.ASCII):
+        return f"{name}={value}"
+    return "'" + f'{name}="{value}"'.replace("'", "'\\''") + "'"
+
+
+def explained(error: Exception, command: str) -> SettingError | None:
+    """Return an error of Hydra or OmegaConf as one line, with a remedy; None if it is another.
+
+    Args:
+        error: The error.
+        command: Name of the command, whose settings are suggested.
+    """
+    if isinstance(error, OverrideParseException):
+        return _unreadable(error.override)
+    if isinstance(error, MissingConfigException) and error.options:
+        return _missing_option(error)
+    if isinstance(error, InterpolationResolutionError):
+        reason = re.sub("^.*resolving interpolation: ", "", first_line(error)).strip('"')
+        expected = "a setting or variable that exists"
+        return SettingError(error.full_key, found=reason, expected=expected)
+    node = getattr(error.__cause__, "parent_node", None)
+    typed = re.search(r"use \+([^=]*)=(.*)", str(error), re.DOTALL)
+    if node is None or typed is None:
+        return None
+    remedy = nearest(typed[1], _known(command, node._get_root()))
+    return SettingError(typed[1], found=typed[2], expected="a known setting", remedy=remedy)
+
+
+def _missing_option(error: MissingConfigException) -> SettingError:
+    """Return the error of an option that a group lacks."""
+    named = re.search("Available options in '(.*)'", str(error))
+    group = named[1] if named else ""
+    option = str(error.missing_cfg_file).removeprefix(f"{group}/")
+    files = (config_folder() / group).rglob("*.yaml")
+    own = {path.relative_to(config_folder() / group).with_suffix("").as_posix() for path in files}
+    options = sorted(own.union(error.options or ()))
+    remedy = nearest(option, options)
+    return SettingError(group, found=option, expected=f"one of {', '.join(options)}", remedy=remedy)
+
+
+def _unreadable(override: str) -> SettingError:
+    """Return the error of a setting that Hydra cannot parse."""
+    name, _, value = override.partition("=")
+    remedy = f"Quote other characters: {typed_setting(name, value)}"
+    if value.startswith("~"):
+        remedy = f"Type the folder in full: {typed_setting(name, str(Path(value).expanduser()))}"
+    expected = "a number, a word, a path, or a list such as [1,2]"
+    return SettingError(name, found=value or "nothing", expected=expected, remedy=remedy)
+
+
+def _known(command: str, config: Any) -> list[str]:
+    """Return the names of groups and settings that a command reads."""
+    kind = SETTINGS[command]
+    names = {*dotted_names(OmegaConf.to_container(config, resolve=False))}
+    if issubclass(kind, RunSettings):
+        names |= {path.name for path in config_folder().iterdir() if path.is_dir()}
+    known = [name for name in sorted(names) if not is_within(name, (*kind.not_read, "hydra"))]
+    is_run = "hydra" in config and config.hydra.run.dir != "."
+    return [*known, *["hydra.run.dir"] * is_run]

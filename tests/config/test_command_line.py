@@ -1,0 +1,133 @@
+"""What is typed: interpolations, words of other programs, hints, and the version."""
+
+from __future__ import annotations
+
+import re
+import sys
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+import tangent_train
+from tangent_train.cli import main, processes
+from tests.cli.tiny_runs import run_command
+from tests.config.test_settings import GIVEN
+from tests.running import Capture, Patch, composed_settings, run_python
+
+UNREAD = r"expected no such setting: an evaluation does not read it\."
+
+
+@pytest.fixture(autouse=True)
+def _folder(tmp_path: Path, monkeypatch: Patch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MY_DATA", str(tmp_path / "my data"))
+    monkeypatch.delenv("UNSET", raising=False)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("train ckpt_path=x", "ckpt_path: found x; .*Did you mean resume or init_from?"),
+        ("transfer ckpt_path=x", "Did you mean checkpoint?"),
+        ("train batch_size=2", "Did you mean data.batch_size?"),
+        ("predict data.batch_size=2 input=x", "Did you mean view_batch_size?"),
+        ("train trainer.epochs=2", "Did you mean trainer.max_epochs?"),
+        ("evaluate optimizer.learning_rate=2", "expected a known setting."),
+        ("train model=unet", "Did you mean network?"),
+        ("predict +level=5", "Did you mean levels?"),
+        ("train save_dir=x", "Did you mean hydra.run.dir?"),
+        ("prepare save_dir=x", "expected a known setting."),
+        ("train --checkpoint x", "--checkpoint: found an option; .*mean resume or init_from?"),
+        ("train --config x.yaml", "Did you mean experiment?"),
+        ("predict net.onnx in out", "mean checkpoint=net.onnx input=in output=out?"),
+        ("predict checkpoint=net.onnx in", "Did you mean input=in?"),
+        ("render a(1).jpg", "Did you mean 'input=\"a(1).jpg\"'?"),
+        ("train fast", "fast: found a word without =; .*tangent-train --help lists them."),
+        ("train experiment=rooms/demoo", "experiment: found rooms/demoo; .*mean rooms/demo?"),
+        ("train data=5", "Config group override must be a string or a list. Got int"),
+        ("train data.root=~/x", f"in full: data.root={Path('~/x').expanduser()}"),
+        ("train data.root=r(a", "Quote other characters: 'data.root=\"r(a\"'"),
+        ("train data.root=${oc.env:UNSET}", "data.root: found .*'UNSET' not found; expected"),
+        ("train data.root=${rot}", "data.root: found Interpolation key 'rot' not found; "),
+        ("train resume=${oc.env:UNSET}", "resume: found .*'UNSET' not found; expected"),
+        ("train resume=${oc.env:MY_DATA}", "my data: found no config.yaml"),
+    ],
+)
+def test_hints_are_true_for_the_command(
+    words: str, message: str, monkeypatch: Patch, capsys: Capture
+) -> None:
+    command, *arguments = words.split()
+    expected = ".*".join(map(re.escape, message.split(".*")))
+    with pytest.raises(SystemExit, match=expected) as ended:
+        run_command(monkeypatch, command, *arguments)
+    text = str(ended.value)
+    assert "\n" not in text
+    assert ("mean " in message) == ("Did you mean" in text)
+    assert not any(capsys.readouterr())
+
+
+def test_interpolations_are_those_of_files(tmp_path: Path) -> None:
+    root = "${oc.env:MY_DATA}/${name}"
+    settings = composed_settings("train", f"data.root={root}", f"data.cache='{root}'", "name=x")
+    assert settings.data["root"] == settings.data["cache"] == f"{tmp_path}/my data/x"
+    given = GIVEN["predict"]
+    assert composed_settings("predict", *given, "input=${oc.env:MY_DATA}").input == str(
+        tmp_path / "my data"
+    )
+
+
+def test_jobs_of_a_sweep_resolve_interpolations(tmp_path: Path, monkeypatch: Patch) -> None:
+    lines: list[list[str]] = []
+
+    def run_process(line: list[str]) -> int:
+        lines.append(line)
+        return 0
+
+    monkeypatch.setattr(processes, "run_process", run_process)
+    root = "data.root=${oc.env:MY_DATA}/${name}"
+    run_command(monkeypatch, "train", "-m", "seed=1,2", root, "hydra.sweep.dir=sweep")
+    found = [composed_settings("train", *line[1:3]) for line in lines]
+    expected = f"{tmp_path}/my data/run"
+    assert [(one.seed, one.data["root"]) for one in found] == [(1, expected), (2, expected)]
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        *("trainer.max_epochs=1", "task.head.label_smoothing=0.1", "task.backbone_lr_factor=1"),
+        *("data.color_jitter=1", "recipe=small", "optimizer.lr=1"),
+    ],
+)
+def test_an_evaluation_refuses_settings_of_a_training(setting: str, monkeypatch: Patch) -> None:
+    with pytest.raises(SystemExit, match=f"{setting.partition('=')[0]}: found a value; {UNREAD}"):
+        run_command(monkeypatch, "evaluate", "checkpoint=.", "data=synthrooms", setting)
+
+
+@pytest.mark.parametrize("command", ["train", "predict", "report", "import"])
+def test_every_command_prints_the_version(
+    command: str, monkeypatch: Patch, capsys: Capture
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        run_command(monkeypatch, command, "--version")
+    assert not ended.value.code
+    expected = version("tangent-train")
+    assert capsys.readouterr().out == f"tangent-{command} {expected}\n"
+    assert tangent_train.__version__ == expected
+
+
+def test_the_package_lists_its_commands(monkeypatch: Patch, capsys: Capture) -> None:
+    monkeypatch.setattr(sys, "argv", ["tangent_train"])
+    main.overview()
+    printed = capsys.readouterr().out
+    commands = {line.split()[0] for line in printed.splitlines() if line.startswith("tangent-")}
+    scripts = Path(tangent_train.__file__).parents[1] / "pyproject.toml"
+    assert commands == {
+        line.split()[0] for line in scripts.read_text().splitlines() if "cli.main:" in line
+    }
+
+
+def test_modules_run_as_commands(tmp_path: Path) -> None:
+    done = run_python(tmp_path, "-m", "tangent_train.cli.export", "output=x.onnx")
+    assert done.returncode == 1
+    assert done.stderr.startswith("tangent-export: checkpoint: found nothing; expected network")
