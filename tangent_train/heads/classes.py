@@ -114,9 +114,11 @@ class ClassesHead(Head):
 
     # Scores
 
-    def build_metric(self) -> segmentation.SegmentationMetric:
+    def build_metric(self) -> Any:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
-        return segmentation.SegmentationMetric(len(self.class_names))
+        from tangent_train.metrics.collected import SegmentationMetric  # seconds to import
+
+        return SegmentationMetric(len(self.class_names))
 
     def _both(self, pixels: Any, angles: Any, compute: Callable[[Any], Any]) -> dict[str, Any]:
         """Return scores by pixels; for panoramas, which have solid angles, by these too."""
@@ -336,9 +338,11 @@ class ImageClassHead(Head):
         """Return the number of shapes."""
         return torch.full((), float(len(targets)), device=targets.device)
 
-    def build_metric(self) -> segmentation.ClassificationMetric:
+    def build_metric(self) -> Any:
         """Build the confusion matrix of whole shapes."""
-        return segmentation.ClassificationMetric(len(self.class_names))
+        from tangent_train.metrics.collected import ClassificationMetric  # seconds to import
+
+        return ClassificationMetric(len(self.class_names))
 
     def scores(self, result: Any) -> Scores:
         """Return the accuracy over shapes, its mean over classes, and that of every class."""

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.collected import DepthMetric
 from tangent_train.metrics.depth import (
     Alignment,
-    DepthMetric,
     DepthProtocol,
     depth_intervals,
     depth_scores,
