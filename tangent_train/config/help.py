@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import yaml  # type: ignore[import-untyped]
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.object_type import ObjectType
 
 from tangent_train.config.settings import SETTINGS, Settings, comment_of, plain
 from tangent_train.files import config_folder
@@ -35,6 +39,20 @@ class Setting(NamedTuple):
     name: str
     value: str
     comment: str
+
+
+def listed_by_files() -> AbstractContextManager[Any]:
+    """Let Hydra list the options of groups by their files: it composes the config for each group.
+
+    Two thirds of the time of ``--help`` would be spent on it.
+    """
+
+    def options(
+        loader: ConfigLoaderImpl, group_name: str, results_filter: Any = ObjectType.CONFIG
+    ) -> list[str]:
+        return loader.repository.get_group_options(group_name, results_filter)
+
+    return patch.object(ConfigLoaderImpl, "get_group_options", options)
 
 
 def annotate(text: str, command: str) -> str:

@@ -95,6 +95,10 @@ class ImageSettings(Settings):
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
+    not_content: ClassVar[Sequence[str]] = (
+        *("output", "report", "shard", "view_batch_size", "device", "trust"),
+    )
+
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
     output: Path
@@ -157,6 +161,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
+
+    not_content: ClassVar[Sequence[str]] = ("figure", "output", "overwrite")
 
     input: str | Path | None = None
     """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
