@@ -49,7 +49,6 @@ def _main(command: str) -> None:
     _print_version(command)
     import hydra
 
-    from tangent_train.cli.paths import check_paths
     from tangent_train.cli.processes import in_sweep, run_job
     from tangent_train.config.command_line import check_words
     from tangent_train.config.help import annotate, listed_by_files
@@ -61,7 +60,7 @@ def _main(command: str) -> None:
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
             settings = validate(command, config)
-            check_paths(settings)
+            import_module("tangent_train.cli.paths").check_paths(settings)
             name = {"import": "import_network"}.get(command, command)  # import is a keyword
             return getattr(import_module(f"tangent_train.cli.{name}"), name)(settings)
 

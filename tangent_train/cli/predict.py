@@ -29,6 +29,9 @@ from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
+_NAMED = 10
+"""Images that a message names, at most."""
+
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
 
@@ -76,6 +79,12 @@ def predict(settings: PredictSettings) -> None:
         if shown:
             folder.write_page(entries, list(prediction.pictures(inputs, shown)))
         folder.table(entries).print()
+        if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
+            print_text(
+                "The network's output is NaN or infinite in parts of "
+                f"{counted(len(spoiled), 'images')}, which are unknown unless other views show "
+                "them: " + ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
+            )
         print_text(f"Results are in {settings.output}.")
     if errors:
         total = len(missing) + done
@@ -180,7 +189,7 @@ class _Prediction:
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
         predicted: PredictedImage = job.value
-        image, pixels, _ = predicted
+        image, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
             is_counted = image.cut(self._masks.read(job.name, image.area)) > 0
@@ -190,6 +199,8 @@ class _Prediction:
         entry: dict[str, Any] = {"rows": pixels.shape[0], "columns": pixels.shape[1]}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
+        if share := facts.get("not_finite"):
+            entry["not_finite"] = float(f"{share:.4g}")
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
 
     def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:

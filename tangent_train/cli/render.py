@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder.labeled import class_masks
+from datamodules.folder.class_masks import class_masks
 from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read

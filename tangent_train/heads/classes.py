@@ -33,7 +33,7 @@ from tangent_train.metrics.scores import (
 )
 from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
 from tangent_train.rendering import Blend
-from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.mosaic import ScoreMosaic, without_softmax
 
 _ROWS_AT_ONCE = 64
 _BINS = 256
@@ -173,8 +173,9 @@ class ClassesHead(Head):
         return mosaic
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Return the labels of the largest logits."""
-        return self.labels_of(outputs.argmax(dim=1))
+        """Return the labels of the largest logits; 0 where they have no softmax."""
+        known = ~without_softmax(outputs)[:, 0]
+        return self.labels_of(outputs.argmax(dim=1).where(known, self.num_outputs))
 
     def labels_of(self, best: Tensor) -> Tensor:
         """Return the labels of outputs: 0 where the best one belongs to none of the K classes."""
@@ -280,8 +281,6 @@ class LabelMosaic(ScoreMosaic):
         **settings: See `ScoreMosaic`.
     """
 
-    facts: Mapping[str, Any] = NOTHING
-
     def __init__(
         self,
         head: ClassesHead,
@@ -294,6 +293,11 @@ class LabelMosaic(ScoreMosaic):
         least = 0.0 if head.min_share else head.min_confidence
         super().__init__(shape, head.num_outputs, blend, min_confidence=least, **settings)
         self._head, self.valid = head, valid
+
+    @property
+    def facts(self) -> Mapping[str, float]:
+        """The share of pixels of views without a class, see `ScoreMosaic.add`, if there are any."""
+        return {"not_finite": self.not_finite} if self.not_finite else NOTHING
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""

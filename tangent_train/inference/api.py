@@ -249,7 +249,7 @@ class Network:
         Returns:
             An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; index k belongs to label
             k + 1. Probabilities add up to 1, or to less for imported networks that also predict
-            "none of the classes".
+            "none of the classes". All are 0 where the scores are NaN or infinite.
 
         Raises:
             DataError: See `labels`.

@@ -111,13 +111,19 @@ class DepthProtocol:
                 values = scaled_and_shifted(values, true.where(used, torch.nan))
             else:
                 v, t = values[used], true[used]
-                values *= t.median() / v.median() if self.alignment == "median" else v @ t / (v @ v)
+                is_median = self.alignment == "median"
+                values *= _median(t) / _median(v) if is_median else v @ t / (v @ v)
             if power < 0 and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
             distances = lengths * values**power
         if self.clip:
             distances = distances.clamp(self.min_distance, self.max_distance)
         return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)
+
+
+def _median(values: Float[Tensor, " n"]) -> Tensor:
+    """Return the mean of both middle values, like NumPy; torch returns the lower one."""
+    return (values.median() - (-values).median()) / 2
 
 
 def scaled_and_shifted(
