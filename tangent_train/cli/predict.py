@@ -29,9 +29,6 @@ from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
-_NOT_CONTENT = {"output", "report", "shard", "view_batch_size", "device", "trust"}
-"""Settings that do not change the predictions."""
-
 _NAMED = 10
 """Images that a message names, at most."""
 
@@ -49,7 +46,7 @@ def predict(settings: PredictSettings) -> None:
     shard, inputs = Shard.parse(settings.shard), Inputs.find(settings.input, settings.every)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
-    content = settings.model_dump(mode="json", exclude=_NOT_CONTENT)
+    content = settings.model_dump(mode="json", exclude={*settings.not_content})
     content["write"] = list(folder.kinds)
     # Not its path: a copy continues a folder, a checkpoint that was trained further does not.
     with settings.checkpoint.open("rb") as file:
