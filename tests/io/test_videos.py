@@ -214,7 +214,7 @@ def test_other_rotations_are_refused(tmp_path: Path, degrees: int) -> None:
         ((64, 128), (1001, 1000), (64, 128)),
     ],
 )
-def test_the_display_size_decides(  # noqa: PLR0913, PLR0917 - every combination
+def test_the_display_size_decides(
     tmp_path: Path,
     suffix: str,
     quarter_turns: int,
