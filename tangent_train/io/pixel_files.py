@@ -77,6 +77,8 @@ def _opened(path: Path) -> Iterator[_StoredImage]:
             yield stored
     except SettingError:  # a missing package
         raise
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise DataError(path, found=error, expected="an image file") from error
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]
