@@ -81,13 +81,14 @@ def _explained(place: str, target: str) -> Iterator[None]:
 
 def _check_types(function: Callable[..., Any], values: Mapping[str, Any], place: str) -> None:
     """Raise SettingError unless values are of the types that a function declares."""
+    called: Any = function
     try:
-        called: Any = vars(function).get("__init__") if isinstance(function, type) else function
-        hints = get_type_hints(called) if called is not None else {}
+        hints = get_type_hints(called.__init__ if isinstance(function, type) else called)
     except NameError:  # names that are imported for type checkers only
         return
     kinds = {name: hints[name] for name, v in values.items() if name in hints and v is not None}
-    arguments: Any = TypedDict("arguments", kinds)  # type: ignore[operator]
+    make: Any = TypedDict
+    arguments = make("arguments", kinds)
     arguments.__pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
     try:
         TypeAdapter(arguments).validate_python({name: values[name] for name in kinds})
