@@ -28,6 +28,9 @@ _CONVERT = "Convert images of other formats, for example to JPEG or PNG."
 DEPTH_SUFFIXES = (".png", ".tif", ".tiff", ".npy", ".exr")
 """Suffixes of depth maps."""
 
+MOST_PIXELS = 32768 * 16384
+"""Largest image: a file of a few kilobytes can claim more than memory holds."""
+
 
 def image_paths(
     pattern: str | Path,
@@ -65,7 +68,10 @@ def image_paths(
     skipped = Counter(file.suffix.lower() or "without suffix" for file in found.difference(images))
     kinds = ", ".join(f"{count} {repr(kind)[1:-1]}" for kind, count in sorted(skipped.items()))
     if not images:
-        others = f"{len(found)} files, none of them an image: {kinds}" if found else "nothing"
+        others = (
+            "nothing" if path.exists() or glob.has_magic(str(path)) else "no such file or folder"
+        )
+        others = f"{len(found)} files, none of them an image: {kinds}" if found else others
         raise DataError(
             pattern,
             found="only results of this command" if files and not found else others,
