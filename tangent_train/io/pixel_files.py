@@ -80,6 +80,8 @@ def _opened(path: Path, channel: str | None = None) -> Iterator[_StoredImage]:
             yield stored
     except (SettingError, DataError):  # a missing package, or no such channel
         raise
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise DataError(path, found=error, expected="an image file") from error
     # Decoders of broken files raise anything, from OSError to SyntaxError and IndexError.
     except Exception as error:
         reason = getattr(error, "strerror", None) or str(error).partition(" <")[0]

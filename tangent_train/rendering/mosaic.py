@@ -19,6 +19,8 @@ from tangent_train.geometry.coverage import check_coverage
 from tangent_train.rendering.forward import (
     Blend,
     blend_of,
+    check_array,
+    check_grid,
     check_images,
     check_interpolation,
     check_shape,
@@ -294,6 +296,8 @@ def tangent_to_equirect(
     """
     if is_traced(images):
         return traced("tangent_to_equirect", images, grid, shape, blend, interpolation)
+    check_array("tangent images", images)
+    check_grid(grid)
     blend = blend_back(grid, blend)
     check_interpolation(interpolation, blend)
     shape = check_shape(shape)
@@ -338,6 +342,8 @@ def tangent_to_labels(
     """
     if is_traced(logits):
         return traced("tangent_to_labels", logits, grid, shape, blend)
+    check_array("scores", logits)
+    check_grid(grid)
     scores = _tensor(logits) if isinstance(logits, np.ndarray) else logits.detach()
     blend = blend_back(grid, blend)
     shape = check_shape(shape)
