@@ -57,7 +57,10 @@ def read_placed(
         SettingError: The angles are invalid.
     """
     is_nearest = interpolation == "nearest"
-    image = frame() if frame else pixel_files.read_pixels(path, indices=is_nearest)
+    if frame:
+        image = frame()
+    else:
+        image = pixel_files.read_pixels(path, indices=is_nearest, in_srgb=not is_nearest)
     area = read_area(path, (image.shape[0], image.shape[1]), angles)
     return area.place(image), area
 
