@@ -88,7 +88,8 @@ def _calls(settings: list[str], root: str, rows: int) -> tuple[Callable[[], obje
         batch = next(iter(data.train_dataloader()))
         images, labels = task.training_pairs(batch._replace(images=data.normalized(batch)))
         optimizer.zero_grad()
-        torch.autograd.backward(task.loss_sum((images,), labels) / task.head.loss_norm(labels))
+        loss = task.loss_sum(task(images), labels) / task.head.loss_norm(labels)
+        torch.autograd.backward(loss)
         optimizer.step()
 
     def evaluate() -> None:

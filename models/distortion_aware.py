@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch._compile import _disable_dynamo
 from torch.nn import functional
 from torch.utils.checkpoint import checkpoint
 
@@ -96,7 +97,7 @@ class DistortionAwareConv2d(nn.Conv2d):
         return torch.cat(outputs, dim=-2)
 
 
-@torch.compiler.disable  # type: ignore[untyped-decorator]
+@_disable_dynamo  # torch.compiler.disable would import the compiler now
 @lru_cache(maxsize=256)
 def _row_taps(
     shape: tuple[int, int],

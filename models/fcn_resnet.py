@@ -9,7 +9,6 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
-from torchvision.models import get_model, get_weight
 
 from models.pretrained import fetch_tensors, load_tensors, tensors_for, widen_stem
 
@@ -50,6 +49,8 @@ class FCNResNet(nn.Module):
         weights: str | Path | None = None,
         frozen_statistics: bool = False,
     ) -> None:
+        from torchvision.models import get_model  # slow to import, and for this network only
+
         super().__init__()
         untrained = {"weights": None, "weights_backbone": None, "aux_loss": False}
         fcn: Any = get_model(f"fcn_resnet{depth}", num_classes=num_classes, **untrained)
@@ -82,7 +83,7 @@ class FCNResNet(nn.Module):
 def _tensors(network: nn.Module, weights: str, depth: int) -> dict[str, Tensor]:
     """Return the tensors named by `weights`, under their names in the FCN."""
     if weights in _PUBLISHED:
-        tensors = fetch_tensors(get_weight(_PUBLISHED[weights].format(depth)))
+        tensors = fetch_tensors(_PUBLISHED[weights].format(depth))
     else:
         tensors = tensors_for(network, Path(weights))
     if "conv1.weight" in tensors:  # state dict of a ResNet classifier

@@ -11,7 +11,6 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
-from torchvision.models import WeightsEnum
 
 from tangent_train.errors import DataError, SettingError, printable
 from tangent_train.files import load_plain
@@ -116,10 +115,12 @@ def _prefixes(names: Iterable[str], ends: Mapping[str, object]) -> list[tuple[st
     return sorted(counts.items(), key=lambda item: (-item[1], len(item[0]))) or [("", 0)]
 
 
-def fetch_tensors(weights: WeightsEnum) -> dict[str, Tensor]:
+def fetch_tensors(weights: str) -> dict[str, Tensor]:
     """Return tensors published by torchvision, from the local cache or the internet."""
+    from torchvision.models import get_weight  # slow to import
+
     return dict(
-        weights.get_state_dict(
+        get_weight(weights).get_state_dict(
             progress=True, check_hash=True, map_location="cpu", weights_only=True
         )
     )

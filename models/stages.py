@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch._compile import _disable_dynamo
 from torch.nn import functional
 from torch.nn.modules.batchnorm import _BatchNorm
 from torch.utils.checkpoint import checkpoint
@@ -181,7 +182,7 @@ class SphereContext(nn.Module):
         rows, columns = (min(side, self.tokens) for side in features.shape[-2:])
         return functional.adaptive_avg_pool2d(features, (rows, columns))
 
-    @torch.compiler.disable  # type: ignore[untyped-decorator]
+    @_disable_dynamo  # torch.compiler.disable would import the compiler now
     def _in_chunks(self, images: Tensor, rays: Tensor, size: int) -> Any:
         """Encode in chunks, mix the tokens of all, decode in chunks."""
         chunks = torch.tensor_split(images, -(-len(images) // size))  # even ones

@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 import logging
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 
@@ -24,6 +26,24 @@ def check_own_packages() -> None:
         found = None if spec is None else spec.origin
         if found is None or Path(found).parents[1] != root:
             raise ImportError(f"{found} has the name of a package of tangent-train: rename it")
+
+
+def on_first_use(package: str, homes: Mapping[str, str]) -> Callable[[str], Any]:
+    """Return the ``__getattr__`` of a package whose names are imported when they are first used.
+
+    Importing a small module of the package then does not import all its libraries.
+
+    Args:
+        package: Name of the package.
+        homes: Module in the package by the name that it defines.
+    """
+
+    def imported(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(import_module(f"{package}.{homes[name]}"), name)
+
+    return imported
 
 
 @contextmanager

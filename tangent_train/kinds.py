@@ -19,6 +19,9 @@ wins where the probability is below ½.
 Align = Literal["none", "scale", "affine", "grid"]
 """Correction of each view: none; a scale; a scale and a shift; or a coarse grid of scales."""
 
+Upright = Literal["pose", "auto"] | None
+"""Source of the up direction of a panorama."""
+
 DepthKind = Literal[
     "log_distance",
     "metric_distance",

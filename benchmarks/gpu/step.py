@@ -91,7 +91,7 @@ def _step(
     def take() -> None:
         optimizer.zero_grad()
         with torch.autocast(DEVICE.type, torch.bfloat16, enabled=half and on_gpu):
-            loss = task.loss_sum((images,), labels) / task.head.loss_norm(labels)
+            loss = task.loss_sum(task(images), labels) / task.head.loss_norm(labels)
         torch.autograd.backward(loss)
         optimizer.step()
 

@@ -12,7 +12,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.utils.data import Dataset
-from torchvision.transforms.v2 import functional
 
 from datamodules.core.depth import STEPS_PER_M
 from datamodules.core.files import Split
@@ -268,6 +267,8 @@ def jitter_colors(rgb: Tensor, strength: float, rng: np.random.Generator) -> Ten
     Returns:
         ``(n, h, w, 3)`` uint8.
     """
+    from torchvision.transforms.v2 import functional  # slow to import, and for training only
+
     brightness, contrast, saturation = rng.uniform(1 - strength, 1 + strength, 3)
     hue = rng.uniform(-1, 1) * strength * _HUE_SHARE
     # As one tall image: with one mean for all, neighboring views keep equal colors at seams.

@@ -47,6 +47,7 @@ from tangent_train.io.gpano import (
 )
 from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_image_size, read_pixels, read_rgb
+from tangent_train.kinds import Upright
 from tangent_train.orientation.gravity import estimate_up
 from tangent_train.orientation.manhattan import MOST_ROWS
 from tangent_train.progress import show_progress
@@ -58,9 +59,6 @@ from tangent_train.rendering.resampling import resize
 
 Unknown = Literal["labels", "any_black", "all_black"]
 """Pixels that are unknown in addition to unlabeled pixels; see `mask_black`."""
-
-Upright = Literal["pose", "auto"] | None
-"""Source of the up direction of a panorama."""
 
 TestRotation = Annotated[float, Field(ge=0, le=180)] | Literal["so3"] | None
 """Rotation of test panoramas: a tilt in degrees, uniformly random (SO(3)), or null."""

@@ -30,9 +30,8 @@ from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap, read_label_map
 from datamodules.folder.cameras import FolderCameras, read_folder_cameras
 from datamodules.folder.splits import FolderSplits
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.io import image_files
-from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_depth_m
 
 
@@ -152,23 +151,3 @@ class FolderPhotos(LabeledFolder, PhotoDataModule):
 
 def _name(folder: Path, path: Path) -> str:
     return image_files.composed(path.relative_to(folder).with_suffix("").as_posix())
-
-
-def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
-    """Return masks that ignore all pixels of some classes.
-
-    Args:
-        folder: Folder with ``labels/`` and ``classes.json``, as for ``data=folder``.
-        ignored: Names of the classes.
-
-    Raises:
-        DataError: ``classes.json`` or ``labels/`` is missing or cannot be used.
-        SettingError: ``classes.json`` lacks one of the classes.
-    """
-    classes = read_label_map(folder / "classes.json")
-    names, ignored = classes.names, list(map(image_files.composed, ignored))
-    if set(ignored) - set(names):
-        found = ", ".join(sorted(set(ignored) - set(names)))
-        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
-    labels = [names.index(name) + 1 for name in ignored]
-    return Masks(folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels))

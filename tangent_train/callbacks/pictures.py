@@ -11,6 +11,8 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import Logger, MLFlowLogger, TensorBoardLogger, WandbLogger
 from torch import Tensor
 
+from tangent_train.console import print_text
+from tangent_train.errors import first_line
 from tangent_train.heads.base import RGB
 from tangent_train.heads.pictures import evenly_spread, shown_arrays
 from tangent_train.io.pixel_files import write_pixels
@@ -60,7 +62,10 @@ class Pictures(Callback):
         # The step at which Lightning logs the validation, one less than `global_step`.
         step = trainer.fit_loop.epoch_loop._batches_that_stepped
         for logger in trainer.loggers if panel is not None else ():
-            log_image(logger, tag, panel, step)
+            try:
+                log_image(logger, tag, panel, step)
+            except Exception as error:
+                print_text(f"{tag} is not logged: {first_line(error)}", error=True)
 
     def on_test_batch_end(  # noqa: D102 - a hook of Lightning
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int

@@ -132,6 +132,8 @@ def as_logits(scores: Tensor, kind: ScoreKind, num_labels: int) -> Tensor:
         known = (values >= 0) & (values < num_labels)  # False for NaN
         labels = torch.where(known, values.long(), num_labels)
         return functional.one_hot(labels, num_labels + 1).movedim(-1, 1) * _CERTAIN
+    if scores.shape[1] == 1 or kind == "probabilities":  # a limit would make infinity a probability
+        scores = scores.where(scores.isfinite(), torch.nan)
     if scores.shape[1] == 1:
         limit = torch.finfo(scores.dtype).eps
         logits = scores.logit(limit) if kind == "probabilities" else scores
@@ -158,17 +160,21 @@ def _resized(images: Tensor, size: Any) -> Tensor:
 def _mean_of_tiles(
     network: Callable[[Tensor], Tensor], images: Tensor, tile: tuple[int, int]
 ) -> Tensor:
-    """Return the mean scores of evenly spaced tiles that cover larger images."""
+    """Return the mean scores of evenly spaced tiles that cover larger images.
+
+    Pixels without a softmax do not count in the mean; they are NaN if there are no others.
+    """
     tops, lefts = (
         torch.linspace(0, side - part, -(-side // part)).round().int().tolist()
         for side, part in zip(images.shape[-2:], tile, strict=True)
     )
-    total, count = torch.zeros(()), images.new_zeros(images.shape[-2:])
+    total, count = torch.zeros(()), images.new_zeros((len(images), 1, *images.shape[-2:]))
     for top, left in itertools.product(tops, lefts):
         area = (..., slice(top, top + tile[0]), slice(left, left + tile[1]))
         scores = network(images[area])
         if not total.ndim:
             total = scores.new_zeros(*scores.shape[:2], *images.shape[-2:])
-        total[area] += scores
-        count[area] += 1
+        known = scores.amax(dim=1, keepdim=True).isfinite()
+        total[area] += scores.where(known, 0)
+        count[area] += known
     return total / count

@@ -29,8 +29,8 @@ from tangent_train.io.masks import Masks
 from tangent_train.manifest import Manifest, Shard
 from tangent_train.results.predictions import PredictionFolder, encode_prediction
 
-_NOT_CONTENT = {"output", "report", "shard", "view_batch_size", "device", "trust"}
-"""Settings that do not change the predictions."""
+_NAMED = 10
+"""Images that a message names, at most."""
 
 _COUNTED_IMAGES = 32
 """Images whose confidences are counted for `min_share`, at most."""
@@ -46,7 +46,7 @@ def predict(settings: PredictSettings) -> None:
     shard, inputs = Shard.parse(settings.shard), Inputs.find(settings.input, settings.every)
     prediction = _Prediction(settings)
     folder, names = prediction.folder, inputs.names
-    content = settings.model_dump(mode="json", exclude=_NOT_CONTENT)
+    content = settings.model_dump(mode="json", exclude={*settings.not_content})
     content["write"] = list(folder.kinds)
     # Not its path: a copy continues a folder, a checkpoint that was trained further does not.
     with settings.checkpoint.open("rb") as file:
@@ -79,6 +79,12 @@ def predict(settings: PredictSettings) -> None:
         if shown:
             folder.write_page(entries, list(prediction.pictures(inputs, shown)))
         folder.table(entries).print()
+        if spoiled := [entry["name"] for entry in entries if entry.get("not_finite")]:
+            print_text(
+                "The network's output is NaN or infinite in parts of "
+                f"{counted(len(spoiled), 'images')}, which are unknown unless other views show "
+                "them: " + ", ".join(spoiled[:_NAMED]) + ", …" * (len(spoiled) > _NAMED)
+            )
         print_text(f"Results are in {settings.output}.")
     if errors:
         total = len(missing) + done
@@ -183,7 +189,7 @@ class _Prediction:
     def write(self, job: Job) -> dict[str, Any]:
         """Write the results of one image; return its entry in the summary."""
         predicted: PredictedImage = job.value
-        image, pixels, _ = predicted
+        image, pixels, facts = predicted
         is_counted = np.array(True)
         if image.area is not None:
             is_counted = image.cut(self._masks.read(job.name, image.area)) > 0
@@ -193,6 +199,8 @@ class _Prediction:
         entry: dict[str, Any] = {"rows": pixels.shape[0], "columns": pixels.shape[1]}
         if image.up is not None:
             entry["tilt_deg"] = round(math.degrees(math.acos(np.clip(image.up[2], -1, 1))), 2)
+        if share := facts.get("not_finite"):
+            entry["not_finite"] = float(f"{share:.4g}")
         return entry | {self._head.summary: self._head.summarize(predicted, is_counted)}
 
     def pictures(self, inputs: Inputs, names: Collection[str]) -> Iterator[Any]:

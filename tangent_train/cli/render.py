@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.folder.labeled import class_masks
+from datamodules.folder.class_masks import class_masks
 from tangent_train.cli import main
 from tangent_train.config.build import build_from_config
 from tangent_train.config.settings import RenderSettings, check_read
@@ -60,7 +60,7 @@ def render(settings: RenderSettings) -> None:
         raise SettingError("input, back and poses", found=found, expected=expected)
     run, read = _MODES[modes[0]]
     check_read(settings, {*read, *modes, "output", "overwrite"})
-    run(settings, settings.model_dump(mode="json", exclude=_NOT_CONTENT))
+    run(settings, settings.model_dump(mode="json", exclude={*settings.not_content}))
 
 
 def _render_views(settings: RenderSettings, content: Mapping[str, Any]) -> None:
@@ -236,10 +236,6 @@ _MODES: dict[str, tuple[Callable[[RenderSettings, Mapping[str, Any]], None], set
     "poses": (_write_poses, {"cameras"}),
 }
 """Function of each mode, and the settings that it reads."""
-
-_NOT_CONTENT = {"figure", "output", "overwrite"}
-"""Settings that do not change the files in an output folder."""
-
 
 if __name__ == "__main__":
     main.render()

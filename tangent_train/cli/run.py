@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -22,6 +21,7 @@ from datamodules.core.label_map import DISTANCE, PIXEL_CLASSES
 from datamodules.core.loading import gathered_order
 from models.unet import check_size
 from tangent_train.callbacks.checkpoints import AtomicCheckpointIO, CheckpointContents
+from tangent_train.callbacks.loggers import start_loggers
 from tangent_train.callbacks.pictures import Pictures
 from tangent_train.callbacks.progress import ProgressBar
 from tangent_train.checkpoints.loaded import (
@@ -68,7 +68,13 @@ class Run:
 
     def trainer(self, callbacks: Sequence[Callback] = ()) -> lightning.Trainer:
         """Build the trainer of the config, with further callbacks, and log the settings."""
-        settings, loggers = self.settings, build_loggers(self.settings, self.folder)
+        settings, resumed = self.settings, getattr(self.settings, "resume", None)
+        loggers = start_loggers(
+            None if settings.trainer.get("fast_dev_run") else settings.logger,
+            self.folder,
+            evaluation.flat_settings(settings.model_dump(mode="json")),
+            resumed and self.folder / "checkpoints" / "last.ckpt",
+        )
         panels = self.folder / "panels", settings.panels, settings.validation_images
         callbacks = [
             *callbacks,
@@ -87,8 +93,6 @@ class Run:
             plugins=[AtomicCheckpointIO()],
             use_distributed_sampler=False,  # the samplers of the data count every image once
         )
-        for logger in trainer.loggers:
-            logger.log_hyperparams(evaluation.flat_settings(settings.model_dump(mode="json")))
         return trainer
 
     def contents(self) -> dict[str, Any]:
@@ -261,20 +265,6 @@ def build_task(settings: RunSettings, data: Any, network: nn.Module, head: Any) 
         optimizer=build_from_config(settings.optimizer, "optimizer"),
         scheduler=scheduler,
     )
-
-
-def build_loggers(settings: RunSettings, folder: Path) -> list[Any]:
-    """Build the loggers; null folders and names are those of the run.
-
-    The run is named after its folder below ``runs``, the group after the folder that contains it.
-    """
-    above, _, below = folder.absolute().as_posix().rpartition("/runs/")
-    parts = below.split("/") if above else folder.absolute().parts[-2:]
-    name = "/".join(parts)
-    group = "/".join(part for part in parts[:-1] if not re.fullmatch(r"(fold|seed)_\d+", part))
-    known = {"save_dir": str(folder), "name": name, "run_name": name, "group": group}
-    sections = (settings.logger or {}).items()
-    return [build_from_config(filled(s, known), f"logger.{name}") for name, s in sections]
 
 
 def build_callbacks(settings: RunSettings, task: Any) -> list[Any]:

@@ -60,6 +60,8 @@ class Settings(BaseModel):
     not_read: ClassVar[Sequence[str]] = ()
     """Groups and settings that the command does not read, although experiments may set them. They
     are not suggested."""
+    not_content: ClassVar[Sequence[str]] = ()
+    """Settings that do not change the files in an output folder."""
 
 
 class NetworkSettings(Settings):
@@ -94,6 +96,8 @@ class ImageSettings(Settings):
 
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
+
+    not_content = ("output", "report", "shard", "view_batch_size", "device", "trust")
 
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
@@ -157,6 +161,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
+
+    not_content = ("figure", "output", "overwrite")
 
     input: str | Path | None = None
     """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""

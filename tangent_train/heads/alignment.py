@@ -115,7 +115,7 @@ def depth_of_output(
     if kind == "log_distance":
         return output.exp(), "metric_distance"
     if kind == "canonical_inverse":
-        inverse = output * _span(ray_lengths)
+        inverse = output.where(output.isfinite(), torch.nan) * _span(ray_lengths)
         return 1 / inverse.clamp(1 / _FARTHEST_M, _FARTHEST_M), "metric_z"
     return output, kind
 
@@ -577,7 +577,9 @@ class AlignedMosaic:
             array = depth[:, 0].cpu().numpy()
             samples.append(sample_views(array, views, self._shape, self._points))
         alignment = align_views(samples, kind, self._align)
-        self.facts = alignment.facts
+        unknown = [~outputs.isfinite() for _, outputs, _ in self._parts]
+        share = sum(int(part.sum()) for part in unknown) / sum(part.numel() for part in unknown)
+        self.facts = alignment.facts | ({"not_finite": share} if share else {})
         mosaic = MeanMosaic(self._shape, self._blend, device=depths[0].device)
         first = 0
         for (views, _, lengths), depth in zip(self._parts, depths, strict=True):

@@ -6,18 +6,20 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from torchmetrics import Metric
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles, ray_lengths
 from tangent_train.io.pixel_files import write_pixels
 from tangent_train.metrics.scores import Interval, ScoreColumn
 from tangent_train.rendering import Blend
+
+if TYPE_CHECKING:
+    from torchmetrics import Metric
 
 RGB = NDArray[np.uint8]
 """A picture ``(H, W, 3)``."""
@@ -203,6 +205,7 @@ class Head(nn.Module, ABC):
         Returns:
             An object with ``add(outputs, views)``, which adds the outputs ``(n, C, h, w)`` of some
             views, ``pixels()``, which returns the prediction ``(H, W)``, and ``facts`` about it.
+            ``not_finite`` is the share of the pixels of views whose outputs are NaN or infinite.
         """
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Any:

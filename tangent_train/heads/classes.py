@@ -33,7 +33,7 @@ from tangent_train.metrics.scores import (
 )
 from tangent_train.metrics.segmentation import AbsentClass, SegmentationCounts
 from tangent_train.rendering import Blend
-from tangent_train.rendering.mosaic import ScoreMosaic
+from tangent_train.rendering.mosaic import ScoreMosaic, without_softmax
 
 _ROWS_AT_ONCE = 64
 _BINS = 256
@@ -114,9 +114,11 @@ class ClassesHead(Head):
 
     # Scores
 
-    def build_metric(self) -> segmentation.SegmentationMetric:
+    def build_metric(self) -> Any:
         """Build the confusion matrices of pixels, latitude bands and solid angles."""
-        return segmentation.SegmentationMetric(len(self.class_names))
+        from tangent_train.metrics.collected import SegmentationMetric  # seconds to import
+
+        return SegmentationMetric(len(self.class_names))
 
     def _both(self, pixels: Any, angles: Any, compute: Callable[[Any], Any]) -> dict[str, Any]:
         """Return scores by pixels; for panoramas, which have solid angles, by these too."""
@@ -171,8 +173,9 @@ class ClassesHead(Head):
         return mosaic
 
     def crop_pixels(self, outputs: Tensor, ray_lengths: Tensor) -> Tensor:
-        """Return the labels of the largest logits."""
-        return self.labels_of(outputs.argmax(dim=1))
+        """Return the labels of the largest logits; 0 where they have no softmax."""
+        known = ~without_softmax(outputs)[:, 0]
+        return self.labels_of(outputs.argmax(dim=1).where(known, self.num_outputs))
 
     def labels_of(self, best: Tensor) -> Tensor:
         """Return the labels of outputs: 0 where the best one belongs to none of the K classes."""
@@ -278,8 +281,6 @@ class LabelMosaic(ScoreMosaic):
         **settings: See `ScoreMosaic`.
     """
 
-    facts: Mapping[str, Any] = NOTHING
-
     def __init__(
         self,
         head: ClassesHead,
@@ -292,6 +293,11 @@ class LabelMosaic(ScoreMosaic):
         least = 0.0 if head.min_share else head.min_confidence
         super().__init__(shape, head.num_outputs, blend, min_confidence=least, **settings)
         self._head, self.valid = head, valid
+
+    @property
+    def facts(self) -> Mapping[str, float]:
+        """The share of pixels of views without a class, see `ScoreMosaic.add`, if there are any."""
+        return {"not_finite": self.not_finite} if self.not_finite else NOTHING
 
     def pixels(self) -> Tensor:
         """Return labels ``(H, W)``, 0 where unknown."""
@@ -332,9 +338,11 @@ class ImageClassHead(Head):
         """Return the number of shapes."""
         return torch.full((), float(len(targets)), device=targets.device)
 
-    def build_metric(self) -> segmentation.ClassificationMetric:
+    def build_metric(self) -> Any:
         """Build the confusion matrix of whole shapes."""
-        return segmentation.ClassificationMetric(len(self.class_names))
+        from tangent_train.metrics.collected import ClassificationMetric  # seconds to import
+
+        return ClassificationMetric(len(self.class_names))
 
     def scores(self, result: Any) -> Scores:
         """Return the accuracy over shapes, its mean over classes, and that of every class."""

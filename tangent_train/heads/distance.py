@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 import numpy as np
 import torch
@@ -29,6 +29,9 @@ from tangent_train.kinds import Align, DepthKind
 from tangent_train.metrics import depth as metrics
 from tangent_train.metrics.scores import Interval, ScoreColumn, by_solid_angle, with_solid_angle
 from tangent_train.rendering import Blend
+
+if TYPE_CHECKING:
+    from tangent_train.metrics.collected import DepthMetric
 
 DepthLoss = Literal["log_l1", "scale_invariant"]
 """Loss of predicted distances, see `log_error_sum`."""
@@ -176,7 +179,7 @@ class DistanceHead(Head):
 
     # Scores
 
-    def build_metric(self) -> metrics.DepthMetric:
+    def build_metric(self) -> DepthMetric:
         """Build the metric, which keeps the sums of the errors of each image.
 
         Raises:
@@ -186,7 +189,9 @@ class DistanceHead(Head):
             found = f"none, for a network that predicts {self.depth_kind}"
             expected = "median, scale or affine: the scale of its distances is unknown"
             raise SettingError("task.head.alignment", found=found, expected=expected)
-        return metrics.DepthMetric()
+        from tangent_train.metrics.collected import DepthMetric  # seconds to import
+
+        return DepthMetric()
 
     def scores(self, result: NDArray[np.float64]) -> Scores:
         """Return means over images; for panoramas, also by solid angle and latitude.

@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from datamodules.core.depth import meters_to_steps
-from datamodules.core.image_module import Upright
 from datamodules.core.label_map import (
     DISTANCE,
     PIXEL_CLASSES,
@@ -52,7 +51,7 @@ from tangent_train.inference.views import Levels, ViewChoice, ViewSelector
 from tangent_train.io.gpano import Fill
 from tangent_train.io.masks import Mask, Masks
 from tangent_train.io.palette import class_colors
-from tangent_train.kinds import Align, DepthKind
+from tangent_train.kinds import Align, DepthKind, Upright
 from tangent_train.rendering import Blend, equirect_to_tangent, tangent_to_equirect
 from tangent_train.rendering.forward import blend_of, check_panorama
 from tangent_train.rendering.mosaic import MeanMosaic
@@ -250,7 +249,7 @@ class Network:
         Returns:
             An array ``(H, W, K)`` or a tensor ``(K, H, W)`` of float32; index k belongs to label
             k + 1. Probabilities add up to 1, or to less for imported networks that also predict
-            "none of the classes".
+            "none of the classes". All are 0 where the scores are NaN or infinite.
 
         Raises:
             DataError: See `labels`.

@@ -325,7 +325,7 @@ class UpLikelihood:
             rays = torch.from_numpy(representation.view_sets()[0].rays()).to(self._device)
         sets = [(views, rendered.of(views), rays)]
         found = [
-            1 - scores.softmax(dim=1).amax(dim=1).mean(dim=(1, 2))
+            1 - scores.softmax(dim=1).amax(dim=1).nan_to_num(0).mean(dim=(1, 2))
             for _, scores in scored_views(network, sets, per_forward)
         ]
         return torch.cat(found).cpu().numpy()

@@ -25,8 +25,8 @@ from tangent_train.rendering.resampling import resize
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from datamodules.core.image_module import Upright
     from tangent_train.inference.engine import UpLikelihood
+    from tangent_train.kinds import Upright
 
     DepthOfSize = Callable[[tuple[int, int]], NDArray[np.uint16]]
     """Returns depth of an image of a size, in steps of 1/512 m."""

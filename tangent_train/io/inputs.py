@@ -69,6 +69,20 @@ class Video:
     frames: dict[str, int]
 
 
+def input_paths(
+    pattern: str | Path, tell: Callable[[str], object] = lambda text: None
+) -> list[Path]:
+    """List the images and videos of `Inputs.find` without opening them, see `image_paths`."""
+
+    @cache
+    def is_written(folder: Path) -> bool:
+        inside = Path(pattern) in folder.parents
+        return inside and ((folder / MANIFEST).exists() or is_written(folder.parent))
+
+    suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
+    return image_paths(pattern, suffixes, lambda path: is_written(path.parent), tell)
+
+
 @dataclass(frozen=True)
 class Inputs:
     """Images and videos of a command.
@@ -98,14 +112,7 @@ class Inputs:
         Raises:
             DataError: There are no images and videos.
         """
-
-        @cache
-        def is_written(folder: Path) -> bool:
-            inside = Path(pattern) in folder.parents
-            return inside and ((folder / MANIFEST).exists() or is_written(folder.parent))
-
-        suffixes = (*IMAGE_SUFFIXES, *VIDEO_SUFFIXES)
-        paths = image_paths(pattern, suffixes, lambda path: is_written(path.parent), print_text)
+        paths = input_paths(pattern, print_text)
         inputs = cls({}, {}, {}, every)
         for short, path in zip(short_names(paths, pattern), paths, strict=True):
             if path.suffix.lower() not in VIDEO_SUFFIXES:

@@ -25,12 +25,10 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, Field
 from pydantic.dataclasses import dataclass
 from torch import Tensor
-from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.geometry import equirect_solid_angles
 from tangent_train.metrics.scores import (
     BAND_EDGES_DEG,
-    ImagesMetric,
     Interval,
     band_of_rows,
     bootstrap,
@@ -47,7 +45,7 @@ Quantity = Literal["distance", "disparity"]
 
 _ERRORS = ("absrel", "sqrel", "rmse", "rmse_log", "mae")
 _SHARES = ("delta1", "delta2", "delta3")
-_SUMS = 2 + len(_ERRORS) + len(_SHARES)
+SUMS = 2 + len(_ERRORS) + len(_SHARES)
 _THRESHOLD = 1.25
 
 
@@ -113,13 +111,19 @@ class DepthProtocol:
                 values = scaled_and_shifted(values, true.where(used, torch.nan))
             else:
                 v, t = values[used], true[used]
-                values *= t.median() / v.median() if self.alignment == "median" else v @ t / (v @ v)
+                is_median = self.alignment == "median"
+                values *= _median(t) / _median(v) if is_median else v @ t / (v @ v)
             if power < 0 and self.clip:
                 values = values.clamp(min=torch.finfo(values.dtype).tiny)  # far away
             distances = lengths * values**power
         if self.clip:
             distances = distances.clamp(self.min_distance, self.max_distance)
         return torch.where(distances > 0, distances, torch.nan).to(prediction.dtype)
+
+
+def _median(values: Float[Tensor, " n"]) -> Tensor:
+    """Return the mean of both middle values, like NumPy; torch returns the lower one."""
+    return (values.median() - (-values).median()) / 2
 
 
 def scaled_and_shifted(
@@ -218,19 +222,3 @@ def depth_intervals(sums: Float[np.ndarray, "images sums"]) -> dict[str, Interva
         return dict(zip(scores, (totals[:, 0] / numbers).T, strict=True))
 
     return bootstrap(np.stack([np.where(defined, columns, 0), defined], axis=1), means)
-
-
-class DepthMetric(ImagesMetric):
-    """Collects the errors of all images of a data set, see `error_sums`."""
-
-    def __init__(self) -> None:
-        super().__init__(1 + len(BAND_EDGES_DEG), _SUMS)
-
-    def update(self, prediction: Tensor, truth: Tensor) -> None:
-        """Add the errors of one image, see `error_sums`."""
-        self.of_images.append(error_sums(prediction, truth)[None])
-
-    def compute(self) -> NDArray[np.float64]:
-        """Return the sums ``(images, 8, 10)`` of all processes."""
-        sums: NDArray[np.float64] = dim_zero_cat(self.of_images).cpu().numpy()
-        return sums

@@ -7,11 +7,8 @@ from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from torch import Tensor
-from torchmetrics import Metric
 
 _Value = TypeVar("_Value")
 
@@ -131,27 +128,3 @@ def bootstrap(
             low, high = np.nanquantile(means, (0.025, 0.975))
             intervals[name] = (float(low), float(high))
     return intervals
-
-
-class ImagesMetric(Metric):
-    """Collects numbers of each image of a data set, on all processes.
-
-    Args:
-        *shape: Shape of the numbers of an image.
-    """
-
-    full_state_update = False
-    of_images: list[Tensor]
-
-    def __init__(self, *shape: int) -> None:
-        super().__init__()
-        self._shape = shape
-        self.add_state("of_images", [], dist_reduce_fx="cat")
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget all images."""
-        super().reset()
-        # Processes without images contribute an empty part of the same dtype and shape.
-        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
-        self.of_images = [empty]

@@ -9,12 +9,10 @@ import torch
 from jaxtyping import Float, Integer
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
-from torchmetrics.classification import MulticlassConfusionMatrix
-from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
 from tangent_train.geometry import equirect_solid_angles
-from tangent_train.metrics.scores import BAND_EDGES_DEG, ImagesMetric, band_of_rows, defined_mean
+from tangent_train.metrics.scores import BAND_EDGES_DEG, band_of_rows, defined_mean
 
 AbsentClass = Literal["skip", "zero"]
 """Treatment of a class without labeled pixels: left out of means, or counted as 0."""
@@ -137,44 +135,6 @@ def count_image(
     return SegmentationCounts(pixels, steradians, bands, torch.stack(sums)[None])
 
 
-class SegmentationMetric(ImagesMetric):
-    """Counts the pixels of all images of a data set, see `SegmentationCounts`.
-
-    Pixels are integer counts. Equirectangular pixels over-count the poles; in the matrix of solid
-    angles each pixel has the weight of its solid angle. Counts are summed over processes.
-
-    Args:
-        num_classes: K + 1, the unknown class 0 included.
-    """
-
-    pixels: Tensor
-    solid_angle: Tensor
-    bands: Tensor
-
-    def __init__(self, num_classes: int) -> None:
-        super().__init__(2, 3, num_classes - 1)
-        self.num_classes = k = num_classes
-        integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
-        for name, shape in integers.items():
-            self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
-        zeros = torch.zeros((k, k), dtype=torch.float64)
-        self.add_state("solid_angle", zeros, dist_reduce_fx="sum")
-
-    def update(
-        self, prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"]
-    ) -> None:
-        """Count one image, see `count_image`."""
-        counts = count_image(prediction, truth, self.num_classes)
-        for name in ("pixels", "solid_angle", "bands"):
-            setattr(self, name, getattr(self, name) + getattr(counts, name))
-        self.of_images.append(counts.of_images)
-
-    def compute(self) -> SegmentationCounts:
-        """Return the counts of all processes as arrays."""
-        states = (dim_zero_cat(getattr(self, name)) for name in SegmentationCounts._fields)
-        return SegmentationCounts(*(state.cpu().numpy() for state in states))
-
-
 def _checked(indices: Tensor, num_classes: int) -> Tensor:
     least, greatest = map(int, indices.aminmax()) if indices.numel() else (0, 0)
     if least < 0 or greatest >= num_classes:
@@ -215,12 +175,3 @@ def classification_scores(confusion: ArrayLike) -> ClassificationScores:
     of_class = np.where(counts > 0, hits / np.maximum(counts, 1), np.nan)
     accuracy = float(hits.sum() / counts.sum()) if counts.any() else np.nan
     return ClassificationScores(accuracy, float(defined_mean(of_class)), of_class, counts)
-
-
-class ClassificationMetric(MulticlassConfusionMatrix):
-    """Counts images in a confusion matrix ``(K, K)``, summed over processes."""
-
-    def compute(self) -> NDArray[np.int64]:  # type: ignore[override]
-        """Return the matrix of all processes; rows are the true classes."""
-        counts: NDArray[np.int64] = super().compute().cpu().numpy()
-        return counts

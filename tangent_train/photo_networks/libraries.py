@@ -75,7 +75,7 @@ def load_torchvision(
     if "aux_loss" in inspect.signature(models.get_model_builder(model)).parameters:
         settings["aux_loss"] = False
     network = build_from_config(settings, "network")
-    tensors = tensors_for(network, Path(weights)) if is_file else fetch_tensors(chosen)
+    tensors = tensors_for(network, Path(weights)) if is_file else fetch_tensors(str(chosen))
     _load_used(network, tensors, weights)
     default = Normalization(preset.mean, preset.std)
     return PhotoNetwork(

@@ -512,13 +512,16 @@ def _tiles(start: int, stop: int, canvas: CanvasGeometry, pixels: int) -> list[T
 
 
 @njit_fast
-def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -> None:
+def _write_classes(
+    sums: Array, num_classes: int, least: float, floor: float, labels: Array
+) -> None:
     """Write the class of the largest sum of each pixel in a row; the first of equal ones, no NaN.
 
     Args:
         sums: ``(w, Kp)`` sums.
         num_classes: K.
         least: Share of the sum of all classes that the largest must reach, else the class is K.
+        floor: Number that the largest sum must exceed, else the class is K.
         labels: ``(w,)`` class indices, written.
     """
     for x in range(len(labels)):
@@ -529,7 +532,7 @@ def _write_classes(sums: Array, num_classes: int, least: float, labels: Array) -
             best += (np.int32(k) - best) * np.int32(score > highest)
             highest = score if score > highest else highest
         unsure = least > 0 and highest < least * sums[x, :num_classes].sum()
-        labels[x] = num_classes if unsure else best
+        labels[x] = best if highest > floor and not unsure else num_classes
 
 
 @njit_fast
@@ -620,7 +623,7 @@ def add_images(
         patch = _add_to_tile(tile, scores, canvas, before, step, owns, buffers, patch, sums)
         if len(total) == 0:
             for i in range(top, bottom):
-                _write_classes(sums[i - top], num_classes, 0.0, labels[i, left:right])
+                _write_classes(sums[i - top], num_classes, 0.0, -np.inf, labels[i, left:right])
         elif afterwards:
             _add_probabilities(tile, covered, canvas.owner, num_classes, sums, total)
 
@@ -663,6 +666,8 @@ def _interpolated_classes(
 ) -> None:
     """Write classes of the largest interpolated scores; the first of equal ones, no NaN.
 
+    The class is K where all scores are NaN or minus infinity.
+
     Args:
         scores: ``(K, h, w)`` scores of an image.
         count: Number of pixels n.
@@ -671,7 +676,7 @@ def _interpolated_classes(
         best: Class indices of the pixels, written.
     """
     right, below = np.uint64(1), np.uint64(scores.shape[2])
-    highest[:count], best[:count] = -np.inf, 0
+    highest[:count], best[:count] = -np.inf, len(scores)
     for k in range(len(scores)):
         plane, label = scores[k].reshape(-1), np.int32(k)
         for p in range(np.uint64(count)):
@@ -762,8 +767,9 @@ def best_classes(
         stop: One past the last row.
         total: ``(H, W, Kp)`` totals of `add_images`.
         num_classes: K.
-        min_confidence: Smallest share of the largest total, else the class is K.
+        min_confidence: Smallest share of the largest total, else the class is K. It is K too where
+            no total is greater than 0.
         labels: ``(H, W)`` class indices, written.
     """
     for i in range(start, stop):
-        _write_classes(total[i], num_classes, min_confidence, labels[i])
+        _write_classes(total[i], num_classes, min_confidence, 0.0, labels[i])

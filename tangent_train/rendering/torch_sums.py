@@ -117,7 +117,7 @@ class TorchSums:
             weight: ``(P,)`` weights; None for pixels that the image owns.
         """
         if not len(self._sums):
-            self._labels[index] = _without_nan(sampled).argmax(dim=0).int()
+            self._labels[index] = self._best(sampled, -torch.inf)[1].int()
             return
         if weight is not None:
             sampled = sampled * weight
@@ -125,6 +125,11 @@ class TorchSums:
             sampled = _softmax(sampled, 0)
         # The pixels are different, so the order of additions does not vary.
         self._sums.index_add_(1, index, sampled)
+
+    def _best(self, scores: Tensor, floor: float) -> tuple[Tensor, Tensor]:
+        """Return the largest of K scores and its index, which is K up to a floor."""
+        highest, best = _without_nan(scores).max(dim=0)
+        return highest, best.where(highest > floor, self._channels)
 
     def _owned_pixels(self, images: Views) -> _Pixels:
         """List the pixels that images own; the table is kept until images of another set follow."""
@@ -148,7 +153,7 @@ class TorchSums:
         """Return ``(H, W)`` indices of the best classes; K where the confidence is too low."""
         for start in range(0, math.prod(self._shape) if len(self._sums) else 0, _PIXELS_AT_ONCE):
             sums = self._sums[:, start : start + _PIXELS_AT_ONCE]
-            highest, best = _without_nan(sums).max(dim=0)
+            highest, best = self._best(sums, 0.0 if self._softmax else -torch.inf)
             if min_confidence > 0:
                 unsure = highest < min_confidence * sums.sum(dim=0)
                 best = best.masked_fill(unsure, self._channels)

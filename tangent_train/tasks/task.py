@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import lightning
@@ -49,7 +49,7 @@ class Task(lightning.LightningModule, ABC):
         frozen: Names of modules and parameters of the network that are not trained; such modules
             stay in evaluation mode.
         backbone_lr_factor: Factor of the learning rate of parameters that are not `fresh`.
-        auxiliary_weight: Weight of the loss of the auxiliary output.
+        auxiliary_weight: Weight of the loss of the auxiliary output, which counts in training only.
         eval_view_batch_size: Number of images per forward pass in evaluation, which bounds memory.
 
     Attributes:
@@ -114,9 +114,14 @@ class Task(lightning.LightningModule, ABC):
     def evaluate(self, batch: Any) -> Tensor:
         """Add the predictions for a batch to `metric` and return them."""
 
-    def loss_sum(self, inputs: tuple[Tensor, ...], targets: Tensor) -> Tensor:
-        """Return the sum of the losses of inputs."""
-        return self.head.loss_sum(self(*inputs), targets)
+    def loss_sum(self, outputs: Any, targets: Tensor) -> Tensor:
+        """Return the sum of the losses, in training and in validation (``val/loss``).
+
+        Args:
+            outputs: Result of `forward`.
+            targets: Targets of `training_pairs`.
+        """
+        return self.head.loss_sum(outputs, targets)
 
     # Training
 
@@ -131,6 +136,13 @@ class Task(lightning.LightningModule, ABC):
         count = -(-len(inputs) // max(1, size // inputs.shape[1:-3].numel()))
         parts = zip(inputs.tensor_split(count), targets.tensor_split(count), strict=True)
         return [((images,), of_images) for images, of_images in parts]
+
+    def on_train_start(self) -> None:
+        """Log at least once per epoch, and once per training, however few steps it has."""
+        trainer: Any = self.trainer
+        per_epoch = math.ceil(trainer.num_training_batches / trainer.accumulate_grad_batches)
+        every = min(trainer.log_every_n_steps, per_epoch, trainer.estimated_stepping_batches)
+        trainer.log_every_n_steps = int(every)
 
     def setup(self, stage: str) -> None:
         """Take settings of the loss from the data before training; a checkpoint contains them."""
@@ -165,10 +177,10 @@ class Task(lightning.LightningModule, ABC):
                     parameter.grad *= before / self._step_norm
         value = norm.new_zeros(())
         for part in parts:
-            loss = self.loss_sum(*part)
+            loss = self.loss_sum(self(*part[0]), part[1])
             strategy.backward(loss / self._step_norm, None)
             value += loss.detach()
-        loss = self.loss_sum(*last)
+        loss = self.loss_sum(self(*last[0]), last[1])
         total: Any = strategy.reduce((value + loss.detach()) / norm, reduce_op="mean")
         # Copied to the host while a GPU is busy with the backward pass.
         copied = torch.cuda.Event() if total.is_cuda else None  # type: ignore[no-untyped-call]
@@ -220,10 +232,10 @@ class Task(lightning.LightningModule, ABC):
 
     # Evaluation
 
-    def add_validation_loss(self, outputs: Tensor, targets: Tensor) -> None:
+    def add_validation_loss(self, outputs: Any, targets: Tensor) -> None:
         """Add to ``val/loss``, which is normalized like the training loss; not in a test."""
         if not self.is_tested:
-            self._sums[1] += self.head.loss_sum(outputs, targets)
+            self._sums[1] += self.loss_sum(outputs, targets)
             self._sums[2] += self.head.loss_norm(targets)
 
     @property
@@ -344,13 +356,28 @@ class PixelTask(Task):
             return [((images, batch.rays), targets)]
         return super().training_parts(batch)
 
-    def loss_sum(self, inputs: tuple[Tensor, ...], targets: Tensor) -> Tensor:
-        """Return the loss, summed over pixels, including that of an auxiliary output."""
-        outputs = self(*inputs)
+    def loss_sum(self, outputs: Mapping[str, Tensor], targets: Tensor) -> Tensor:
+        """Return the loss, summed over pixels; in training with that of an auxiliary output.
+
+        Args:
+            outputs: Outputs of the network by name, see `forward`.
+            targets: The output that would be correct, see `Head.targets`.
+        """
         loss = self.head.loss_sum(outputs["out"], targets)
-        if "aux" not in outputs:
+        if "aux" not in outputs or not self.training:
             return loss
         return loss + self.auxiliary_weight * self.head.auxiliary_sum(outputs["aux"], targets)
+
+    def _evaluated_views(self, sets: Iterable[Any]) -> Iterator[tuple[Any, Tensor, Any]]:
+        """Yield views, their scores (see `scored_views`), and all outputs, for `loss_sum`."""
+        kept: list[Mapping[str, Tensor]] = []
+
+        def network(*inputs: Tensor) -> Mapping[str, Tensor]:
+            kept[:] = [self(*inputs)]
+            return kept[0]
+
+        for views, scores in scored_views(network, sets, self.eval_view_batch_size):
+            yield views, scores, {**kept[0], "out": scores}
 
     @torch.no_grad()
     def evaluate(self, batch: Any) -> Tensor:
@@ -371,11 +398,10 @@ class PixelTask(Task):
 
     def predict_crops(self, images: Tensor, truth: Tensor, lengths: Tensor) -> Tensor:
         """Predict the crops of a photo ``(n, h, w)``; see `predict_panorama`."""
-        predictions, step = [], self.eval_view_batch_size
-        crops = range(len(truth))
-        for numbers, outputs in scored_views(self, [(crops, images.__getitem__, None)], step):
+        predictions, crops = [], range(len(truth))
+        for numbers, scores, outputs in self._evaluated_views([(crops, images.__getitem__, None)]):
             part = slice(numbers.start, numbers.stop)
-            predictions.append(self.head.crop_pixels(outputs, lengths[part]))
+            predictions.append(self.head.crop_pixels(scores, lengths[part]))
             self.add_validation_loss(outputs, self.head.targets(truth[part], lengths[part]))
         return torch.cat(predictions)
 
@@ -405,10 +431,10 @@ class PixelTask(Task):
         how: dict[str, Any] = {"averaged": len(sets) > 1, "device": images.device}
         mosaic = self.head.mosaic(shape, self.representation.blend, valid=valid, **how)
         view_sets = zip(sets, readers, rays, strict=True)
-        for views, outputs in scored_views(self, view_sets, self.eval_view_batch_size):
-            mosaic.add(outputs, views)
+        for views, scores, outputs in self._evaluated_views(view_sets):
+            mosaic.add(scores, views)
             if truth is not None and not self.is_tested:
-                lengths = torch.from_numpy(views.ray_lengths()).to(outputs.device)
+                lengths = torch.from_numpy(views.ray_lengths()).to(scores.device)
                 targets = self.head.targets(_labels_of_views(truth, views), lengths)
                 self.add_validation_loss(outputs, targets)
         return mosaic.pixels().to(images.device)

@@ -73,3 +73,33 @@ def test_depth_has_one_channel_and_images_are_resized_for_it(output: str) -> Non
     found = network(images)
     assert found.shape == (1, 1, 8, 12)
     torch.testing.assert_close(found[..., 1:-1, 1:-1], images[:, :1, 1:-1, 1:-1], atol=0.1, rtol=0)
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("kind", ["logits", "probabilities"])
+def test_a_single_score_and_probabilities_that_are_not_finite_are_nan(
+    kind: ScoreKind, wrong: float
+) -> None:
+    for count in (1, 3):
+        scores = torch.full((1, count, 1, 2), 0.25)
+        scores[..., 1] = wrong
+        largest = as_logits(scores, kind, count).amax(dim=1)[0, 0]
+        assert largest.isfinite().tolist() == [True, False]
+
+
+class _InfiniteColumn(nn.Module):
+    """Two classes, infinite in the first column."""
+
+    def forward(self, images: Tensor) -> Tensor:
+        scores = images[:, :2].clone()
+        scores[..., 0] = torch.inf
+        return scores
+
+
+def test_a_tile_that_is_not_finite_does_not_spoil_its_neighbors() -> None:
+    """Tiles begin in columns 0 and 4; the second one is infinite where the first is finite."""
+    images = torch.randn(1, 3, 4, 10)
+    found = OutputNetwork(_InfiniteColumn(), 2, tile=(4, 6))(images)
+    expected = images[:, :2].clone()
+    expected[..., 0] = torch.nan
+    torch.testing.assert_close(found, expected, equal_nan=True)

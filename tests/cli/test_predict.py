@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import torch
 from numpy.typing import NDArray
 from PIL import Image
 
@@ -141,6 +142,22 @@ def test_photos_get_labels(tmp_path: Path, predict: Predict, capsys: Capture) ->
     assert "Give fov=" in " ".join(capsys.readouterr().out.split())
     predict(**settings, fov=70, output="wide")
     assert read_png(tmp_path / "wide" / "labels" / "a.png").shape == (30, 50)
+
+
+def test_scores_that_are_not_finite_are_counted_and_named(
+    tmp_path: Path, predict: Predict, capsys: Capture
+) -> None:
+    file = torch.load(tmp_path / "model.ckpt")
+    file["state_dict"]["network.bias"][1] = torch.inf
+    torch.save(file, tmp_path / "overflow.ckpt")
+    write_pixels(tmp_path / "in" / "a.png", sphere(32))
+    entry = predict(checkpoint=tmp_path / "overflow.ckpt", write="[labels,probabilities]")["a"]
+    assert not read_png(tmp_path / "out" / "labels" / "a.png").any()
+    assert not np.load(tmp_path / "out" / "probabilities" / "a.npy").any()
+    assert (entry["not_finite"], entry["classes"]["unknown"]) == (1, 1)
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "NaN or infinite in parts of 1 image, which are unknown" in printed
+    assert printed.count("views show them: a") == 1
 
 
 def test_the_network_estimates_the_up_direction(

@@ -13,8 +13,9 @@ import pytest
 import torch
 from lightning.pytorch.callbacks import Callback, RichModelSummary
 
+from tangent_train.callbacks.loggers import start_loggers
 from tangent_train.checkpoints.loaded import load_network
-from tangent_train.cli.run import build_callbacks, build_loggers
+from tangent_train.cli.run import build_callbacks
 from tangent_train.tasks import PixelTask
 from tests.cli.tiny_runs import SETTINGS, Run, results
 from tests.running import Capture, Patch, composed_settings, run_python
@@ -196,17 +197,19 @@ class Named(Callback):
         self.given = monitor, mode
 
 
-def test_loggers_and_callbacks_of_the_user_are_built() -> None:
+def test_loggers_and_callbacks_of_the_user_are_built(tmp_path: Path) -> None:
     settings = composed_settings(
         "train",
         "logger=csv",
-        "+logger.mine={_target_: lightning.pytorch.loggers.CSVLogger, save_dir: here, name: null}",
+        "+logger.mine={_target_: lightning.pytorch.loggers.CSVLogger, save_dir: ., name: null}",
         "callbacks=model_summary",
         f"+callbacks.mine={{_target_: {__name__}.Named, monitor: null, mode: null}}",
     )
-    folder = Path("/x/runs/demo/2026-01-02/fold_1/P")
-    loggers: Any = build_loggers(settings, folder)
-    assert [logger.save_dir for logger in loggers] == [str(folder), "here"]
+    folder = tmp_path / "runs/demo/2026-01-02/fold_1/P"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path)
+        loggers: Any = start_loggers(settings.logger, folder, {})
+    assert [logger.save_dir for logger in loggers] == [str(folder), "."]
     assert loggers[1].name == "demo/2026-01-02/fold_1/P"
     summary, mine = build_callbacks(settings, shape_task())
     assert isinstance(summary, RichModelSummary)

@@ -22,7 +22,7 @@ from tangent_train.rendering import (
 )
 
 STRIP = (-180, 180, -35.15, 35.15)
-ANGLES = [STRIP, (41, 166, 11, 70), (130, -150, -90, 30), (6, 40, -79, 8), (-3, 3, -2, 2)]
+ANGLES = [STRIP, (-136, -59, 12, 74), (130, -150, -90, 30), (6, 40, -79, 8), (-3, 3, -2, 2)]
 RINGS: Any = [{"pitch": 0, "views": 8}, {"pitch": 40, "views": 5}, {"pitch": -40, "views": 5}]
 WIDE: Any = [{"pitch": 0, "views": 6}, *({"pitch": p, "views": 5, "fov": 120} for p in (50, -50))]
 SHAPE = (128, 256)

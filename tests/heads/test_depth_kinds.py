@@ -60,9 +60,9 @@ def test_canonical_depth_is_multiplied_by_the_focal_length_in_widths() -> None:
 
 
 def test_values_without_a_distance_are_unknown() -> None:
-    """Not finite or not positive; the sky has disparity 0. Depth Pro's is limited."""
+    """Not finite or not positive; the sky has disparity 0. Depth Pro's are limited."""
     odd, one = torch.tensor([torch.nan, torch.inf, -torch.inf, 0.0, -1.0]), torch.ones(1)
-    known = {"log_distance": [0, 0, 0, 1, 1], "canonical_inverse": [0, 1, 1, 1, 1]}
+    known = {"log_distance": [0, 0, 0, 1, 1], "canonical_inverse": [0, 0, 0, 1, 1]}
     for kind in get_args(DepthKind):
         depth, depth_kind = depth_of_output(odd, kind, one)
         found = distance_of(along_rays(depth, depth_kind, one), depth_kind)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from torch import nn
 
 from datamodules.core.dataset import render_inputs
 from datamodules.core.depth import distance_from_z_depth
@@ -294,3 +295,31 @@ def test_a_network_of_whole_spheres_takes_only_those_of_its_training(
     with pytest.raises(SettingError, match=expected):
         _labels(trained, _photo(sphere(32), 60.0))
     assert ViewSelector(trained, 4).representation.image_size == size
+
+
+class _HalfKnown(nn.Module):
+    """Scores of `color_network`; those of one class are `wrong` where red is below its mean."""
+
+    def __init__(self, wrong: float) -> None:
+        super().__init__()
+        self.network, self.wrong = color_network(), wrong
+
+    def forward(self, images: torch.Tensor) -> torch.Tensor:
+        scores: torch.Tensor = self.network(images)
+        scores[:, 1] = scores[:, 1].where(images[:, 0] > 0, self.wrong)
+        return scores
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf])
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+@pytest.mark.parametrize("representation", [TANGENT, ERP, ICOSPHERE, CUBE, PERSPECTIVE])
+def test_scores_that_are_not_finite_are_unknown(
+    representation: Any, blend: Any, wrong: float
+) -> None:
+    image = _photo(sphere(32), 90.0) if representation is PERSPECTIVE else InputImage(sphere(32))
+    usual = _labels(trained_network(representation), image, blend=blend)
+    module: Any = _HalfKnown(wrong)
+    found = _labels(trained_network(representation, module=module), image, blend=blend)
+    red = image.rgb[..., 0].astype(int)
+    np.testing.assert_array_equal(found[red < 90], 3)  # index K
+    np.testing.assert_array_equal(found[red > 160], usual[red > 160])

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.geometry import equirect_solid_angles
+from tangent_train.metrics.collected import DepthMetric
 from tangent_train.metrics.depth import (
     Alignment,
-    DepthMetric,
     DepthProtocol,
     depth_intervals,
     depth_scores,
@@ -116,12 +116,15 @@ def test_intervals_contain_the_mean_and_leave_out_images_without_truth() -> None
 def test_alignments_equal_least_squares_of_numpy(alignment: Alignment, quantity: Any) -> None:
     prediction, truth = _image(5)
     used = ~np.isnan(prediction) & ~np.isnan(truth)
+    if used.sum() % 2:  # an even number has two middle values
+        truth[tuple(np.argwhere(used)[0])] = np.nan
+        used = ~np.isnan(prediction) & ~np.isnan(truth)
 
     def as_quantity(x: Any) -> Any:
         return x if quantity == "distance" else 1 / x
 
     p, g = as_quantity(prediction), as_quantity(truth)
-    medians = [np.quantile(x[used], 0.5, method="lower") for x in (g, p)]
+    medians = [np.median(x[used]) for x in (g, p)]
     fits: dict[str, Any] = {
         "none": (1.0, 0.0),
         "median": (medians[0] / medians[1], 0.0),

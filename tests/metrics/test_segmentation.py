@@ -11,10 +11,9 @@ from torchmetrics.classification import MulticlassAccuracy
 from torchmetrics.utilities import dim_zero_cat
 
 from tangent_train.errors import SettingError
+from tangent_train.metrics.collected import ClassificationMetric, SegmentationMetric
 from tangent_train.metrics.scores import BAND_EDGES_DEG, bootstrap
 from tangent_train.metrics.segmentation import (
-    ClassificationMetric,
-    SegmentationMetric,
     classification_scores,
     mean_scores,
     segmentation_scores,

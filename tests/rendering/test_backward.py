@@ -46,10 +46,12 @@ def test_equal_infinite_and_nan_scores_have_defined_labels(blend: Any) -> None:
     assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
     scores[:, 0] = -np.inf
     assert (tangent_to_labels(scores, grid, (16, 32), blend) == 1).all()
+    scores[0] = np.nan
+    labels = tangent_to_labels(scores, grid, (16, 32), blend)
+    assert labels.dtype == np.uint8
+    assert set(np.unique(labels)) <= {1, 18}
     scores[:] = np.nan
-    assert not tangent_to_labels(scores, grid, (16, 32), blend).any()
-    scores[:, 17] = -5
-    assert (tangent_to_labels(scores, grid, (16, 32), blend) == 17).all()
+    assert (tangent_to_labels(scores, grid, (16, 32), blend) == 18).all()
 
 
 @pytest.mark.parametrize("num_classes", [1, 15, 16, 40, 257])

@@ -104,18 +104,45 @@ def test_probabilities_of_owners_are_the_softmax_of_the_interpolated_scores() ->
 
 @pytest.mark.parametrize("backend", ["numba", "torch"])
 @pytest.mark.parametrize("blend", ["nearest", "feather"])
-def test_infinite_and_nan_scores_have_no_probability(blend: Blend, backend: Any) -> None:
+def test_classes_of_minus_infinity_have_no_probability(blend: Blend, backend: Any) -> None:
     grid, shape = GRIDS[0]
     scores = torch.full((20, 300, *grid.size), -torch.inf)
-    scores[:, 2], scores[:, 1], scores[:, 299] = torch.nan, 0, 0
+    scores[:, 1], scores[:, 299] = 0, 0
     result = ScoreMosaic(shape, 300, blend, averaged=True, backend=backend)
     found = _probabilities(_added(result, scores, grid))
     np.testing.assert_allclose(found[..., [1, 299]], 0.5, atol=1e-6)
     np.testing.assert_allclose(found.sum(axis=-1), 1, atol=1e-6)
     assert _labels(result).dtype == np.uint16
     assert (_labels(result) == 1).all()
-    nothing = ScoreMosaic(shape, 300, blend, averaged=True, backend=backend)
-    assert not _labels(_added(nothing, scores * torch.nan, grid)).any()
+
+
+@pytest.mark.parametrize("wrong", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("averaged", [False, True])
+@pytest.mark.parametrize("backend", ["numba", "torch"])
+@pytest.mark.parametrize("blend", ["nearest", "feather"])
+def test_views_that_are_not_finite_are_as_if_left_out(
+    blend: Blend, backend: Any, averaged: bool, wrong: float
+) -> None:
+    """The largest score of five views is not finite; others decide, or no class is known."""
+    grid, shape = GRIDS[0]
+    scores = _scores(grid)
+    kept = ScoreMosaic(shape, 7, blend, averaged=True, backend=backend)
+    kept.add(scores[5:], PinholeViews(grid)[5:])
+    scores[:5, slice(None) if wrong < 0 else 3] = wrong
+    result = ScoreMosaic(shape, 7, blend, averaged=averaged, backend=backend)
+    _added(result, scores, grid)
+    known = _probabilities(kept).sum(axis=-1) > 0
+    assert 0.6 < known.mean() < 1
+    assert (_labels(result)[~known] == 7).all()
+    assert result.not_finite == pytest.approx(5 / grid.num_images)
+    np.testing.assert_array_equal(_labels(result)[known], _labels(kept)[known])
+    if averaged or blend == "feather":
+        np.testing.assert_allclose(_probabilities(result), _probabilities(kept), atol=1e-6)
+    labels = tangent_to_labels(
+        scores.softmax(1) if blend == "feather" else scores, grid, shape, blend
+    )
+    assert (labels[~known] == 7).all()
+    assert (labels[known] < 7).all()
 
 
 def test_large_sums_are_in_a_file_and_equal(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,13 +61,18 @@ class Shapes(Spheres):
 
 
 class SmallNetwork(nn.Module):
-    """Without batch statistics, a gradient does not depend on what is computed together."""
+    """Without batch statistics, a gradient does not depend on what is computed together.
+
+    With batch statistics, biases before them would have gradients of rounding errors only.
+    """
 
     def __init__(self, classes: int = 3, *, statistics: bool = False) -> None:
         super().__init__()
         norm: Any = nn.BatchNorm2d if statistics else partial(nn.GroupNorm, 2)
-        self.encoder = nn.Sequential(nn.Conv2d(3, 8, 3, stride=2), norm(8), nn.ReLU())
-        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1), norm(8), nn.ReLU())
+        self.encoder = nn.Sequential(
+            nn.Conv2d(3, 8, 3, stride=2, bias=not statistics), norm(8), nn.ReLU()
+        )
+        self.neck = nn.Sequential(nn.Conv2d(8, 8, 1, bias=not statistics), norm(8), nn.ReLU())
         self.head = nn.Linear(8, classes)
 
     def forward(self, images: Tensor) -> Tensor:

@@ -91,7 +91,7 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     images, truth = task.training_pairs(batch)
     near = (batch.labels > 0) & (batch.labels <= 5 * 512)
     assert task.head.loss_norm(truth).item() == int(near.sum())
-    assert task.loss_sum((images,), truth) / near.sum() == pytest.approx(0, abs=2e-5)
+    assert task.loss_sum(task(images), truth) / near.sum() == pytest.approx(0, abs=2e-5)
     (scores,) = quiet_trainer().validate(task, datamodule=data, verbose=False)
     assert scores["val/loss"] == pytest.approx(0, abs=2e-5)
     counts = [int(((s.labels > 0) & (s.labels <= 5 * 512)).sum()) for s in data.test]
@@ -109,7 +109,7 @@ def test_every_kind_of_output_becomes_the_true_distance(kind: DepthKind) -> None
     assert task.head.scores_of(with_unknown, [3]).keys() == record.scores.keys()
     if is_metric(kind):
         images[:, 0] += np.log(1.1)
-        loss = task.loss_sum((images,), truth) / near.sum()
+        loss = task.loss_sum(task(images), truth) / near.sum()
         assert loss.item() == pytest.approx(np.log(1.1), rel=1e-4), "10 % too far"
 
 

@@ -41,7 +41,7 @@ def test_a_training_step_neither_copies_nor_waits(network: nn.Module) -> None:
         depth, labels = views[..., 0].to(torch.int16), views[..., 0].flatten(0, 1)
         images = normalize((views, depth), RGBD_NORMALIZATION, ("rgb", "depth")).flatten(0, 1)
         inputs = (images, torch.empty(2, 5, 3, 3)) if task.sees_rays else (images,)
-        loss = task.loss_sum(inputs, labels) / task.head.loss_norm(labels)
+        loss = task.loss_sum(task(*inputs), labels) / task.head.loss_norm(labels)
     assert (loss.device.type, transfers) == ("cuda", [])
 
 

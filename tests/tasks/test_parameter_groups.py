@@ -30,6 +30,7 @@ def _changed(task: Any, before: dict[str, Tensor]) -> set[str]:
 
 
 def test_frozen_parts_stay_as_they_are() -> None:
+    torch.manual_seed(0)
     frozen, optimizer = ["encoder", "neck.0.weight"], partial(Adam, lr=0.1, weight_decay=0.1)
     task = shape_task(SmallNetwork(statistics=True), optimizer=optimizer, frozen=frozen)
     before = _tensors(task)

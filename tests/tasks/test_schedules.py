@@ -80,6 +80,17 @@ def test_a_resumed_schedule_continues_as_if_it_had_not_stopped(name: str, tmp_pa
     assert begun + rest == pytest.approx(whole)
 
 
+def test_the_number_of_warm_up_steps_is_rounded() -> None:
+    optimizer = torch.optim.SGD([torch.zeros(1, requires_grad=True)], lr=LR)
+    schedule = warmup_cosine(optimizer, total_steps=11, warmup_share=0.25)  # 2.75
+    rates = []
+    for _ in range(4):
+        rates.append(optimizer.param_groups[0]["lr"])
+        optimizer.step()
+        schedule.step()
+    assert rates == pytest.approx([LR * (0.01 + 0.99 * step / 3) for step in range(4)])
+
+
 @pytest.mark.parametrize("interval", ["epoch", "step"])
 def test_warm_up_and_cosine_have_their_closed_form(interval: Any) -> None:
     length = {"epoch": 8, "step": 24}
@@ -116,3 +127,12 @@ def test_a_plateau_is_resumed_exactly(until: int, tmp_path: Path) -> None:
     assert whole[::STEPS] == pytest.approx([LR * f for f in (1, 1, 1, 1, 0.5, 0.5, 0.25)])
     begun = _train(tmp_path, schedule, until=until, **more | {"max_epochs": 6})
     assert begun + _train(tmp_path, schedule, resume=True, **more) == pytest.approx(whole)
+
+
+def test_a_plateau_is_stepped_after_every_nth_epoch(tmp_path: Path) -> None:
+    """After epochs 1, 3 and 5; the score is best in epoch 1."""
+    plateau: Any = partial(lr_scheduler.ReduceLROnPlateau, mode=_NULL, factor=0.5, patience=0)
+    schedule = Schedule(plateau, frequency=2, monitor="val/made")
+    more: dict[str, Any] = {"limit_val_batches": 1, "max_epochs": 6, "check_val_every_n_epoch": 2}
+    rates = _train(tmp_path, schedule, **more)
+    assert rates[::STEPS] == pytest.approx([LR, LR, LR, LR, LR / 2, LR / 2])

@@ -15,7 +15,9 @@ from torch.utils.data import DataLoader
 from datamodules.core.dataset import Sample
 from models import AuxiliaryHead
 from tangent_train.errors import SettingError
+from tangent_train.heads import ClassesHead
 from tangent_train.rendering import TangentRepresentation
+from tangent_train.tasks import PixelTask
 from tests.tasks.builders import segmentation_task
 from tests.tasks.shapes import Spheres, quiet_trainer
 
@@ -98,13 +100,74 @@ def test_the_auxiliary_head_adds_its_loss(weight: float) -> None:
     network = AuxiliaryHead(nn.Sequential(nn.Conv2d(2, 2, 1)), "0", 2, 2)
     task = _task(network, auxiliary_weight=weight)
     task.head.class_weights.copy_(WEIGHTS)
-    found = task.loss_sum((images,), labels) / task.head.loss_norm(labels)
+    found = task.loss_sum(task(images), labels) / task.head.loss_norm(labels)
     known = labels > 0
     main, auxiliary = (
         functional.cross_entropy(scores.movedim(1, -1)[known], labels[known].long() - 1, WEIGHTS)
         for scores in network(images).values()
     )
     torch.testing.assert_close(found, main + weight * auxiliary)
+
+
+class Confidence(PixelTask):
+    """A loss of the user, of a further output of the network; 10 of every pixel."""
+
+    def loss_sum(self, outputs: Any, targets: Tensor) -> Tensor:
+        return 10 * outputs["further"][(targets > 0)[:, None]].sum()
+
+
+class Further(nn.Module):
+    """Returns a second output beside the scores, and an auxiliary one in evaluation too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = nn.Conv2d(2, 2, 1)
+
+    def forward(self, images: Tensor) -> dict[str, Tensor]:
+        scores = self.layer(images)
+        ones = torch.ones_like(scores[:, :1]) + 0 * scores[:, :1]
+        return {"out": scores, "aux": scores + 1e3, "further": ones}
+
+
+class ConstantHead(ClassesHead):
+    """A loss of the user: 7 of every labeled pixel."""
+
+    def loss_sum(self, outputs: Tensor, targets: Tensor) -> Tensor:
+        return 7 * (targets > 0).sum() + 0 * outputs.sum()
+
+
+@pytest.mark.parametrize(
+    ("kind", "head", "expected"), [(Confidence, ClassesHead, 10), (PixelTask, ConstantHead, 7)]
+)
+def test_a_loss_of_the_user_is_that_of_training_and_validation(
+    kind: Any, head: Any, expected: float
+) -> None:
+    task = kind(Further(), TANGENT, head(NAMES), partial(torch.optim.SGD, lr=0.1))
+    task.auxiliary_weight = 0
+    trainer = quiet_trainer(max_epochs=1)
+    trainer.fit(task, datamodule=Data())
+    assert trainer.callback_metrics["val/loss"] == pytest.approx(expected)
+    assert trainer.callback_metrics["train/loss"] == pytest.approx(expected)
+
+
+def test_the_validation_loss_is_that_of_the_main_output() -> None:
+    task = _task(Further())
+    trainer = quiet_trainer(max_epochs=1, limit_train_batches=0)
+    (scores,) = trainer.validate(task, datamodule=Data(), verbose=False)
+    task.auxiliary_weight = 1e6
+    assert trainer.validate(task, datamodule=Data(), verbose=False) == [scores]
+
+
+def test_intervals_count_absent_classes_as_the_score_does() -> None:
+    """Of two classes the first is right everywhere, and the second is absent."""
+    for absent, expected in (("skip", 1.0), ("zero", 0.5)):
+        head = ClassesHead(NAMES, absent_class=absent)  # type: ignore[arg-type]
+        metric = head.build_metric()
+        for _ in range(3):
+            metric.update(torch.ones(4, 8, dtype=torch.long), torch.ones(4, 8, dtype=torch.long))
+        result = metric.compute()
+        assert head.scores(result).means["miou"] == expected
+        assert head.intervals(result)["miou"] == pytest.approx((expected, expected))
 
 
 class Looking(nn.Module):

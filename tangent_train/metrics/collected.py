@@ -1,0 +1,107 @@
+"""Metrics of torchmetrics: counts and errors of all images, summed or joined over processes.
+
+They are apart from the functions that compute scores, because torchmetrics takes seconds to import
+and predictions do not need it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from jaxtyping import Integer
+from numpy.typing import NDArray
+from torch import Tensor
+from torchmetrics import Metric
+from torchmetrics.classification import MulticlassConfusionMatrix
+from torchmetrics.utilities import dim_zero_cat
+
+from tangent_train.metrics.depth import SUMS, error_sums
+from tangent_train.metrics.scores import BAND_EDGES_DEG
+from tangent_train.metrics.segmentation import SegmentationCounts, count_image
+
+
+class ImagesMetric(Metric):
+    """Collects numbers of each image of a data set, on all processes.
+
+    Args:
+        *shape: Shape of the numbers of an image.
+    """
+
+    full_state_update = False
+    of_images: list[Tensor]
+
+    def __init__(self, *shape: int) -> None:
+        super().__init__()
+        self._shape = shape
+        self.add_state("of_images", [], dist_reduce_fx="cat")
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all images."""
+        super().reset()
+        # Processes without images contribute an empty part of the same dtype and shape.
+        empty = torch.zeros((0, *self._shape), dtype=torch.float64, device=self.device)
+        self.of_images = [empty]
+
+
+class SegmentationMetric(ImagesMetric):
+    """Counts the pixels of all images of a data set, see `SegmentationCounts`.
+
+    Pixels are integer counts. Equirectangular pixels over-count the poles; in the matrix of solid
+    angles each pixel has the weight of its solid angle. Counts are summed over processes.
+
+    Args:
+        num_classes: K + 1, the unknown class 0 included.
+    """
+
+    pixels: Tensor
+    solid_angle: Tensor
+    bands: Tensor
+
+    def __init__(self, num_classes: int) -> None:
+        super().__init__(2, 3, num_classes - 1)
+        self.num_classes = k = num_classes
+        integers = {"pixels": (k, k), "bands": (len(BAND_EDGES_DEG) - 1, k, k)}
+        for name, shape in integers.items():
+            self.add_state(name, torch.zeros(shape, dtype=torch.int64), dist_reduce_fx="sum")
+        zeros = torch.zeros((k, k), dtype=torch.float64)
+        self.add_state("solid_angle", zeros, dist_reduce_fx="sum")
+
+    def update(
+        self, prediction: Integer[Tensor, "*shape"], truth: Integer[Tensor, "*shape"]
+    ) -> None:
+        """Count one image, see `count_image`."""
+        counts = count_image(prediction, truth, self.num_classes)
+        for name in ("pixels", "solid_angle", "bands"):
+            setattr(self, name, getattr(self, name) + getattr(counts, name))
+        self.of_images.append(counts.of_images)
+
+    def compute(self) -> SegmentationCounts:
+        """Return the counts of all processes as arrays."""
+        states = (dim_zero_cat(getattr(self, name)) for name in SegmentationCounts._fields)
+        return SegmentationCounts(*(state.cpu().numpy() for state in states))
+
+
+class ClassificationMetric(MulticlassConfusionMatrix):
+    """Counts images in a confusion matrix ``(K, K)``, summed over processes."""
+
+    def compute(self) -> NDArray[np.int64]:  # type: ignore[override]
+        """Return the matrix of all processes; rows are the true classes."""
+        counts: NDArray[np.int64] = super().compute().cpu().numpy()
+        return counts
+
+
+class DepthMetric(ImagesMetric):
+    """Collects the errors of all images of a data set, see `error_sums`."""
+
+    def __init__(self) -> None:
+        super().__init__(1 + len(BAND_EDGES_DEG), SUMS)
+
+    def update(self, prediction: Tensor, truth: Tensor) -> None:
+        """Add the errors of one image, see `error_sums`."""
+        self.of_images.append(error_sums(prediction, truth)[None])
+
+    def compute(self) -> NDArray[np.float64]:
+        """Return the sums ``(images, 8, 10)`` of all processes."""
+        sums: NDArray[np.float64] = dim_zero_cat(self.of_images).cpu().numpy()
+        return sums
