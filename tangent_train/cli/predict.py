@@ -149,7 +149,8 @@ class _Prediction:
             if settings.depth is None:
                 expected = "a folder of depth images, which the network takes"
                 raise SettingError("depth", found="null", expected=expected)
-            self._depth = images.DepthFolder(settings.depth, settings.depth_scale)
+            of_file = settings.depth_scale, settings.depth_channel
+            self._depth = images.DepthFolder(settings.depth, *of_file)
 
     def count(self, inputs: Inputs) -> None:
         """Let the head count in some of the images, see `Head.count`."""
@@ -221,7 +222,9 @@ def _read(settings: PredictSettings, loaded: LoadedNetwork) -> set[str]:
     names |= {"fov"} if settings.projection == "perspective" else panoramas
     names |= {"max_tilt_deg"} if settings.upright == "auto" else set()
     names |= {"unmapped"} if settings.label_map is not None else set()
-    return names | ({"depth", "depth_scale"} if "depth" in loaded.inputs else set())
+    return names | (
+        {"depth", "depth_scale", "depth_channel"} if "depth" in loaded.inputs else set()
+    )
 
 
 if __name__ == "__main__":
