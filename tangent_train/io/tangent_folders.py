@@ -59,8 +59,11 @@ def read_placed(
         SettingError: The angles are invalid.
     """
     is_nearest = interpolation == "nearest"
-    read = partial(pixel_files.read_pixels, indices=is_nearest, channel=channel)
-    image = frame() if frame else read(path)
+    if frame:
+        image = frame()
+    else:
+        options: Any = {"indices": is_nearest, "in_srgb": not is_nearest, "channel": channel}
+        image = pixel_files.read_pixels(path, **options)
     area = read_area(path, (image.shape[0], image.shape[1]), angles)
     return area.place(image), area
 
