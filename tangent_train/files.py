@@ -179,3 +179,9 @@ def config_folder() -> Path:
     package = Path(__file__).resolve().parent
     packaged = package / "configs"
     return packaged if packaged.is_dir() else package.parent / "configs"
+
+
+def quoted(path: Path) -> str:
+    """Return a path as Hydra reads it literally."""
+    is_plain = re.fullmatch(r"[\w./-]+", str(path), re.ASCII)
+    return str(path) if is_plain else "'" + str(path).replace("'", "\\'") + "'"
