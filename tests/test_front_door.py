@@ -6,6 +6,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 import tangent_train
@@ -32,6 +34,65 @@ def test_importing_the_package_imports_nothing_heavy() -> None:
         import sys, tangent_train
         dir(tangent_train)
         sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))
+    """
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+_HEAVY = ("torch", "numba", "cv2", "lightning", "torchmetrics", "torchvision", "transformers")
+
+
+def _imported(folder: Path, command: str, *arguments: str, names: tuple[str, ...]) -> set[str]:
+    """Run a command in a process of its own; return the modules that it has imported."""
+    code = f"""if True:
+        import sys
+        from tangent_train.cli import main
+        sys.argv = ['tangent-{command}', *{arguments!r}]
+        try:
+            main.{command}()
+        except SystemExit as end:
+            print(end.code or '')
+        finally:
+            print('imported', *[name for name in {names!r} if name in sys.modules])
+    """
+    done = run_python(folder, "-c", code)
+    return set(done.stdout.rpartition("imported")[2].split())
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("train", ("--help",)),
+        ("render", ("--help",)),
+        ("render", ("input=missing.jpg", "output=out")),
+        ("render", ("input=pano.png", "output=held")),
+        ("render", ("input=pano.png", "output=done", "views=cubemap")),
+        ("predict", ("checkpoint=missing.ckpt", "input=pano.png", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=missing.jpg", "output=out")),
+        ("predict", ("checkpoint=net.ckpt", "input=pano.png", "output=held")),
+        ("export", ("checkpoint=net.ckpt", "output=pano.png")),
+        ("train", ("init_from=missing.ckpt",)),
+    ],
+)
+def test_help_and_refused_paths_import_nothing_heavy(
+    tmp_path: Path, command: str, arguments: tuple[str, ...]
+) -> None:
+    for name in ("pano.png", "net.ckpt", "held/notes.txt", "done/finished.jsonl"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text('{"item": "pano"}')
+    (tmp_path / "done" / "manifest.json").write_text('{"views": "horizontal"}')
+    assert _imported(tmp_path, command, *arguments, names=_HEAVY) == set()
+
+
+def test_rendering_and_predicting_import_no_libraries_of_training(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "pano.png"), np.zeros((16, 32, 3), np.uint8))
+    arguments = ("input=pano.png", "output=out", "views=cubemap", "level=3")
+    names = (*_HEAVY[3:], "matplotlib", "torch._dynamo")
+    assert _imported(tmp_path, "render", *arguments, names=names) == set()
+    assert len([*tmp_path.glob("out/pano/*.png")]) == 6
+    code = f"""if True:
+        import sys, tangent_train.cli.predict, tangent_train
+        tangent_train.load
+        sys.exit(bool(set({names!r}) & set(sys.modules)))
     """
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 

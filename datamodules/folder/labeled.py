@@ -30,9 +30,8 @@ from datamodules.core.inputs import Input
 from datamodules.core.label_map import LabelMap, read_label_map
 from datamodules.folder.cameras import FolderCameras, read_folder_cameras
 from datamodules.folder.splits import FolderSplits
-from tangent_train.errors import DataError, SettingError
+from tangent_train.errors import DataError
 from tangent_train.io import image_files
-from tangent_train.io.masks import Masks
 from tangent_train.io.pixel_files import read_depth_m
 
 
@@ -46,6 +45,7 @@ class LabeledFolder(ImageDataModule):
         split_seed: Seed of both splits. Independent of the run's seed, so that runs with
             different seeds share their splits.
         depth_units_per_m: Units per meter of integer depth files, 1000 for millimeters.
+        depth_channel: Channel of OpenEXR depth files, see `read_depth_m`.
 
     Raises:
         DataError: ``classes.json`` is missing or cannot be used.
@@ -55,6 +55,7 @@ class LabeledFolder(ImageDataModule):
     test_fraction: Annotated[float, Field(gt=0, lt=1)] = 0.2
     split_seed: NonNegativeInt = 0
     depth_units_per_m: PositiveFloat = 1000
+    depth_channel: str | None = None
 
     def find_label_map(self) -> LabelMap:
         """Return the classes of ``classes.json``: the network needs their number early."""
@@ -112,11 +113,12 @@ class LabeledFolder(ImageDataModule):
     def decode_depth(self, files: ImageFiles) -> NDArray[np.uint16]:
         """See `ImageDataModule`."""
         path: Any = files.depth
-        return meters_to_steps(read_depth_m(path, self.depth_units_per_m))
+        return meters_to_steps(read_depth_m(path, self.depth_units_per_m, self.depth_channel))
 
     def decode_settings(self) -> dict[str, Any]:
         """See `DataModule`."""
-        return {**super().decode_settings(), "units": self.depth_units_per_m}
+        depth = {"units": self.depth_units_per_m, "channel": self.depth_channel}
+        return {**super().decode_settings(), **depth}
 
 
 @data_set
@@ -151,23 +153,3 @@ class FolderPhotos(LabeledFolder, PhotoDataModule):
 
 def _name(folder: Path, path: Path) -> str:
     return image_files.composed(path.relative_to(folder).with_suffix("").as_posix())
-
-
-def class_masks(folder: Path, ignored: Sequence[str]) -> Masks:
-    """Return masks that ignore all pixels of some classes.
-
-    Args:
-        folder: Folder with ``labels/`` and ``classes.json``, as for ``data=folder``.
-        ignored: Names of the classes.
-
-    Raises:
-        DataError: ``classes.json`` or ``labels/`` is missing or cannot be used.
-        SettingError: ``classes.json`` lacks one of the classes.
-    """
-    classes = read_label_map(folder / "classes.json")
-    names, ignored = classes.names, list(map(image_files.composed, ignored))
-    if set(ignored) - set(names):
-        found = ", ".join(sorted(set(ignored) - set(names)))
-        raise SettingError("mask_classes", found=found, expected=f"of {', '.join(names)}")
-    labels = [names.index(name) + 1 for name in ignored]
-    return Masks(folder / "labels", counts=lambda path: ~np.isin(classes.read_labels(path), labels))

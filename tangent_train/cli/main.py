@@ -70,7 +70,7 @@ def _main(command: str) -> None:
 
     from tangent_train.cli.processes import in_sweep, run_job
     from tangent_train.config.command_line import check_words
-    from tangent_train.config.help import annotate
+    from tangent_train.config.help import annotate, listed_by_files
     from tangent_train.config.settings import config_name, validate
     from tangent_train.files import config_folder
 
@@ -78,7 +78,9 @@ def _main(command: str) -> None:
         if in_sweep():  # outside the block: the other jobs go on
             return run_job(command)
         with _errors_as_messages(command):  # inside: Hydra prints a line for other exceptions
-            return _run(command, validate(command, config))
+            settings = validate(command, config)
+            import_module("tangent_train.cli.paths").check_paths(settings)
+            return _run(command, settings)
 
     os.environ["HYDRA_FULL_ERROR"] = "1"  # errors are raised here, not printed by Hydra
     with _errors_as_messages(command):
@@ -88,7 +90,7 @@ def _main(command: str) -> None:
         if {"--help", "-h"}.isdisjoint(sys.argv):
             run(job)()
             return
-        with suppress(SystemExit), redirect_stdout(StringIO()) as printed:
+        with suppress(SystemExit), redirect_stdout(StringIO()) as printed, listed_by_files():
             run(job)()
         sys.stdout.write(annotate(printed.getvalue(), command))
 

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import yaml  # type: ignore[import-untyped]
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra.core.object_type import ObjectType
 
 from tangent_train.config.settings import SETTINGS, Settings, comment_of, plain
 from tangent_train.files import config_folder
 
 _COLUMN = 32
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The loader in C, which takes a tenth of the time, where PyYAML has it."""
+
 _BASE = re.compile(r"^  - (?:/(\w+)@(\w+): )?(?!_self_)(\w+)$", re.MULTILINE)
 _GENERAL = {
     "_target_": "Python class or function",
@@ -35,6 +42,20 @@ class Setting(NamedTuple):
     name: str
     value: str
     comment: str
+
+
+def listed_by_files() -> AbstractContextManager[Any]:
+    """Let Hydra list the options of groups by their files: it composes the config for each group.
+
+    Two thirds of the time of ``--help`` would be spent on it.
+    """
+
+    def options(
+        loader: ConfigLoaderImpl, group_name: str, results_filter: Any = ObjectType.CONFIG
+    ) -> list[str]:
+        return loader.repository.get_group_options(group_name, results_filter)
+
+    return patch.object(ConfigLoaderImpl, "get_group_options", options)
 
 
 def annotate(text: str, command: str) -> str:
@@ -77,7 +98,7 @@ def _declared(kind: type[Settings], prefix: str) -> Iterator[Setting]:
 def read_settings(file: Path) -> list[Setting]:
     """Return the settings of a config file, with the options that its defaults list chooses."""
     text = file.read_text("utf-8")
-    return list(_settings(yaml.compose(text), text, ""))
+    return list(_settings(yaml.compose(text, _LOADER), text, ""))
 
 
 def description(file: Path) -> list[str]:

@@ -60,6 +60,8 @@ class Settings(BaseModel):
     not_read: ClassVar[Sequence[str]] = ()
     """Groups and settings that the command does not read, although experiments may set them. They
     are not suggested."""
+    not_content: ClassVar[Sequence[str]] = ()
+    """Settings that do not change the files in an output folder."""
 
 
 class NetworkSettings(Settings):
@@ -95,6 +97,8 @@ class ImageSettings(Settings):
 class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """Settings of tangent-predict."""
 
+    not_content = ("output", "report", "shard", "view_batch_size", "device", "trust")
+
     input: str | Path
     """image or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
     output: Path
@@ -103,6 +107,9 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
     """folder of depth images with the names of the inputs, for networks with depth"""
     depth_scale: PositiveFloat = 1000
     """units per meter in depth files of integers, read or written"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel of depth, e.g. ViewLayer.Depth.Z; null = the one called Z, depth,
+    depth.Z or depth.V"""
     projection: Literal["equirectangular", "perspective"] = "equirectangular"
     """equirectangular | perspective (photos)"""
     fill: Literal["black", "mean", "edge", "reflect"] | None = None
@@ -158,6 +165,8 @@ class PredictSettings(LabelMapSettings, ImageSettings, NetworkSettings):
 class RenderSettings(ImageSettings):
     """Settings of tangent-render."""
 
+    not_content = ("figure", "output", "overwrite")
+
     input: str | Path | None = None
     """panorama or video, folder of them, or pattern, e.g. 'holiday/*.jpg'"""
     output: Path | None = None
@@ -182,6 +191,9 @@ class RenderSettings(ImageSettings):
     """png | jpg | webp | tif | npy"""
     interpolation: Literal["bilinear", "nearest"] = "bilinear"
     """bilinear | nearest (for labels and depth)"""
+    depth_channel: str | None = None
+    """OpenEXR files: channel to read, e.g. ViewLayer.Depth.Z; null = colors, or for nearest and
+    depth the one called Z, depth, depth.Z or depth.V"""
     colmap: bool = False
     """true: one project for COLMAP of all panoramas: images, masks and rig_config.json"""
     mask: float | ExistingPath | None = None

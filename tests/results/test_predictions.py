@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from datamodules.core.label_map import read_label_map
-from datamodules.folder.labeled import class_masks
+from datamodules.folder.class_masks import class_masks
 from tangent_train.geometry import camera_matrix_from_fov
 from tangent_train.heads import ClassesHead, PredictedImage
 from tangent_train.inference.images import InputImage
