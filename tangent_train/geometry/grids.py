@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property, lru_cache
 from typing import Any, Self
@@ -12,11 +12,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tangent_train.errors import SettingError, at_least
+from tangent_train.errors import SettingError, at_least, check_type
 from tangent_train.geometry.camera import half_width
 from tangent_train.geometry.coverage import check_coverage, overlaps
 from tangent_train.geometry.icosphere import icosphere, vertex_resolution
-from tangent_train.geometry.sphere import checked_rotation, lonlat_to_xyz, tangent_axes
+from tangent_train.geometry.sphere import MOST_ROWS, checked_rotation, lonlat_to_xyz, tangent_axes
 
 Faces = Sequence[int] | NDArray[np.integer]
 """Indices of images."""
@@ -40,9 +40,11 @@ class PinholeGrid:
         pitch: Distance p of neighboring pixels on the image plane, in focal lengths.
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         is_overlapping: True if every direction is inside an image, not only on its outer edge.
+        is_complete: True if the images are known to cover what they are rendered back to; False to
+            check it then.
 
     Raises:
-        SettingError: The rotation is not a rotation.
+        SettingError: The rotation is not a rotation, or the size is out of range.
     """
 
     def __init__(
@@ -53,12 +55,17 @@ class PinholeGrid:
         rotation: ArrayLike | None = None,
         *,
         is_overlapping: bool = True,
+        is_complete: bool = False,
     ) -> None:
         self._axes = axes
-        self.size = size
+        self.size = (
+            at_least("rows of an image", size[0], 1, MOST_ROWS),
+            at_least("columns of an image", size[1], 1, MOST_ROWS),
+        )
         self.pitch = pitch
         self.rotation = None if rotation is None else checked_rotation(rotation)
         self.is_overlapping = is_overlapping
+        self.is_complete = is_complete
 
     @property
     def num_images(self) -> int:
@@ -178,9 +185,21 @@ class PinholeGrid:
         return np.einsum("nwc,ijc->nijw", axes, rays)
 
     def face_indices(self, faces: Faces | None = None) -> NDArray[np.int64]:
-        """Return indices of images, by default of all; NumPy refuses others."""
+        """Return indices of images, by default of all.
+
+        Raises:
+            SettingError: There is no such image.
+            TypeError: It is not a list.
+        """
         every = np.arange(self.num_images)
-        return every if faces is None else every[[*faces]]
+        if faces is None:
+            return every
+        check_type("faces", faces, Iterable, "a list of indices, e.g. [0, 5]")
+        try:
+            return every[[*faces]]
+        except IndexError as error:
+            expected = f"indices of images, 0 to {self.num_images - 1}"
+            raise SettingError("faces", found=faces, expected=expected) from error
 
     def owners(self, directions_xyz: ArrayLike) -> NDArray[np.int64]:
         """Return the face that owns each direction: the face with the nearest center.
@@ -259,8 +278,8 @@ class TangentGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of the whole icosahedron: directions become R·d.
 
     Raises:
-        SettingError: The rotation is not a rotation, or `dim` would leave part of an owned cell
-            uncovered.
+        SettingError: The rotation is not a rotation, a level is out of range, or `dim` would leave
+            part of an owned cell uncovered.
 
     >>> grid = TangentGrid(base_level=1, level=10)
     >>> grid.num_images, grid.dim, round(grid.fov_deg, 4)
@@ -274,16 +293,19 @@ class TangentGrid(PinholeGrid):
         dim: int | None = None,
         rotation: ArrayLike | None = None,
     ) -> None:
+        at_least("base_level", base_level, 0, 8)
+        at_least("level", level, 0)
         dim = int(2.0 ** (level - base_level)) if dim is None else dim
         least = self.least_dim(base_level, level)
-        if dim < least:
+        if at_least("dim", dim, 0) < least:
             raise SettingError(
                 "dim",
                 found=dim,
                 expected=f"at least {least} at base level {base_level} and level {level}",
                 remedy="Smaller images would leave parts of the sphere uncovered.",
             )
-        super().__init__(_face_axes(base_level), (dim, dim), _pitch(base_level, level), rotation)
+        axes, pitch = _face_axes(base_level), _pitch(base_level, level)
+        super().__init__(axes, (dim, dim), pitch, rotation, is_complete=True)
         self.base_level = base_level
         self.level = level
 
@@ -357,7 +379,8 @@ class CubeGrid(PinholeGrid):
         axes = _upright_axes([x, y, -x, -y, z, -z])
         pitch = 2 / (dim - 2 * margin)
         # Without a margin, neighbors meet at their outer edges.
-        super().__init__(axes, (dim, dim), pitch, rotation, is_overlapping=margin > 0)
+        kinds = {"is_overlapping": margin > 0, "is_complete": True}
+        super().__init__(axes, (dim, dim), pitch, rotation, **kinds)
 
 
 class RingGrid(PinholeGrid):
@@ -375,7 +398,7 @@ class RingGrid(PinholeGrid):
         rotation: ``(3, 3)`` proper rotation R of all images: directions become R·d.
         valid: ``(H, W)`` pixels of a panorama that the images must cover; None for the sphere.
         by_owners: False if images may be blended with ``feather`` only, see `check_coverage`.
-        is_complete: False for images that cover them together with those of other grids.
+        is_complete: False for images that do not cover them, or only with those of other grids.
 
     Raises:
         SettingError: A field of view is out of range, or the images miss a direction.
@@ -405,7 +428,7 @@ class RingGrid(PinholeGrid):
             for number in range(int(ring["views"]))
         ]
         axes = _upright_axes(lonlat_to_xyz(np.radians(centers_deg)))
-        super().__init__(axes, (size[0], size[1]), pitch, rotation)
+        super().__init__(axes, (size[0], size[1]), pitch, rotation, is_complete=is_complete)
         resting = self.with_rotation(None)
         if is_complete:
             check_coverage([resting], valid, by_owners=by_owners)

@@ -17,6 +17,7 @@ from tangent_train.geometry import (
     RingGrid,
     TangentGrid,
     equirect_shape,
+    panorama_rows,
     random_rotation,
     rotation_about,
 )
@@ -86,7 +87,7 @@ class PinholeRepresentation:
         self.grid: PinholeGrid = grid
         self.random_rotation = random_rotation
         self.mirror = mirror
-        self.erp_height = equirect_shape(level)[0] if erp_height is None else erp_height
+        self.erp_height = panorama_rows(level, erp_height)
         self.blend = blend
         self.faces_per_panorama = faces_per_panorama
         self.grids = grids
@@ -258,6 +259,7 @@ class HorizontalRepresentation(PinholeRepresentation):
     """
 
     grid: PinholeGrid
+    must_cover = True
 
     def __init__(
         self,
@@ -279,7 +281,8 @@ class HorizontalRepresentation(PinholeRepresentation):
             by_fov.setdefault(_pair(ring.get("fov", fov)), []).append(others)
         if not by_fov:
             raise SettingError("representation.rings", found="[]", expected="one ring or more")
-        if len(by_fov) > 1 and blend == "nearest":
+        is_joint = len(by_fov) > 1
+        if is_joint and blend == "nearest" and self.must_cover:
             raise SettingError(
                 "representation.blend",
                 found="nearest, with rings of different fov",
@@ -290,10 +293,10 @@ class HorizontalRepresentation(PinholeRepresentation):
         covered = None
         if area is not None:
             covered = area_mask(check_area(area, "representation.area"), (_ROWS, 2 * _ROWS))
-        is_joint = len(by_fov) > 1
-        coverage = {"by_owners": blend == "nearest", "is_complete": not is_joint}
+        is_complete = self.must_cover and not is_joint
+        coverage = {"by_owners": blend == "nearest", "is_complete": is_complete}
         grids = [RingGrid(part, of, size, None, covered, **coverage) for of, part in by_fov.items()]
-        if is_joint:
+        if is_joint and self.must_cover:
             check_coverage(grids, covered)
         self.symmetry_deg = 360 / max(ring["views"] for part in by_fov.values() for ring in part)
         super().__init__(
@@ -309,6 +312,12 @@ class HorizontalRepresentation(PinholeRepresentation):
             covered is not None,
             is_joint,
         )
+
+
+class SeparateViews(HorizontalRepresentation):
+    """Horizontal views for other programs, which need not cover the sphere."""
+
+    must_cover = False
 
 
 class CubemapRepresentation(PinholeRepresentation):
