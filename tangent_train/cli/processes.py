@@ -32,7 +32,7 @@ class SweepSummary(Callback):
         folder = Path(config.hydra.sweep.dir)
         for file in sorted(folder.rglob("results.json")):
             content = json.loads(file.read_bytes())
-            name, best = content["main"], file.with_name(OBJECTIVE_FILE)
+            name, best = next(iter(content["scores"])), file.with_name(OBJECTIVE_FILE)
             scores = [f"{name} {content['scores'][name]:.4g}"]
             if best.is_file():
                 validation = json.loads(best.read_bytes())
